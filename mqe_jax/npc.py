@@ -22,23 +22,14 @@ def flock(
     friction: float = 1.0,
     top_speed: float = 2.0,
 ) -> jax.Array:
-    """Returns the velocities (S, 2), m/s, of S sheep during the next environment step.
+    """Returns the velocities (S, 2), m/s, of S sheep during the next environment step, s.
 
     v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over robots of 0.2 r / q^1.4, with c the flock's centre (this
     term is omitted for one sheep), r = p - p_robot and q = |r squared elementwise|, zero beyond q = 9; then each
     component is clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
-    before and half after this, so that the sheep moves at the step's mean speed.
+    before and half after this, so that the sheep moves at the step's mean speed. p are the sheep's positions (S, 2), m,
+    v their velocities, p_robot those of the robots (A, 2), s is the restlessness, m/s.
     Source: paper, section III, with the constants of the released system.
-
-    Args:
-        key: random key.
-        position: of the sheep (S, 2), m.
-        velocity: of the sheep (S, 2), m/s.
-        robots: positions of the robots (A, 2), m.
-        restlessness: s in the formula, m/s.
-        step: environment step, s.
-        friction: sliding friction between sheep and ground.
-        top_speed: maximum of each velocity component, m/s.
     """
     half = friction * GRAVITY * step / 2
     velocity = slowed(velocity, half)
@@ -67,13 +58,8 @@ def defend(position: jax.Array, yaw: jax.Array, ball: jax.Array, goal: jax.Array
         vx       = clip(|t - g| - |p - g|, -0.5, 0.5)                       (as far from the goal as t)
         vy       = -clip(distance of p to the left of the line g -> t, -0.5, 0.5)
 
+    Positions are (2,), m, the goal's is the midpoint of its line; yaw is in rad.
     Source: paper, section III, with the constants of the released system.
-
-    Args:
-        position: of the robot (2,), m.
-        yaw: of the robot (), rad.
-        ball: (2,), m.
-        goal: midpoint of the goal line (2,), m.
     """
     own, target = position - goal, 0.6 * (ball - goal)
     distance = jnp.linalg.norm(target)

@@ -1,8 +1,7 @@
 """Terrain: a track is a row of blocks along x, each as wide as the track.
 
-A block is a small frozen dataclass with a length and a `layout` method. Walls whose positions
-differ between environments are attached to an anchor, which is sampled at reset and is part of the state (mocap bodies,
-which all engines support).
+A block is a small frozen dataclass with a length and a `layout` method. Walls whose positions differ between
+environments are attached to an anchor, which is sampled at reset and is part of the state (mocap bodies).
 
 Frame: the environment's, x along the track from its start, y across it with 0 on the centre line, z up; metres.
 """
@@ -19,13 +18,14 @@ from mqe_jax.physics.appearance import GOAL_SITE, GROUND_GROUP, HIDDEN_GROUP, SI
 from mqe_jax.physics.appearance.shapes import WALL_COLOR, WALL_GROUP, Ground, Style, gate_wall, side_wall
 from mqe_jax.physics.collision import GROUND_BIT, WALL_BIT
 
+_THICKNESS = 0.04  # of the side walls, m
+
 
 @dataclasses.dataclass(frozen=True)
 class Wall:
     """A box-shaped wall."""
 
     name: str
-    """Name, unique in the track."""
     center: tuple[float, float, float]
     """Centre (3,), m; relative to the anchor (z: to the ground) if `anchor` is not None."""
     size: tuple[float, float, float]
@@ -39,7 +39,6 @@ class Barrier:
     """An infinite vertical plane that blocks motion against `normal`; rendered as a box."""
 
     name: str
-    """Name, unique in the track."""
     point: tuple[float, float]
     """A point on the plane (2,), m."""
     normal: tuple[float, float]
@@ -67,9 +66,7 @@ class Layout:
     walls: tuple[Wall, ...] = ()
     """Fixed and moving walls; `anchor` is an index into this layout's anchors."""
     barriers: tuple[Barrier, ...] = ()
-    """Infinite walls."""
     anchors: tuple[Anchor, ...] = ()
-    """The block's anchors."""
     spawn: tuple[tuple[float, float, float], ...] = ()
     """Spawn poses (x, y, yaw) of the robots, m and rad."""
 
@@ -134,8 +131,6 @@ class Gate(TerrainBlock):
     """Width of the gap, m."""
     depth: float = 0.1
     """Thickness of the wall along x, m."""
-    offset: tuple[float, float] = (0.0, 0.0)
-    """Offset of the gap's mean centre from the block's centre (x, y), m."""
     random: tuple[float, float] = (0.0, 0.0)
     """Half-widths of the range of the gap's centre, sampled at reset (x, y), m."""
 
@@ -143,60 +138,14 @@ class Gate(TerrainBlock):
         gap, depth, height = self.width, self.depth, track.wall_height
         if not 0 < gap < track.width:
             raise InputError(f"terrain block gate: width {gap} must be between 0 and the track's width {track.width}")
-        center = (start + self.length / 2 + self.offset[0], self.offset[1])
+        center = (start + self.length / 2, 0.0)
         # Long enough to reach the side wall for every sampled gap position; the overhang is hidden when rendering.
-        reach = (track.width - gap) / 2 + abs(self.offset[1]) + self.random[1]
+        reach = (track.width - gap) / 2 + self.random[1]
         walls = tuple(
             Wall(f"gate{number}_{side}", (0.0, sign * (gap + reach) / 2, height / 2), (depth, reach, height), anchor=0)
             for side, sign in (("right", -1.0), ("left", 1.0))
         )
         return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random),))
-
-
-@dataclasses.dataclass(frozen=True)
-class RoughGround:
-    """Perlin-noise ground instead of the flat floor; a height field, on all engines.
-
-    On Warp its contacts chatter: joints of a standing robot move at up to 4.4 rad/s (0.2 rad/s on the C engine),
-    whatever the number of solver iterations.
-    """
-
-    amplitude: float = 0.03
-    """Maximum height above the flat ground, m."""
-    wavelength: float = 1.0
-    """Period of the coarsest octave, m."""
-    octaves: int = 2
-    """Number of noise octaves, each with half the wavelength and amplitude of the previous one."""
-    resolution: float = 0.1
-    """Grid spacing, m."""
-    seed: int = 0
-    """Seed of the noise."""
-
-    def heights(self, length: float, width: float) -> np.ndarray:
-        """Returns heights in [0, amplitude] (rows along y, columns along x), m."""
-        rows, columns = (round(extent / self.resolution) + 1 for extent in (width, length))
-        total = np.zeros((rows, columns))
-        for octave in range(self.octaves):
-            cell = self.wavelength / 2**octave
-            y, x = np.arange(rows) * self.resolution / cell, np.arange(columns) * self.resolution / cell
-            total += _perlin(y, x, np.random.default_rng((self.seed, octave))) / 2**octave
-        low, high = total.min(), total.max()
-        return self.amplitude * (total - low) / max(high - low, 1e-9)
-
-
-def _perlin(y: np.ndarray, x: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Returns gradient noise with unit cells at the grid points (len(y), len(x))."""
-    angle = random.uniform(0, 2 * np.pi, (int(y.max()) + 2, int(x.max()) + 2))
-    gradient = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    row, column = y.astype(int)[:, None], x.astype(int)[None, :]
-    fy, fx = (y - y.astype(int))[:, None], (x - x.astype(int))[None, :]
-    corners = [
-        [gradient[row + i, column + j, 0] * (fx - j) + gradient[row + i, column + j, 1] * (fy - i) for j in (0, 1)]
-        for i in (0, 1)
-    ]
-    fade_x, fade_y = (t**3 * (t * (6 * t - 15) + 10) for t in (fx, fy))
-    near, far = (a + fade_x * (b - a) for a, b in corners)
-    return near + fade_y * (far - near)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,10 +160,6 @@ class Track:
     """Number of spawn poses of a `SpawnArea`."""
     wall_height: float = 0.5
     """Height of every wall, m."""
-    wall_thickness: float = 0.04
-    """Thickness of the side walls, m."""
-    rough: RoughGround | None = None
-    """Perlin-noise ground, or None for a flat floor."""
     walled: bool = True
     """Whether there are side walls."""
     style: Style = "boards"
@@ -252,13 +197,11 @@ class Track:
 
 
 def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> Layout:
-    """Adds a track's ground and walls to a scene; returns the layout.
-
-    Moving walls become mocap bodies named `wall/<name>`, in the order of the layout's walls.
-    """
+    """Adds a track's ground and walls to a scene, moving ones as mocap bodies `wall/<name>`; returns the layout."""
     layout = track.layout()
     world, solid = spec.worldbody, {"contype": WALL_BIT, "conaffinity": 0}
-    _add_ground(spec, track)
+    ground = {"contype": GROUND_BIT, "conaffinity": 0, "condim": 3, "rgba": track.ground.color, "group": GROUND_GROUP}
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
     if visual:
         track.ground.add(world)
     for barrier in layout.barriers:
@@ -273,7 +216,7 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
             **solid,
         )
         if visual:
-            half = (track.wall_thickness / 2, barrier.length / 2 + track.wall_thickness, track.wall_height / 2)
+            half = (_THICKNESS / 2, barrier.length / 2 + _THICKNESS, track.wall_height / 2)
             center = np.array([*barrier.point, track.wall_height / 2]) - normal * half[0]
             yaw = np.arctan2(normal[1], normal[0])
             side_wall(world, track.style, center, half, float(yaw))
@@ -301,18 +244,3 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
                 place = (0, inner * half[1], z)
                 body.add_site(name=f"{GOAL_SITE}/{wall.name}/{name}", pos=place, group=SITE_GROUP)
     return layout
-
-
-def _add_ground(spec: mujoco.MjSpec, track: Track) -> None:
-    ground = {"contype": GROUND_BIT, "conaffinity": 0, "condim": 3, "rgba": track.ground.color, "group": GROUND_GROUP}
-    if track.rough is None:
-        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
-        return
-    length, width = track.length, track.width
-    heights = track.rough.heights(length, width)
-    top = max(float(heights.max()), 1e-6)
-    (rows, columns), size = heights.shape, (length / 2, width / 2, top, 0.1)
-    spec.add_hfield(name="ground", nrow=rows, ncol=columns, size=size, userdata=(heights / top).ravel())
-    spec.worldbody.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", pos=(length / 2, 0, 0), **ground
-    )

@@ -3,6 +3,7 @@
 import functools
 import importlib
 import pickle
+import runpy
 import sys
 import types
 import warnings
@@ -129,7 +130,6 @@ def test_jaxmarl_rollout(task: str) -> None:
     agents: Any = env.agents
     spaces: Any = env.observation_spaces
     assert agents == [f"robot_{i}" for i in range(env.num_agents)] and env.name == task
-    assert [a for team in env.agent_classes.values() for a in team] == agents
     wrapped = importlib.import_module("jaxmarl.wrappers.baselines").LogWrapper(env)
     zero = {agent: jnp.zeros((COUNT, env.env.action_size)) for agent in agents}
 
@@ -203,8 +203,6 @@ def test_jaxmarl_world_state_and_discrete_actions() -> None:
 
 def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
     adapter("jaxmarl")
-    runner = importlib.import_module("mqe_jax.adapters.__main__")
-    monkeypatch.setattr(sys, "argv", list(sys.argv))
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "beside_it.py").write_text("CONTROL = 'position'\n")
     script = tmp_path / "script.py"
@@ -214,12 +212,13 @@ def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any
         "    env = jaxmarl.make(sys.argv[1], impl='c', control=CONTROL)\n"
         "    print(env.name, env.num_agents, env.action_space('robot_0').shape)\n"
     )
-    runner.main([str(script), "go1gate"])
-    assert capsys.readouterr().out == "go1gate 2 (12,)\n"
+    monkeypatch.setattr(sys, "argv", ["", str(script), "go1gate"])
+    runpy.run_module("mqe_jax.adapters", run_name="__main__")
+    assert capsys.readouterr().out.endswith("go1gate 2 (12,)\n")
     for wrong in ([], [str(tmp_path / "none.py")]):
-        with pytest.raises(SystemExit, match="2"):
-            runner.main(wrong)
-        assert "expected a Python file" in capsys.readouterr().err
+        monkeypatch.setattr(sys, "argv", ["", *wrong])
+        with pytest.raises(SystemExit, match="must be a Python file"):
+            runpy.run_module("mqe_jax.adapters", run_name="__main__")
 
 
 # -- PettingZoo --------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from mqe_jax.core import limits, memory
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, check, load_yaml, override
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
-from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
+from mqe_jax.envs.replay import Recording, load_recording
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
 from mqe_jax.policies import all_agents
@@ -43,14 +43,13 @@ from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import register_network
 from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy, save_policy
 from mqe_jax.train.runner import train
-from mqe_jax.viz import clips, curves, recording, render
+from mqe_jax.viz import recording, render
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
 
 KEY, NAN = jax.random.PRNGKey(0), math.nan
 LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3))
 WALLS = np.full((3, 2, 3), NAN)
-FRAME = np.zeros((16, 16, 3), np.uint8)
 GAMES = np.ones((1, 1, 3), np.int64)
 RATINGS = tournament.Ratings(np.zeros(1), np.zeros(1), np.zeros(1))
 
@@ -152,13 +151,9 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("start: ", lambda x, v: mqe_jax.learn("go1plane", {"start": v}), ("x" * 300, "")),
     ("seeds", lambda x, v: mqe_jax.learn_seeds("go1plane", "demo", seeds=v), (None, 3, [], [-1], range(65), "ab")),
     ("seeds: ", lambda x, v: mqe_jax.make_learner("go1plane", "demo", seeds=v), (None, 0, True, 10**12)),
-    ("actions: ", lambda x, v: Recording("a", {}, "c", "command", {"x": np.zeros(2)}, v), (None, np.zeros(2))),
-    ("states", lambda x, v: Recording("a", {}, "c", "command", v, np.zeros((2, 1, 1))), (None, {1: np.zeros(2)})),
+    ("actions: ", lambda x, v: Recording("a", {}, "c", "command", {"x": np.zeros(2)}, v), (np.zeros(2),)),
     ("params: ", lambda x, v: Recording("a", v, "c", "command", {}, np.zeros((2, 1, 1))), (None, {"control": "c"})),
-    ("states: ", lambda x, v: save_recording("a.npz", x["task"], x.get(v, v), jnp.zeros((2, 2, 12))), (None, "states")),
     ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
-    ("policy: ", lambda x, v: tournament.play(x["matches"], v, [], KEY), (None, "idle", TrainedPolicy)),
-    ("policies", lambda x, v: tournament.round_robin(x["matches"], v, KEY), (None, [], {}, {"a": "idle"})),
     ("folder: ", lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v), (None, 3, "")),
     ("policies", lambda x, v: mqe_jax.tournament("go1tug", v), (None, 3, [], [3], {})),
     ("task: ", lambda x, v: mqe_jax.tournament(v, ["idle"]), ("go1gate", "x")),
@@ -166,14 +161,12 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("skill: ", lambda x, v: mqe_jax.train_skill(v, "runs/a"), (None, 3, "walc")),
     ("scenario", lambda x, v: mqe_jax.evaluate_skill("walk", scenarios=v), (3, ["flatt"], [3])),
     ("cells", lambda x, v: mqe_jax.sweep("a.yaml", "runs/a", cells=v), (None, 3, [3])),
-    ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones((2, 2)), np.full((2, 2, 3), NAN))),
     ("match: ", lambda x, v: TeamEnv(x.get(v, v), "idle"), (None, 3, "matches")),
     ("key: ", lambda x, v: TeamEnv(x["match"], "idle").reset(v), (None, 3)),
     ("assistance: ", lambda x, v: TeamEnv(x["match"], "idle").reset(KEY, v), LEVELS),
     ("state: ", lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))), (None, "state")),
     ("env: ", lambda x, v: recording.record(x.get(v, v), x["act"], KEY), (None, 3, "matches")),
     ("episode: ", lambda x, v: _render(x, episode=v), (None, 3, [])),
-    ("recording: ", lambda x, v: replay(v), (None, 3, "a.npz")),
     ("env: ", lambda x, v: scene_xml(x.get(v, v)), (None, "go1gate", "matches")),
     ("demonstrator: ", lambda x, v: Demonstrated(x["task"], 2, v), (None, 3, TrainedPolicy)),
     ("robot: ", lambda x, v: robots.register(v), (None, "go1")),
@@ -187,16 +180,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("key: ", lambda x, v: _record(x, v), (None, 7)),
     ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (v, memory)), (None, np.zeros((1, 2, 4)))),
     ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (np.zeros((1, 2, 3)), v)), (3, None, [])),
-    ("episodes: ", lambda x, v: recording.best([]), (None,)),
-    ("Episode: ", lambda x, v: dataclasses.replace(x["episode"], qpos=v), (None, 3, np.zeros(3))),
-    ("Episode: ", lambda x, v: dataclasses.replace(x["episode"], mocap_quat=v), (None, np.zeros((3, 2, 3)))),
-    ("dt: ", lambda x, v: dataclasses.replace(x["episode"], dt=v), (None, 0, NAN, "x")),
-    ("success: ", lambda x, v: dataclasses.replace(x["episode"], success=v), (None, "x")),
     ("episode: ", lambda x, v: _render(x, episode=dataclasses.replace(x["episode"], **{v: WALLS})), ("mocap_pos",)),
-    ("episode: ", lambda x, v: render.render_frames(x["match"], x["episode"]), (None,)),
-    ("views: ", lambda x, v: render.render_frames(x["fake"], x["episode"], v, backend="egl"), ([], 3, [1, 2, 3])),
-    ("tables", lambda x, v: curves.plot_curves(v, "a"), (None, [], [3])),
-    ("title: ", lambda x, v: curves.plot_curves([{}], v), (None, 3)),
     ("size", lambda x, v: _render(x, size=v), ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))),
     ("fps: ", lambda x, v: _render(x, fps=v), (-1, 0, NAN, math.inf, "x")),
     ("speed: ", lambda x, v: _render(x, speed=v), (0, -1, NAN)),
@@ -207,12 +191,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("episode: ", lambda x, v: _render(x, episode=x["episode"].cut(slice(0, 0))), (None,)),
     ("episode: ", lambda x, v: render.render_episode(x["match"], x["episode"], x["gif"]), (None,)),
     ("output: ", lambda x, v: _render(x, episode=x["long"], size=(4096, 4096), fps=50), (None,)),
-    ("size", lambda x, v: list(render.render_frames(x["fake"], x["episode"], size=(-1, 3))), (None,)),
-    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([]), 25), (None,)),
-    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32))]), 25), (None,)),
-    ("frames: ", lambda x, v: clips.write_clip(x["gif"], iter([v]), 25), ("x", KEY, np.zeros((0, 8, 3), np.uint8))),
-    ("frames: ", lambda x, v: clips.write_clip(x["gif"], v, 25), (None, 3, [FRAME, FRAME[:8]])),
-    ("fps: ", lambda x, v: clips.write_clip(x["gif"], iter([np.zeros((32, 32, 3), np.uint8)]), 0), (None,)),
     ("env: ", lambda x, v: needs_of(v, x["config"]), (None, "task")),
     ("processes: ", lambda x, v: make_learner(x["batch"], x["config"], processes=v), (None, 0, "x")),
     ("key: ", lambda x, v: make_learner(x["batch"], x["config"]).init(v), (None, 3)),

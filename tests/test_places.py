@@ -1,4 +1,4 @@
-"""Machines that lack what a Linux workstation has: POSIX, a home folder, a GL library, docstrings."""
+"""Machines that lack what a Linux workstation has: POSIX, a home folder, a GL library."""
 
 import os
 import subprocess
@@ -72,12 +72,6 @@ def test_nothing_needs_posix_or_a_home_folder(tmp_path: Path) -> None:
     assert (tmp_path / "clip.gif").stat().st_size and len(
         (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     ) == 3
-
-
-def test_help_is_the_same_without_docstrings(tmp_path: Path) -> None:
-    code = "import sys; from mqe_jax.cli import main; sys.argv = ['mqe', 'walk', 'train', '--help']; sys.exit(main())"
-    plain, optimized = (run(code, tmp_path, env={**os.environ, "PYTHONOPTIMIZE": level}).stdout for level in ("", "2"))
-    assert optimized == plain
 
 
 def test_only_drawing_needs_a_gl_library(tmp_path: Path) -> None:

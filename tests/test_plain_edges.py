@@ -23,7 +23,7 @@ from mqe_jax.train.learner import make_learner
 from mqe_jax.train.logs import row_of
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
 from mqe_jax.train.optim import adam
-from mqe_jax.train.rollout import _masked, _means, _sums
+from mqe_jax.train.rollout import _means, _sums
 from tests import training as probes
 from tests.states import made
 from tests.training import Probe
@@ -93,7 +93,7 @@ def test_constant_observations_are_divided_by_a_hundredth() -> None:
 def test_metrics_of_episodes_are_missing_without_any() -> None:
     """Zero in compiled code, where `jax_debug_nans` looks for NaN, and NaN in the row of metrics.csv."""
     none = jnp.zeros(3, bool)
-    ended = _sums(_masked({"success": jnp.ones(3), "episodes": jnp.ones(3)}, none))
+    ended = _sums({"success": jnp.zeros(3), "episodes": none})
     found = _means(_sums({"pace": jnp.arange(3.0), "diverged": jnp.ones(3)}), ended, 3)
     assert found == {"pace": 1.0, "diverged": 3.0, "ended": {"success": 0.0, "episodes": 0.0}}
     row = row_of(1, found, TrainConfig(), 0.0, -1.0)

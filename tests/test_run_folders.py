@@ -4,7 +4,6 @@ import json
 import os
 import resource
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,9 @@ from test_train_run import rows, settings
 
 from mqe_jax import cli
 from mqe_jax.cli import programs
-from mqe_jax.core import files, interrupts
+from mqe_jax.core import files
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import locked, remove_temporaries, replacing, write_atomically
+from mqe_jax.core.files import locked, replacing, write_atomically
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -91,28 +90,6 @@ def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixtu
             assert sorted(Path(folder).rglob("*")) == before
 
 
-def test_temporary_files_that_nothing_changes_for_an_hour_go_when_a_run_starts(tmp_path: Path) -> None:
-    """Another process, on any host and system, may still write a younger one, such as a clip.
-
-    Nothing else goes: no folder, no file of another name, nothing behind a link.
-    """
-    own, young, folder = (f".mqe-{16 * letter}.tmp" for letter in "abc")
-    run, other = tmp_path / "run", tmp_path / "other"
-    (run / "checkpoints").mkdir(parents=True)
-    (run / folder).mkdir()
-    other.mkdir()
-    (run / "link").symlink_to(other)
-    gone = [own, f"{own}.mp4", f"checkpoints/{own}.safetensors"]
-    kept = [young, f"link/{own}", ".hidden", ".notes.tmp", ".mqe-1.tmp", ".keep.1.tmp.tar.gz", f"{own}~"]
-    then = time.time() - 3700
-    for name in (*gone, *kept):
-        (run / name).write_text("half")
-        os.utime(run / name, None if name == young else (then, then))
-    os.utime(run / folder, (then, then))
-    train(PROBE, SETTINGS, run)
-    assert [name for name in (*gone, *kept, folder) if (run / name).exists()] == [*kept, folder]
-
-
 @pytest.mark.parametrize("name", ["checkpoints", "best", "metrics.csv"])
 def test_a_training_writes_and_removes_nothing_through_links(name: str, tmp_path: Path) -> None:
     run, other = tmp_path / "run", tmp_path / "other"
@@ -150,14 +127,6 @@ def test_temporary_files_are_new_and_unpredictable(tmp_path: Path, monkeypatch: 
     with pytest.raises(FileExistsError):
         files.write_atomically(tmp_path / "a", b"new")
     assert not (tmp_path / "foreign").exists()
-
-
-def test_a_file_that_is_being_written_is_not_removed(tmp_path: Path) -> None:
-    with replacing(tmp_path / "a.txt") as temporary:
-        temporary.write_text("new")
-        assert temporary in interrupts.temporaries
-        remove_temporaries(tmp_path)
-    assert (tmp_path / "a.txt").read_text() == "new"
 
 
 # -- files are written whole -------------------------------------------------------------------------------------------

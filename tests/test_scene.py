@@ -1,4 +1,4 @@
-"""Robots and terrain: compiled models, robots as data, tracks, rough ground on the engines."""
+"""Robots and terrain: compiled models, robots as data, tracks."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -13,13 +13,13 @@ import pytest
 
 from mqe_jax import make
 from mqe_jax.core.errors import InputError
-from mqe_jax.physics import engines, robots
+from mqe_jax.physics import robots
 from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import foot_positions, knee_positions
 from mqe_jax.physics.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
-from mqe_jax.terrain import Plane, RoughGround, SpawnArea, Track
+from mqe_jax.terrain import Plane, Track
 from tests.states import made
 
 PLANE = Track(blocks=(Plane(4.0),), walled=False, num_robots=1)
@@ -177,55 +177,3 @@ def test_missing_walk_weights_say_how_to_make_them() -> None:
 
 
 # -- terrain -----------------------------------------------------------------------------------------------------------
-
-
-ROUGH = RoughGround(amplitude=0.08, wavelength=1.0, octaves=3, seed=1)
-
-
-def rough_scene() -> CompiledScene:
-    track = Track((SpawnArea(2.0, back_wall=False), Plane(2.0)), width=3.0, num_robots=1, rough=ROUGH, walled=False)
-    return compile_scene(Scene(track, num_robots=1))
-
-
-def test_mjx_accepts_rough_ground() -> None:
-    """MJX refuses margins beside a height field; `MarginStep` adds those of the robot's shapes later."""
-    model = rough_scene().model
-    assert model.nhfield == 1 and model.geom_margin.max() > 0.0
-    assert engines.make(model, impl="jax", num_envs=1).init(
-        jnp.asarray(model.qpos0), jnp.zeros(model.nv), jnp.zeros((0, 3)), jnp.zeros(model.nu)
-    ).qpos.shape == (model.nq,)
-
-
-def height_at(x: float, y: float) -> float:
-    """Height of the rough ground, m, interpolated between its points 0.1 m apart."""
-    heights = ROUGH.heights(4.0, 3.0)
-    (row, v), (column, u) = ((int(place), place % 1) for place in ((y + 1.5) / 0.1, x / 0.1))
-    near, far = ((1 - u) * heights[r, column] + u * heights[r, column + 1] for r in (row, row + 1))
-    return float((1 - v) * near + v * far)
-
-
-@pytest.mark.parametrize(
-    "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=pytest.mark.gpu)]
-)
-def test_a_robot_stands_on_rough_ground(impl: str) -> None:
-    scene = rough_scene()
-    model, index = scene.model, scene.index
-    physics = engines.make(model, impl=impl, num_envs=1)
-    qpos = np.array(model.qpos0)
-    qpos[index.base_qpos[0]] = [2.0, 0.3, 0.42, 1, 0, 0, 0]
-    qpos[index.joint_qpos] = GO1.default_joints
-    ctrl = jnp.zeros(model.nu).at[index.actuator].set(GO1.default_joints)
-    data = physics.init(jnp.asarray(qpos), jnp.zeros(model.nv), jnp.zeros((0, 3)), ctrl)
-    after = jax.jit(lambda data: jax.lax.scan(lambda d, _: (physics.step(d, ctrl)[0], None), data, None, 50)[0])(data)
-    reference = mujoco.MjData(model)
-    reference.qpos[:] = after.qpos
-    mujoco.mj_kinematics(model, reference)
-    feet = [geom for geom in range(model.ngeom) if model.geom(geom).name.endswith("_foot")]
-    gaps = [
-        reference.geom_xpos[foot][2] - model.geom_size[foot, 0] - height_at(*reference.geom_xpos[foot][:2])
-        for foot in feet
-    ]
-    assert np.sum(np.abs(gaps) < 0.01) >= 3, gaps
-    quaternion = np.asarray(after.qpos)[index.base_qpos[0, 3:]]
-    fastest = np.abs(np.asarray(after.qvel)).max()
-    assert quaternion[0] > 0.98 and fastest < (5.0 if impl == "warp" else 1.0)  # contacts chatter on Warp

@@ -15,7 +15,7 @@ import pytest
 from mqe_jax.core.errors import InputError
 from mqe_jax.study import statistics
 from mqe_jax.study.estimates import band, evaluated, group, score_matrices
-from mqe_jax.study.report import to_marl_eval, write_report
+from mqe_jax.study.report import write_report
 from mqe_jax.study.runs import REWARD, Cell, Reference, Run
 
 REFERENCE = Reference(label="theirs", values={"plain": {"go1gate": {"mappo": 2.75}}}, tasks={"go1sheep-hard": "Hard"})
@@ -55,7 +55,7 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 def test_the_same_runs_give_the_same_files(folder: Path, tmp_path: Path) -> None:
     files = {path.name: path.read_bytes() for path in write_report(RUNS, tmp_path, REFERENCE)}
     assert files == {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert {"curves.png", "evaluations.png", "profiles.png", "final.csv", "report.md", "marl_eval.json"} <= set(files)
+    assert {"curves.png", "evaluations.png", "profiles.png", "final.csv", "report.md"} <= set(files)
 
 
 def test_final_values_stand_beside_the_reference(folder: Path) -> None:
@@ -193,15 +193,3 @@ def test_normalized_scores_are_fractions_of_a_tasks_range() -> None:
     scores = {"a": np.array([[1.0, 5.0]]), "b": np.array([[3.0, 5.0]])}
     result = statistics.normalized(scores, np.array([1.0, 5.0]), np.array([5.0, 5.0]))
     np.testing.assert_allclose(result["b"], [[0.5, 0.0]])
-
-
-def test_marl_eval_export_has_the_documented_nesting() -> None:
-    point = {"env_steps": 10, "sampled": {"average_step_reward": 0.5, "success_rate": 0.25}}
-    run = Run(Cell("go1gate", "mappo"), 3, {}, [point, {**point, "env_steps": 20}], {**point, "env_steps": 20})
-    variant = Run(Cell("go1gate", "mappo", "tuned"), 3, {}, [], None)
-    exported = to_marl_eval([run, variant])
-    assert list(exported["mqe"]) == ["go1gate"]
-    seed = exported["mqe"]["go1gate"]["mappo"]["seed_3"]
-    assert list(seed) == ["step_1", "step_2", "absolute_metrics"]
-    assert seed["step_2"] == {"step_count": 20, "average_step_reward": [0.5], "success_rate": [0.25]}
-    assert seed["absolute_metrics"] == {"average_step_reward": [0.5], "success_rate": [0.25]}

@@ -24,7 +24,7 @@ def test_a_driven_robot_obeys_the_hand_and_the_others_their_policy() -> None:
     run.drive.env, run.drive.robot = 1, 1
     run.drive.change((-1.0, 0.5, 1.0))
     run.advance()
-    moved = run.frame().qpos[:, FakeEnv.robot_x] - np.array([1.0, 1.0])
+    moved = run.moment().frame.qpos[:, FakeEnv.robot_x] - np.array([1.0, 1.0])
     np.testing.assert_allclose(moved, [[0.025, 0.025], [0.025, -0.05]], atol=1e-6)
     np.testing.assert_allclose(run.commands[-1][0], [[0.5, 0, 0], [0.5, 0, 0]])
     # Teleoperation commands are in the robot's frame, although its agent acts in a mirrored one.
@@ -67,7 +67,7 @@ def test_episodes_start_over_and_the_record_keeps_the_last_seconds() -> None:
     assert run.times[-1] == pytest.approx(21 * 0.02)
     assert not run.drivable
     run.reset()
-    np.testing.assert_allclose(run.frame().qpos[:, FakeEnv.robot_x], 1.0)
+    np.testing.assert_allclose(run.moment().frame.qpos[:, FakeEnv.robot_x], 1.0)
 
 
 @pytest.fixture(scope="module")

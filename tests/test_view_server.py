@@ -218,7 +218,7 @@ def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> N
     env.name = EVIL
     env.observation_layout = SimpleNamespace(blocks=[SimpleNamespace(name=EVIL)], slice=lambda name: slice(None))
     run = session(env)
-    monkeypatch.setattr("mqe_jax.view.viewer.start_frame", lambda *_: run.frame())
+    monkeypatch.setattr("mqe_jax.view.viewer.start_frame", lambda *_: run.moment().frame)
     with open_page(640, 480) as page:
         viewer = Viewer(port=free_port(), menu=Menu(fail, Choice("go1gate", EVIL), {EVIL: "go1gate"}))
         viewer.announce(env, 2)

@@ -6,10 +6,7 @@ extra to install. `python -m mqe_jax.adapters SCRIPT` runs a script of such a li
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +30,6 @@ def missing(library: str, error: ImportError) -> InputError:
     )
 
 
-@contextlib.contextmanager
-def quietly() -> Iterator[None]:
-    """Hides what a library prints while it is imported, such as that packages which no task needs are missing."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
-
-
 def task_env(
     task: str | QuadrupedEnv,
     *,
@@ -48,19 +38,10 @@ def task_env(
     limit: str = "max_steps",
     **overrides: Any,
 ) -> Any:
-    """Returns the environment of a task, or of team 0 of a match; a given environment accepts no overrides.
+    """Returns the environment of a task, or with an opponent the `TeamEnv` of a match.
 
-    Args:
-        task: id, or an environment.
-        opponent: policy of team 1 of a match: what `mqe_jax.load_policy` accepts, or a policy; without one, the agents
-            of both teams act.
-        max_steps: time limit in environment steps, instead of the task's.
-        limit: name of the adapter's argument for `max_steps`, for errors.
-        overrides: arguments of `mqe_jax.make`.
-
-    Returns:
-        A `QuadrupedEnv`, or with an opponent a `TeamEnv`; InputError as theirs, for overrides of a given environment,
-        and for a time limit below one step.
+    `task` is an id with `overrides` of `make`, or an environment without; `opponent` a policy of team 1, or what
+    `mqe_jax.load_policy` accepts; `max_steps` a time limit in environment steps, which errors name `limit`.
     """
     if isinstance(task, QuadrupedEnv):
         if overrides or max_steps is not None:

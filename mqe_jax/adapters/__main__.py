@@ -5,6 +5,7 @@ The script creates a task by the `make` of its library: `ENV_NAME=go1gate` for t
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import runpy
 import sys
@@ -12,33 +13,12 @@ from pathlib import Path
 
 from mqe_jax.core.errors import InputError
 
-LIBRARIES = ("gymnasium", "pettingzoo", "brax", "jaxmarl")
-
-
-def register() -> list[str]:
-    """Registers the tasks with every installed library; returns their names."""
-    found = []
-    for library in LIBRARIES:
-        try:
-            importlib.import_module(f"mqe_jax.adapters.{library}")
-        except InputError:
-            continue
-        found.append(library)
-    return found
-
-
-def main(arguments: list[str]) -> None:
-    """Runs the script, the first argument, with the others as its own."""
-    if not arguments or not Path(arguments[0]).is_file():
-        given = repr(arguments[0]) if arguments else "none"
-        print(f"SCRIPT: {given}; expected a Python file: python -m mqe_jax.adapters SCRIPT ...", file=sys.stderr)
-        raise SystemExit(2)
-    register()
-    script = Path(arguments[0]).resolve()
-    sys.argv = [str(script), *arguments[1:]]
-    sys.path.insert(0, str(script.parent))
-    runpy.run_path(str(script), run_name="__main__")
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    if not sys.argv[1:] or not Path(sys.argv[1]).is_file():
+        sys.exit(f"{sys.argv[1:2]}: SCRIPT must be a Python file: python -m mqe_jax.adapters SCRIPT ...")
+    for library in ("gymnasium", "pettingzoo", "brax", "jaxmarl"):
+        with contextlib.suppress(InputError):  # not installed
+            importlib.import_module(f"mqe_jax.adapters.{library}")
+    sys.argv = sys.argv[1:]
+    sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
+    runpy.run_path(sys.argv[0], run_name="__main__")

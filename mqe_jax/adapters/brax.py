@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import envs
-from mqe_jax.adapters import missing, quietly, task_env, team_reward
+from mqe_jax.adapters import missing, task_env, team_reward
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError
@@ -30,11 +30,10 @@ from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
 
 try:
-    with quietly():
-        from brax.envs import register_environment
-        from brax.envs.base import Env as BraxEnv
-        from brax.envs.base import State, Wrapper
-        from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+    from brax.envs import register_environment
+    from brax.envs.base import Env as BraxEnv
+    from brax.envs.base import State, Wrapper
+    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 except ImportError as error:
     raise missing("brax", error) from None
 
@@ -51,26 +50,18 @@ def register() -> None:
 class Env(BraxEnv):
     """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after agent.
 
-    With an `opponent`, A counts the agents of team 0. The reward is the mean over the agents of team 0: all agents in
-    cooperative tasks. `done` is 1 on termination.
-    Truncation is left to Brax's EpisodeWrapper, which needs `episode_length` and would otherwise treat the time limit
-    as a termination. `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` is the
-    observation at the end of the step, also after an automatic reset. `pipeline_state` is the task's `State`.
+    With an `opponent`, A counts the agents of team 0 and the reward is their mean. `done` is 1 on termination; time
+    limits are left to Brax's EpisodeWrapper. `info["truncation"]` is 1 in the step that reaches the time limit,
+    `info[FINAL_OBS]` the observation at the end of the step. `pipeline_state` is the task's `State`.
     """
-
-    env: TaskEnv
-    """The task."""
-    episode_length: int
-    """Time limit, environment steps."""
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
         """Creates the environment from a task id or an environment; see `task_env` for the overrides."""
-        self.env = task_env(task, **overrides)
-        self.episode_length = self.env.max_steps
+        self.env: TaskEnv = task_env(task, **overrides)
+        self.episode_length: int = self.env.max_steps
 
     @single
     def reset(self, rng: jax.Array) -> State:
-        """Starts an episode."""
         state = self.env.reset(rng)
         obs = state.obs.reshape(-1)
         info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
@@ -101,17 +92,14 @@ class Env(BraxEnv):
 
     @property
     def observation_size(self) -> int:
-        """Length of the joint observation."""
         return self.env.num_agents * self.env.observation_size
 
     @property
     def action_size(self) -> int:
-        """Length of the joint action."""
         return self.env.num_agents * self.env.action_size
 
     @property
     def backend(self) -> str:
-        """The physics engine: 'jax', 'warp' or 'c'."""
         return self.env.impl
 
 
@@ -124,7 +112,6 @@ class AutoReset(Wrapper):
     @single
     @checked(rng=RandomKeys)
     def reset(self, rng: jax.Array) -> State:
-        """Starts an episode in each environment."""
         return self.env.reset(rng)
 
     @single
@@ -153,11 +140,7 @@ class AutoReset(Wrapper):
 def wrap(
     env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable[..., Any] | None = None
 ) -> Wrapper:
-    """Wraps an `Env` for Brax's trainers: batch, time limit, automatic reset to new episodes; pass it as `wrap_env_fn`.
-
-    Raises:
-        InputError: for a `randomization_fn`; use the task parameter `randomization` instead.
-    """
+    """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, automatic reset to new episodes."""
     if not isinstance(getattr(env, "unwrapped", env), Env):
         raise InputError(f"env: {type(getattr(env, 'unwrapped', env)).__name__} is not a mqe_jax.adapters.brax.Env")
     if randomization_fn is not None:

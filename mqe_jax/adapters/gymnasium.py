@@ -75,7 +75,6 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._host.reset([seed], self.np_random)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advances by one environment step; actions are clipped to [-1, 1]."""
         out = self._host.step([action])
         info: dict[str, Any] = {name: value[0] for name, value in out.info.items()}
         info["agent_rewards"] = out.reward[0]
@@ -104,14 +103,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         render_size: tuple[int, int] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
-        """Creates the environments; other arguments as those of `SingleEnv`.
+        """Creates N environments; other arguments as those of `SingleEnv`.
 
-        Args:
-            task: id, or an environment.
-            num_envs: N.
-            autoreset_mode: Gymnasium's convention for environments whose episodes have ended: NEXT_STEP (Gymnasium's
-                default), SAME_STEP, which stores the last observation in `infos["final_obs"]`, or DISABLED.
-            max_episode_steps: time limit, instead of the task's.
+        `autoreset_mode` is Gymnasium's convention for environments whose episodes have ended: NEXT_STEP, SAME_STEP,
+        which stores the last observation in `infos["final_obs"]`, or DISABLED. `max_episode_steps` is a time limit
+        instead of the task's.
         """
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -135,11 +131,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts episodes.
+        """Starts episodes, of the environments that `options["reset_mask"]` (N,) bool selects.
 
-        Args:
-            seed: of environment 0 (environment i: seed + i), or one per environment; None continues the PRNG stream.
-            options: `reset_mask` (N,) bool selects the environments to reset.
+        `seed` is that of environment 0 (environment i: seed + i), or one per environment; None continues the stream.
         """
         super().reset(seed=check("seed", seed, Seed) if isinstance(seed, int | np.integer) else None)
         mask = _reset_mask(options, self.num_envs)
@@ -156,7 +150,6 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._host.reset(seeds, self.np_random, mask), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances all environments by one step; actions are clipped to [-1, 1]."""
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
             raise InputError(f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask")
         out = self._host.step(actions, self.autoreset_mode)

@@ -31,11 +31,7 @@ RENDER_MODES = ("rgb_array",)
 
 
 class Step(NamedTuple):
-    """Output of one step of N environments; the arrays are writable copies.
-
-    `final_obs`, `info` and all flags and rewards describe the step itself; `obs` is that of the new episode where an
-    environment was reset in this call.
-    """
+    """Output of one step of N environments, before any reset but for `obs`; the arrays are writable copies."""
 
     obs: np.ndarray  # (N, A, O)
     final_obs: np.ndarray  # (N, A, O)
@@ -58,13 +54,6 @@ class HostEnvs:
 
     A reset without a seed continues the environment's PRNG stream and starts the same episode as an automatic reset.
     """
-
-    env: TaskEnv
-    """The task."""
-    num_envs: int
-    """N."""
-    state: State | None
-    """The environments' states; None before the first reset."""
 
     def __init__(
         self, env: TaskEnv, num_envs: int, render_mode: str | None = None, render_size: tuple[int, int] = RENDER_SIZE
@@ -92,11 +81,7 @@ class HostEnvs:
     def reset(
         self, seeds: Sequence[int | None], generator: np.random.Generator, mask: np.ndarray | None = None
     ) -> np.ndarray:
-        """Resets the environments of the mask (N,) bool, all by default; returns observations (N, A, O).
-
-        A seed of None continues the PRNG stream of the environment's state; at the first reset it is sampled by the
-        generator. InputError for a seed outside [0, 2^32).
-        """
+        """Resets the masked environments (N,) bool and returns observations; None as seed continues the PRNG stream."""
         if self.state is None:
             seeds = [int(generator.integers(2**31)) if seed is None else seed for seed in seeds]
         seeded = np.array([seed is not None for seed in seeds])
@@ -106,11 +91,10 @@ class HostEnvs:
         return np.array(self.state.obs)
 
     def step(self, action: ArrayLike, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
-        """Steps all environments with actions (N, A, action_size) in [-1, 1], clipped to it.
+        """Steps all environments with actions (N, A, action_size), clipped to [-1, 1].
 
         An environment is reset in the call that ends its episode (SAME_STEP), in the next call, which ignores its
-        action and returns a zero reward (NEXT_STEP), or not at all (DISABLED). InputError for actions of another shape
-        or not finite, and before the first reset.
+        action and returns a zero reward (NEXT_STEP), or not at all (DISABLED).
         """
         if self.state is None:
             raise InputError("step: reset the environment first")
@@ -129,10 +113,7 @@ class HostEnvs:
         return jax.tree.map(np.array, jax.device_get(out))  # copies, as JAX arrays are read-only
 
     def render(self, index: int = 0) -> np.ndarray | None:
-        """Returns an image (H, W, 3) uint8 of one environment, or None without a render mode.
-
-        The first image sets the camera.
-        """
+        """Returns an image (H, W, 3) uint8 of one environment, or None without a render mode."""
         if self._mode is None:
             return None
         if self.state is None:

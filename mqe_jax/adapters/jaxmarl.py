@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import envs
-from mqe_jax.adapters import agent_names, missing, quietly, select, task_env
+from mqe_jax.adapters import agent_names, missing, select, task_env
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError, shown
@@ -27,11 +27,10 @@ from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
 
 try:
-    with quietly():
-        import jaxmarl
-        from jaxmarl import registration
-        from jaxmarl.environments.multi_agent_env import MultiAgentEnv
-        from jaxmarl.environments.spaces import Box, Discrete
+    import jaxmarl
+    from jaxmarl import registration
+    from jaxmarl.environments.multi_agent_env import MultiAgentEnv
+    from jaxmarl.environments.spaces import Box, Discrete
 except ImportError as error:
     raise missing("jaxmarl", error) from None
 
@@ -63,11 +62,6 @@ class Env(MultiAgentEnv):
     are true on termination and on truncation.
     """
 
-    env: TaskEnv
-    """The task."""
-    action_table: np.ndarray | None
-    """The action of each integer (1 + 2 action_size, action_size); None without discrete actions."""
-
     @checked(discrete=bool)
     def __init__(self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any) -> None:
         """Creates the environment of a task's id, or adapts a given one; `overrides` are those of `task_env`.
@@ -75,26 +69,21 @@ class Env(MultiAgentEnv):
         With `discrete`, actions are integers, as JaxMARL's MAPPO and Q-learning need: 0 is the zero action, 2 i + 1 and
         2 i + 2 are +1 and -1 in dimension i, zero in the others.
         """
-        self.env = task_env(task, **overrides)
+        self.env: TaskEnv = task_env(task, **overrides)
         super().__init__(self.env.num_agents)
         size = self.env.action_size
         self.agents = agent_names(self.env)
         self.observation_spaces = {a: Box(-jnp.inf, jnp.inf, (self.env.observation_size,)) for a in self.agents}
-        self.action_table = np.zeros((1 + 2 * size, size), np.float32) if discrete else None
-        if self.action_table is not None:
+        self.action_table: np.ndarray | None = None  # the action of each integer
+        if discrete:
+            self.action_table = np.zeros((1 + 2 * size, size), np.float32)
             self.action_table[1::2], self.action_table[2::2] = np.eye(size), -np.eye(size)
         space = Discrete(1 + 2 * size) if discrete else Box(-1.0, 1.0, (size,))
         self.action_spaces = dict.fromkeys(self.agents, space)
 
     @property
     def name(self) -> str:
-        """Id of the task."""
         return self.env.name
-
-    @property
-    def agent_classes(self) -> dict[str, list[str]]:
-        """Agents of each team."""
-        return {f"team_{i}": [self.agents[j] for j in team] for i, team in enumerate(self.env.teams)}
 
     @checked(key=RandomKey)
     @functools.partial(jax.jit, static_argnums=0)
@@ -102,7 +91,6 @@ class Env(MultiAgentEnv):
     def reset(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, key: jax.Array
     ) -> tuple[Arrays, State]:
-        """Starts an episode."""
         state = self.env.reset(key)
         return self.get_obs(state), state
 
@@ -112,8 +100,7 @@ class Env(MultiAgentEnv):
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
         """Advances by one environment step and resets an ended environment, to `reset_state` where it is given.
 
-        Replaces the base class's step, which selects between whole states: Warp's contact buffers are shared by all
-        environments and cannot be selected.
+        The base class selects between whole states; contact buffers of Warp are shared by all environments.
         """
         for one in (state, reset_state):
             if one is not None:
@@ -165,7 +152,6 @@ class Env(MultiAgentEnv):
         return state.privileged_obs
 
     def world_state_size(self) -> int:
-        """Returns its length P."""
         return self.env.privileged_observation_size
 
     def observation_space(self, agent: str) -> Box:

@@ -8,16 +8,17 @@ from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gymnasium.spaces import Box
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, checked
 from mqe_jax.core.types import AnySingle, Level, Memory, RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.envs.observation import box
 from mqe_jax.envs.state import with_final
 from mqe_jax.policies import SimplePolicy, load_as
 from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
@@ -28,10 +29,8 @@ from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
 class TeamState(State):
     """State of a match as seen by team 0, with T agents; observations, rewards and metrics are those of team 0."""
 
-    rival_obs: jax.Array
-    """Observations of the opponent's agents (T, O)."""
-    rival_memory: Memory
-    """Recurrent state of the opponent, leading axis 1."""
+    rival_obs: jax.Array  # observations of the opponent's agents (T, O)
+    rival_memory: Memory  # recurrent state of the opponent, leading axis 1
 
 
 class TeamEnv:
@@ -40,24 +39,13 @@ class TeamEnv:
     It has what the adapters use of `QuadrupedEnv`: sizes and spaces are those of team 0, everything else the match's.
     """
 
-    match: QuadrupedEnv
-    """The match."""
-    opponent: Policy
-    """The policy of team 1."""
-    num_agents: int
-    """Number of agents of a team T."""
-
     @checked(match=AnySingle)
     def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
-        """Creates the environment; `opponent` is what `mqe_jax.load_policy` accepts, or a policy.
-
-        A policy that samples its actions does so here. InputError for a task that is not a match, an opponent that
-        cannot be read, or one of another task.
-        """
+        """Creates the environment; `opponent` is a policy, which samples if it does, or what `load_policy` accepts."""
         if len(match.teams) != 2:
             raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
         self.match = match
-        self.opponent = load_as("opponent", opponent, match)
+        self.opponent: Policy = load_as("opponent", opponent, match)
         self.num_agents = len(match.teams[0])
         if further := groups_of(self.opponent) - {"policy"}:
             raise InputError(f"opponent: sees the groups {sorted(further)}; here it must see the group 'policy'")
@@ -77,14 +65,14 @@ class TeamEnv:
         return (tuple(range(self.num_agents)),)
 
     @property
-    def action_space(self) -> gymnasium.spaces.Box:
+    def action_space(self) -> Box:
         """Actions of team 0 (T, action_size) in [-1, 1]."""
-        return gymnasium.spaces.Box(-1.0, 1.0, (self.num_agents, self.match.action_size), np.float32)
+        return box(1.0, (self.num_agents, self.match.action_size))
 
     @property
-    def observation_space(self) -> gymnasium.spaces.Box:
+    def observation_space(self) -> Box:
         """Observations of team 0 (T, O)."""
-        return gymnasium.spaces.Box(-np.inf, np.inf, (self.num_agents, self.match.observation_size), np.float32)
+        return box(np.inf, (self.num_agents, self.match.observation_size))
 
     @property
     def identity(self) -> Hashable:
@@ -122,10 +110,7 @@ class TeamEnv:
 
     @single
     def step(self, state: State, action: jax.Array) -> TeamState:
-        """Advances by one environment step with the actions of team 0 (T, action_size); the opponent acts for team 1.
-
-        InputError for actions of another shape, and as `QuadrupedEnv.step`.
-        """
+        """Advances by one environment step with the actions of team 0 (T, action_size)."""
         check("state", state, TeamState)
         shape = (self.num_agents, self.match.action_size)
         if jnp.shape(action) != shape:

@@ -52,11 +52,6 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     A copied or unpickled instance is a new environment with the same settings, as SuperSuit's vectorisers require.
     """
 
-    teams: Any
-    """Agents of each team."""
-    state_space: Any
-    """Observation space of `state()`."""
-
     metadata: dict[str, Any] = {  # noqa: RUF012
         "name": "mqe",
         "render_modes": list(RENDER_MODES),
@@ -114,11 +109,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         return self._by_agent(obs), {agent: {} for agent in self.agents}
 
     def step(self, actions: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Advances by one environment step; an agent's info has the metrics of the step.
-
-        Raises:
-            InputError: if an agent has no action, or an action is given for an unknown agent.
-        """
+        """Advances by one environment step; an agent's info has the metrics of the step."""
         if not self.agents:
             return {}, {}, {}, {}, {}
         if set(check("actions", actions, Mapping)) != set(self.agents):
@@ -145,7 +136,6 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         return np.array(self._host.state.privileged_obs[0])
 
     def render(self) -> np.ndarray | None:
-        """Returns an image (H, W, 3) uint8, or None without a render mode."""
         return self._host.render()
 
     def close(self) -> None:

@@ -53,12 +53,12 @@ def keep() -> None:
 
 
 def write_whole() -> None:
-    """Has JAX write the files of compiled programs atomically, and removes what killed processes left of them.
+    """Has JAX write the files of compiled programs atomically.
 
     JAX itself writes them in place and never replaces one. A file cut off by a kill or a full disk would be read in
     vain at every later start, with a warning, and its program compiled anew. Imports JAX.
     """
-    from mqe_jax.core.files import remove_temporaries, write_atomically
+    from mqe_jax.core.files import write_atomically
 
     with contextlib.suppress(ImportError, AttributeError):  # a private class; another JAX writes as it does
         from jax._src.lru_cache import LRUCache
@@ -73,5 +73,3 @@ def write_whole() -> None:
                 write_atomically(path, value)
 
         LRUCache.put = put if original.__module__ != __name__ else original
-    with contextlib.suppress(KeyError, OSError):
-        remove_temporaries(Path(os.environ["JAX_COMPILATION_CACHE_DIR"]))

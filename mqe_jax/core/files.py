@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import itertools
 import json
 import os
 import re
 import secrets
 import stat
 import tempfile
-import time
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -26,8 +24,6 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-_TEMPORARY = re.compile(r"\.mqe-[0-9a-f]{16}\.tmp(\.\w+)?")
-_ABANDONED = 3600.0  # s after its last change a temporary file counts as left
 _TAGS = {f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "int", "float", "str", "seq", "map")}
 LOCK = ".mqe.lock"
 """Name of the file that a process locks in a run folder."""
@@ -39,9 +35,9 @@ _locks: dict[Path, os.stat_result] = {}  # folders that this process has locked,
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a new file of the same folder and suffix, with a name that nobody can know, renamed to `path` at the end.
+    """Yields a new file of the same folder, which it creates, and suffix, renamed to `path` at the end.
 
-    It creates the folder. The file is removed if this fails, or a signal ends the process. An OSError names `path`.
+    The file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
     temporary = path.with_name(f".mqe-{secrets.token_hex(8)}.tmp{path.suffix}")
     check_locks(path)
@@ -104,18 +100,6 @@ def check_locks(path: Path) -> None:
             raise InputError(f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it")
 
 
-def remove_temporaries(folder: Path) -> None:
-    """Removes the files of `replacing` that ended processes left in a folder, an hour after their last change.
-
-    A process that still writes one may be on another host. Links are not followed.
-    """
-    for path in () if folder.is_symlink() else folder.glob(".mqe-*.tmp*"):
-        with contextlib.suppress(OSError):
-            old = time.time() - path.lstat().st_mtime > _ABANDONED
-            if old and _TEMPORARY.fullmatch(path.name) and path not in interrupts.temporaries:
-                path.unlink()
-
-
 # -- readers: every failure of a parser is an InputError that names the file; no file costs more than its limit --------
 
 
@@ -134,10 +118,7 @@ def check_file(path: Path, limit: int) -> None:
 
 @contextlib.contextmanager
 def parsing(path: Path | str, what: str) -> Iterator[None]:
-    """Turns what a parser raises for a damaged or hostile file into an InputError: `path: damaged, or not <what> ...`.
-
-    Parsers of other libraries raise errors of any type, among them RecursionError and MemoryError.
-    """
+    """Turns what a parser raises for a damaged or hostile file, of any type, into an InputError that names the path."""
     try:
         yield
     except InputError:
@@ -248,8 +229,7 @@ def linear_layers(
 ) -> dict[str, dict[str, np.ndarray]]:
     """Returns the arrays LAYER.weight (outputs, inputs) and LAYER.bias (outputs,) by layer, as float32.
 
-    `sizes` holds inputs and outputs of each layer. An InputError says `what` has a missing or unexpected name, or
-    another shape.
+    `sizes` holds inputs and outputs of each layer. An InputError says what is wrong with `what`.
     """
     import numpy as np
 
@@ -271,10 +251,7 @@ def linear_layers(
 
 @contextlib.contextmanager
 def archive(path: Path, limit: int, what: str) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip file whose members have at most `limit` bytes together, none of them encrypted.
-
-    Whatever is raised while it is open becomes an InputError that says `what` it should be.
-    """
+    """Opens a zip file of at most `limit` bytes, unpacked too; errors while it is open are those of `parsing`."""
     check_file(path, limit)
     with parsing(path, what), zipfile.ZipFile(path) as opened:
         size = sum(member.file_size for member in opened.infolist())
@@ -295,10 +272,7 @@ def user_cache() -> Path:
 
 
 def check_folder(folder: Path, field: str = "run_dir", file: Path | None = None) -> None:
-    """Raises an InputError that names the field unless a folder, for a file, can be written, or created.
-
-    It leaves nothing behind.
-    """
+    """Raises an InputError that names the field unless a folder, for a file, can be written, or created."""
     try:
         there = next(path for path in (folder, *folder.parents) if path.exists() or path.is_symlink())
         with tempfile.TemporaryDirectory(prefix=".mqe-", dir=there) as inner:
@@ -318,31 +292,16 @@ def check_output(path: Path, field: str = "output") -> None:
 
 
 @contextlib.contextmanager
-def making(folder: Path) -> Iterator[None]:
-    """Creates a folder; where its use raises, those that were missing and are empty go again. An OSError names it."""
-    missing = list(itertools.takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
-    try:
-        with naming(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        yield
-    except BaseException:
-        for path in missing:
-            with contextlib.suppress(OSError):
-                path.rmdir()
-        raise
-
-
-@contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Holds a lock on a folder; it is released when the process exits, even abnormally.
+    """Creates a folder and holds a lock on it, which ends with the process; InUseError if it is locked already.
 
-    Below it, nothing is written once its path leads to another folder or to none.
-
-    Raises:
-        InUseError: where another process (or this one) already holds it.
+    Below it, nothing is written once its path leads to another folder or to none. Folders made and left empty go again.
     """
     import filelock  # 30 ms, which most commands need not wait for
 
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    with naming(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     lock, outer = filelock.FileLock(folder / LOCK, blocking=False), _locks.get(folder)
     try:
         lock.acquire()
@@ -359,3 +318,6 @@ def locked(folder: Path) -> Iterator[None]:
         _locks.pop(folder, None)
         if outer is not None:
             _locks[folder] = outer
+        with contextlib.suppress(OSError):
+            for path in missing:
+                path.rmdir()

@@ -66,7 +66,7 @@ def installed() -> bool:
 def deferred() -> Iterator[Callable[[], int]]:
     """Yields a function that returns the signal that came since, or 0; a later one ends the process at once.
 
-    Without `install`, as in a notebook, it defers SIGINT, unless ignored, and a later one raises KeyboardInterrupt.
+    Without `install`, as in a notebook, only SIGINT is deferred, and a later one raises KeyboardInterrupt.
     """
     global _deferring, _noted
 

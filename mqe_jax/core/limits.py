@@ -1,9 +1,7 @@
 """What input may hold and cost: the one list of bounds. Whatever is outside of them is refused with an `InputError`.
 
-Kinds of numbers are types: fields of records have them (`settings.record`), and arguments of functions
-(`settings.checked`); a field that is a plain `int` or `float` has the bounds of `Integer` or `Number`. The constants in
-capitals bound files, texts and memory; `files.py` has the readers. The fuzz tests take from here what must be refused
-(`bounds`) and what may be accepted.
+Kinds of numbers are types of fields of records (`settings.record`) and of arguments (`settings.checked`); a plain `int`
+or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
 """
 
 from __future__ import annotations
@@ -64,10 +62,10 @@ VALUES = 20_000  # in one YAML file
 YAML_BYTES = 2**17
 JSON_BYTES = 2**26
 CSV_BYTES = 2**27
-WEIGHTS_BYTES = 2**27  # walk weights and actuator networks; in a TorchScript archive, all members and all tensors
+WEIGHTS_BYTES = 2**27  # of skills and actuator networks; in a TorchScript archive, all members and all tensors
 POLICY_BYTES = 2**28
 CHECKPOINT_BYTES = 2**34
-WEIGHT = 1e4  # magnitude of a weight of a policy or an actuator network; trained ones are below 10
+WEIGHT = 1e4  # magnitude of a weight of a policy, a skill or an actuator network; trained ones are below 10
 RECORDING_BYTES = 2**28  # all members
 
 # -- memory, refused before it is allocated ----------------------------------------------------------------------------

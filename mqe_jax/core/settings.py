@@ -17,8 +17,6 @@ as a number) are accepted, bytes are not; "none" means None for an optional fiel
 
 from __future__ import annotations
 
-import ast
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -26,7 +24,6 @@ import itertools
 import math
 import os
 import re
-import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -73,24 +70,14 @@ class FrozenMapping(Mapping[str, Any]):
 _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
-def _two(value: Any) -> Any:
-    try:
-        _, _ = value
-    except (TypeError, ValueError):
-        raise ValueError("two numbers (lowest, highest)") from None
-    return value
-
-
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
         raise ValueError("two numbers (lowest, highest), in this order")
     return value
 
 
-Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered), pydantic.BeforeValidator(_two)]
-Coordinates = Annotated[
-    tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered), pydantic.BeforeValidator(_two)
-]
+Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered)]
+Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered)]
 
 
 def _parameters(value: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -111,9 +98,6 @@ def record(cls: type[T]) -> type[T]:
     Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
     of nested records are prefixed with their path. A subclass of a record must be decorated too.
     """
-    if cls.__doc__ is None:  # `python -OO`; tyro reads the fields' docstrings from the source too
-        with contextlib.suppress(OSError):  # no source
-            cls.__doc__ = ast.get_docstring(ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0])  # type: ignore
     hints = typing.get_type_hints(cls, include_extras=True)
     cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
     made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
@@ -163,11 +147,7 @@ def is_text(value: str) -> bool:
 
 
 def checked(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a function check some of its arguments, as a record checks its fields, each against a type.
-
-    Raises, when the function is called:
-        InputError: naming the argument, its value and what is allowed.
-    """
+    """Makes a function check some of its arguments, each against a type, as a record checks its fields."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(function)
@@ -216,26 +196,34 @@ def fail(name: str, value: object, allowed: str) -> NoReturn:
 def build(kind: type[T], values: Mapping[str, Any]) -> T:
     """Builds a record from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted (`{"ppo.clip": 0.1}`).
 
-    Raises:
-        InputError: for a value that is not allowed or an unknown name, with the nearest known one.
+    InputError for a value that is not allowed or an unknown name, with the nearest known one.
     """
     if not (isinstance(kind, type) and is_record(kind)):
         fail("kind", kind, "a class of settings, such as TrainConfig")
-    return kind(**_nested(kind, values))
+    return kind(**_joined(kind, {}, values))
 
 
 def override(settings: T, changes: Mapping[str, Any]) -> T:
-    """Returns a record with fields replaced, given as in `build`.
-
-    A nested record with a `name` field (a choice among several records) is replaced as a whole where the changes
-    name another one; mappings that are not records are `joined`.
-
-    Raises:
-        InputError: as `build`.
-    """
+    """Returns a record with fields replaced, given as in `build`; mappings are `joined`. InputError as `build`."""
     if not is_record(settings):
         fail("settings", settings, "a record, such as TrainConfig()")
-    return type(settings)(**_merged(settings, _nested(type(settings), changes)))
+    return type(settings)(**_joined(type(settings), _fields(settings), changes))
+
+
+def _joined(kind: Any, first: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    if not isinstance(changes, Mapping):
+        fail(kind.__name__, changes, "a mapping of names to values")
+    made = joined({}, changes)  # which refuses what is nested too deep
+    for name, following in itertools.pairwise(sorted(_names(changes))):
+        if name == following:
+            raise InputError(f"{name}: is given twice")
+    return joined(first, made)
+
+
+def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the dotted names of all values that are no mappings."""
+    for key, value in values.items():
+        yield from _names(value, f"{prefix}{key}.") if isinstance(value, Mapping) else (f"{prefix}{key}",)
 
 
 def differences(settings: Any, default: Any) -> dict[str, Any]:
@@ -253,24 +241,25 @@ def differences(settings: Any, default: Any) -> dict[str, Any]:
 def joined(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
     """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
 
-    InputError where one is nested more than `depth` deep.
+    A record with a `name`, a choice among several records, is replaced as a whole by another one. InputError for
+    mappings that are nested more than `depth` deep.
     """
     both: dict[str, Any] = {}
     for key, value in (*first.items(), *second.items()):
         name, dot, rest = str(key).partition(".")
         value = {rest: value} if dot else value
-        if isinstance(value, Mapping) and not depth:
-            fail(name, value, f"nested at most {limits.DEPTH} deep")
-        both[name] = joined(_fields(both.get(name)), value, depth - 1) if isinstance(value, Mapping) else value
+        if isinstance(value, Mapping):
+            if not depth:
+                fail(name, value, f"nested at most {limits.DEPTH} deep")
+            now = _fields(both.get(name))
+            other = is_record(both.get(name)) and value.get("name", now.get("name")) != now.get("name")
+            value = joined({} if other else now, value, depth - 1)
+        both[name] = value
     return both
 
 
 def to_mapping(settings: Any) -> dict[str, Any]:
-    """Returns a record as nested mappings, lists and scalars that YAML and JSON can represent.
-
-    Raises:
-        InputError: for a value in a mapping that is none of these.
-    """
+    """Returns a record as nested mappings, lists and scalars for YAML and JSON; InputError for any other value."""
 
     def plain(value: Any) -> Any:
         if hasattr(value, "tolist"):
@@ -283,11 +272,7 @@ def to_mapping(settings: Any) -> dict[str, Any]:
 
 
 def load_yaml(path: str | Path) -> dict[str, Any]:
-    """Reads names and values from a YAML file; an empty file gives an empty mapping.
-
-    Raises:
-        InputError: naming the file, if it cannot be read or is not a mapping.
-    """
+    """Reads names and values from a YAML file, which may be empty; InputError, naming it, if it is no mapping."""
     values = read_yaml(Path(check("path", path, PathText)))
     if values is None:
         return {}
@@ -364,23 +349,6 @@ def _boolean(value: Any) -> bool:
 # -- names and messages ----------------------------------------------------------------------------------------------
 
 
-def _nested(kind: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns values with dotted names resolved into mappings."""
-    if not isinstance(values, Mapping):
-        fail(kind.__name__, values, "a mapping of names to values")
-    made = joined({}, values)  # which refuses what is nested too deep
-    for name, following in itertools.pairwise(sorted(_names(values))):
-        if name == following:
-            raise InputError(f"{name}: is given twice")
-    return made
-
-
-def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the dotted names of all values that are no mappings."""
-    for key, value in values.items():
-        yield from _names(value, f"{prefix}{key}.") if isinstance(value, Mapping) else (f"{prefix}{key}",)
-
-
 def _fields(value: Any) -> Mapping[str, Any]:
     """Returns a mapping, or a record as one; empty for another value."""
     if is_record(value):
@@ -393,20 +361,6 @@ def _record_in(hint: Any) -> Any:
     if is_record(hint):
         return hint
     return next((found for part in typing.get_args(hint) if (found := _record_in(part)) is not None), None)
-
-
-def _merged(settings: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a record's fields as keyword arguments, with the changes merged in."""
-    values = dict(_fields(settings))
-    for name, change in changes.items():
-        now = values.get(name)
-        if isinstance(change, Mapping) and is_record(now):
-            renamed = "name" in change and change["name"] != getattr(now, "name", None)
-            change = dict(change) if renamed else _merged(now, change)
-        elif isinstance(change, Mapping) and isinstance(now, Mapping):
-            change = joined(now, change)
-        values[name] = change
-    return values
 
 
 def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:

@@ -64,54 +64,29 @@ def _level(value: Any) -> Any:
     return value
 
 
-def _environment(value: Any) -> Any:
-    names = ("name", "num_agents", "action_size", "reset", "step")
-    if isinstance(value, type) or not all(hasattr(value, name) for name in names):
-        raise ValueError("an environment, such as that of mqe_jax.make")
-    return value
+def _having(names: str, allowed: str, *, lacks: str = "", callables: bool = False) -> Any:
+    """Returns the validator of objects with some attributes, or of functions too."""
+
+    def validate(value: Any) -> Any:
+        whole = all(hasattr(value, name) for name in names.split()) and not (lacks and hasattr(value, lacks))
+        if isinstance(value, type) or not (whole or (callables and callable(value))):
+            raise ValueError(allowed)
+        return value
+
+    return pydantic.AfterValidator(validate)
 
 
-def _single(value: Any) -> Any:
-    if hasattr(_environment(value), "num_envs"):
-        raise ValueError("one environment, such as that of mqe_jax.make, not a batch")
-    return value
-
-
-def _batch(value: Any) -> Any:
-    if not hasattr(_environment(value), "num_envs"):
-        raise ValueError("a batch of environments, such as VectorEnv(mqe_jax.make(task), 64)")
-    return value
-
-
-def _whole(value: Any) -> Any:
-    if isinstance(value, type) or not all(hasattr(value, x) for x in ("task", "agents", "act", "initial_memory")):
-        raise ValueError("a policy, such as that of mqe_jax.load_policy")
-    return value
-
-
-def _policy(value: Any) -> Any:
-    whole = all(hasattr(value, name) for name in ("act", "initial_memory"))
-    if isinstance(value, type) or not (whole or callable(value)):
-        raise ValueError("a policy, such as that of mqe_jax.load_policy, or a function act(obs, memory, key)")
-    return value
-
-
+# Kinds of arguments (`mqe_jax.core.settings.checked`).
+_ENV, _POLICY = "name num_agents action_size reset step", "a policy, such as that of mqe_jax.load_policy"
+_ACT = f"{_POLICY}, or a function act(obs, memory, key)"
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
-"""Kind of an argument that is a random key (see `mqe_jax.core.settings.checked`)."""
-RandomKeys = Annotated[Any, pydantic.AfterValidator(_keys)]
-"""Kind of an argument that holds a random key for each environment of a batch."""
-Level = Annotated[Any, pydantic.AfterValidator(_level)]
-"""Kind of an argument that is a curriculum level, a number or an array () in [0, 1]."""
-AnyEnvironment = Annotated[Any, pydantic.AfterValidator(_environment)]
-"""Kind of an argument that is one environment or a batch."""
-AnySingle = Annotated[Any, pydantic.AfterValidator(_single)]
-"""Kind of an argument that is one environment."""
-AnyBatch = Annotated[Any, pydantic.AfterValidator(_batch)]
-"""Kind of an argument that is a batch of environments."""
-AnyPolicy = Annotated[Any, pydantic.AfterValidator(_whole)]
-"""Kind of an argument that is a policy of a team."""
-PolicyOrAct = Annotated[Any, pydantic.AfterValidator(_policy)]
-"""Kind of an argument that is a policy or its function `act`."""
+RandomKeys = Annotated[Any, pydantic.AfterValidator(_keys)]  # one for each environment of a batch
+Level = Annotated[Any, pydantic.AfterValidator(_level)]  # of a curriculum, a number or an array () in [0, 1]
+AnyEnvironment = Annotated[Any, _having(_ENV, "an environment, such as that of mqe_jax.make")]
+AnySingle = Annotated[Any, _having(_ENV, "one environment, such as that of mqe_jax.make", lacks="num_envs")]
+AnyBatch = Annotated[Any, _having(f"{_ENV} num_envs", "a batch, such as VectorEnv(mqe_jax.make(task), 64)")]
+AnyPolicy = Annotated[Any, _having("task agents act initial_memory", _POLICY)]
+PolicyOrAct = Annotated[Any, _having("act initial_memory", _ACT, callables=True)]
 
 Teams = tuple[tuple[int, ...], ...]
 """Agents of each team; every agent belongs to exactly one."""
@@ -175,11 +150,7 @@ def reset_memory(memory: NetworkMemory, is_first: jax.Array) -> NetworkMemory:
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
-    """Returns an environment state with fields replaced: a dataclass, a NamedTuple, or a class with a `replace` method.
-
-    Raises:
-        InputError: for another kind of state.
-    """
+    """Returns a state, which is a dataclass, a NamedTuple or has a method `replace`, with fields replaced."""
     if dataclasses.is_dataclass(state) and not isinstance(state, type):
         return dataclasses.replace(state, **fields)
     for method in ("_replace", "replace"):
@@ -192,8 +163,7 @@ def replace_fields(state: Any, **fields: jax.Array) -> Any:
 def check_act(name: str, returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
     """Returns what a policy's `act` returned: actions of a shape, and a recurrent state like its `memory`.
 
-    Raises:
-        InputError: naming the argument that the policy is, for anything else.
+    InputError, naming the argument that the policy is, for anything else.
     """
 
     def shapes(tree: Any) -> Any:
@@ -233,12 +203,9 @@ class Outcome:
 
     success: Any = None
     """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None where there is no such measure."""
-    win: Any = None
-    """Whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss."""
-    draw: Any = None
-    """Whether it was a draw (K,)."""
-    loss: Any = None
-    """Whether each team lost (K,)."""
+    win: Any = None  # whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss
+    draw: Any = None  # whether it was a draw (K,)
+    loss: Any = None  # whether each team lost (K,)
     further: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     """Further results of each team by name (K,), such as a distance, m."""
     ending: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
@@ -272,10 +239,8 @@ class Outcome:
 class Observations:
     """What agents see: the input of a policy. Leading axis N, or none for a single environment."""
 
-    obs: jax.Array
-    """Observations of the group `policy` (N, A, O)."""
-    active: jax.Array | None = None
-    """Which agents take part (N, A) bool; None: all."""
+    obs: jax.Array  # observations of the group `policy` (N, A, O)
+    active: jax.Array | None = None  # which agents take part (N, A) bool; None: all
     groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     """Observations of further groups by name (N, A, O_g)."""
 
@@ -314,14 +279,10 @@ RESULTS = ("win", "draw", "loss")
 class Cast(NamedTuple):
     """The environments of a training, and who else plays in them."""
 
-    env: Any
-    """Environments in which the policy learns."""
-    eval_env: Any = None
-    """Environments of evaluations during training; None without."""
-    league: Matchmaker | None = None
-    """Gives the environments their opponents between updates."""
-    teacher: Any = None
-    """The policy that imitation imitates."""
+    env: Any  # environments in which the policy learns
+    eval_env: Any = None  # environments of evaluations during training; None without
+    league: Matchmaker | None = None  # gives the environments their opponents between updates
+    teacher: Any = None  # the policy that imitation imitates
 
 
 class NetworkMemory(NamedTuple):
@@ -334,30 +295,18 @@ class NetworkMemory(NamedTuple):
 class Transition(NamedTuple):
     """One step of a rollout; stacked by the scan to a leading axis T."""
 
-    memory: NetworkMemory
-    """Recurrent state before this step, zeroed at an episode's first step."""
-    is_first: jax.Array
-    """Whether the step is the first of its episode (N,) bool."""
-    obs: jax.Array
-    """Observations (N, A, O)."""
-    privileged_obs: jax.Array
-    """Privileged observations (N, P)."""
-    final_obs: jax.Array | None
-    """Observations of the state reached (N, A, O), or None if the critic does not read them."""
-    final_privileged_obs: jax.Array | None
-    """Privileged observations of the state reached (N, P), or None."""
-    action: jax.Array
-    """Actions as sampled: unscaled and unclipped (N, A, D)."""
-    log_prob: jax.Array
-    """Log-probabilities of the actions (N, A, D)."""
-    reward: jax.Array
-    """Rewards (N, A)."""
-    active: jax.Array
-    """Which agents took part (N, A) bool."""
-    terminated: jax.Array
-    """Whether the episode terminated (N,) bool."""
-    done: jax.Array
-    """Whether it was terminated or truncated (N,) bool."""
+    memory: NetworkMemory  # recurrent state before this step, zeroed at an episode's first step
+    is_first: jax.Array  # whether the step is the first of its episode (N,) bool
+    obs: jax.Array  # observations (N, A, O)
+    privileged_obs: jax.Array  # privileged observations (N, P)
+    final_obs: jax.Array | None  # observations of the state reached (N, A, O), or None if the critic does not read them
+    final_privileged_obs: jax.Array | None  # privileged observations of the state reached (N, P), or None
+    action: jax.Array  # actions as sampled: unscaled and unclipped (N, A, D)
+    log_prob: jax.Array  # log-probabilities of the actions (N, A, D)
+    reward: jax.Array  # rewards (N, A)
+    active: jax.Array  # which agents took part (N, A) bool
+    terminated: jax.Array  # whether the episode terminated (N,) bool
+    done: jax.Array  # whether it was terminated or truncated (N,) bool
 
 
 class Batch(NamedTuple):
@@ -369,13 +318,8 @@ class Batch(NamedTuple):
     privileged_obs: jax.Array
     action: jax.Array
     log_prob: jax.Array
-    advantage: jax.Array
-    """Advantages (L, C, V)."""
-    target: jax.Array
-    """Value targets, normalised (L, C, V)."""
-    old_value: jax.Array
-    """Normalised values at collection (L, C, V)."""
-    active: jax.Array
-    """Which agents took part (L, C, A) bool."""
-    teacher_action: Any = ()
-    """Actions of the teacher, unscaled (L, C, A, D); empty without one."""
+    advantage: jax.Array  # advantages (L, C, V)
+    target: jax.Array  # value targets, normalised (L, C, V)
+    old_value: jax.Array  # normalised values at collection (L, C, V)
+    active: jax.Array  # which agents took part (L, C, A) bool
+    teacher_action: Any = ()  # actions of the teacher, unscaled (L, C, A, D); empty without one

@@ -51,8 +51,7 @@ def make(
         overrides: task parameters by name; nested ones as mappings or, from a dict, by dotted names:
             `make("go1gate", robot="go2", gate_width=0.8, rewards={"collision": -5.0})`.
 
-    Raises:
-        InputError: for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
+    InputError for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
     """
     cls = TASKS[task_id(task)]
     return cls(override(cls.Params(), overrides), impl=impl, control=control, num_envs=num_envs)

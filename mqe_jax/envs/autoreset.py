@@ -60,19 +60,12 @@ class Batch:
     """What all batches of environments of tasks have."""
 
     env: QuadrupedEnv
-    """The task."""
-    num_envs: int
-    """Number of environments N."""
-    num_agents: int
-    """Number of agents A of each."""
+    num_envs: int  # N
+    num_agents: int  # A, of each
     teams: tuple[tuple[int, ...], ...]
-    """Agents of each team."""
     action_size: int
-    """Length of an agent's action."""
     max_episode_steps: int
-    """Environment steps until the time limit."""
-    group_sizes: Mapping[str, int]
-    """Lengths of the agents' observations by group."""
+    group_sizes: Mapping[str, int]  # of the agents' observations
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.num_envs}: {getattr(self, 'inner', self.env)!r}>"
@@ -95,22 +88,15 @@ class Batch:
 class VectorEnv(Batch):
     """A batch of environments with automatic reset, as used for training and evaluation."""
 
-    copies: int
-    """Batches for which buffers are sized."""
-    final: tuple[str, ...]
-    """Which of `SEEN` are observed at the end of a step too, before any reset."""
     groups: tuple[str, ...] = ()
     """Groups that are observed besides `policy`."""
 
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = SEEN) -> None:
         """Creates the batch.
 
-        Args:
-            env: the task.
-            num_envs: number of environments N.
-            copies: batches under an outer `vmap`, such as one per seed, for which buffers are sized.
-            final: which of the observations `final_obs`, `final_privileged_obs` and `final_groups` a step returns, by
-                the names in `SEEN`; a critic needs what it reads, and each takes time.
+        `copies` are batches under an outer `vmap`, such as one per seed, for which buffers are sized. `final` says by
+        the names in `SEEN` which observations a step also returns as they were before any reset (`final_obs`, ...): a
+        critic needs what it reads, and each takes time.
         """
         if not isinstance(env, QuadrupedEnv):
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
@@ -153,11 +139,7 @@ class VectorEnv(Batch):
         return other
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances all environments by one step with actions (N, A, action_size); resets those that ended.
-
-        Raises:
-            InputError: as `QuadrupedEnv.step`, and for another number of environments.
-        """
+        """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
         self.check_step(state, action, State)
         return jax.vmap(self._step)(state, action)
 

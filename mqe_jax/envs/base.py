@@ -31,7 +31,7 @@ from mqe_jax.envs.returned import alike, results, shaped, weights_of
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
 from mqe_jax.physics import engines, robots
-from mqe_jax.physics.actuators import Actuators, NetworkActuators, load_actuator_network
+from mqe_jax.physics.actuators import NetworkActuators, load_actuator_network
 from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.index import RobotState, placed, read_robots
 from mqe_jax.physics.rotation import euler_to_quaternion
@@ -92,7 +92,7 @@ class QuadrupedEnv(Task[S, P]):
         self.dt = float(self.compiled.model.opt.timestep) * self.physics.num_substeps
         if self.max_steps < 1:
             fail("episode_length", self.params.episode_length, f"at least one environment step, {self.dt} s")
-        self.actuators = Actuators(self.physics, self.index)
+        self.actuators = None
         if network:
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
@@ -187,12 +187,7 @@ class QuadrupedEnv(Task[S, P]):
     @single
     @checked(key=RandomKey, assistance=Level)
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
-        """Returns a randomised initial state; runs no forward pass of the physics.
-
-        Args:
-            key: random key.
-            assistance: curriculum level in [0, 1]; 0 is the unmodified task.
-        """
+        """Returns a randomised initial state; the task is unmodified at `assistance` 0, a curriculum level up to 1."""
         return with_final(self.observed(self.begin(key, assistance)))
 
     def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
@@ -203,7 +198,7 @@ class QuadrupedEnv(Task[S, P]):
         anchors = self.compiled.sample_anchors(anchor_key)
         qpos, qvel = self._sample_robots(spawn_key, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel, assistance)
-        ctrl = self.actuators.control(jnp.asarray(self.controller.neutral))
+        ctrl = self._ctrl(jnp.asarray(self.controller.neutral))
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
         robot_state = self.read(data)
         no, empty = jnp.zeros((), bool), jnp.zeros((0,))
@@ -222,7 +217,7 @@ class QuadrupedEnv(Task[S, P]):
             step=jnp.zeros((), jnp.int32),
             anchors=anchors,
             control=self.controller.reset(),
-            actuators=self.actuators.init_memory(),
+            actuators=self.actuators.init_memory() if self.actuators else (),
             randomized=self.randomizer.sample(physics_key),
             task=nothing,
             assistance=assistance,
@@ -240,16 +235,11 @@ class QuadrupedEnv(Task[S, P]):
 
     @single
     def step(self, state: State[S], action: jax.Array) -> State[S]:
-        """Advances one environment by one environment step.
+        """Advances one environment by one environment step with actions (A, action_size), clipped to [-1, 1].
 
-        Args:
-            state: of the environment; an episode that has ended continues unless it is reset (see `VectorEnv`).
-            action: (A, action_size), floating point, in [-1, 1] (clipped to it).
-
-        Raises:
-            InputError: for a state of another task or of a batch, or if the action has another shape or dtype, or is
-                not finite. Finiteness is checked only outside of compiled code; inside, an action that is not finite
-                ends the episode as diverged.
+        An episode that has ended continues unless it is reset (see `VectorEnv`). InputError for a state of another task
+        or of a batch, and for an action of another shape or dtype, or that is not finite; in compiled code the latter
+        ends the episode as diverged.
         """
         return with_final(self.observed(self.advance(state, action)))
 
@@ -276,7 +266,11 @@ class QuadrupedEnv(Task[S, P]):
             target = target + state.randomized.motor_offset
         data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key)
         fields, forces = self.randomizer.fields(state.randomized), self.external_forces(state)
-        data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
+        if self.actuators is None:
+            actuators = ()
+            data, overflow = self.physics.step(data, self._ctrl(target), fields=fields, xfrc_applied=forces)
+        else:
+            data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
         robot_state = self.read(data, state.active)
         moved = {"data": data, "control": control, "actuators": actuators}
         state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
@@ -351,6 +345,10 @@ class QuadrupedEnv(Task[S, P]):
         roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
         return (out | (height < params.min_height) | (height > params.max_height)) & robot_state.active
+
+    def _ctrl(self, targets: jax.Array) -> jax.Array:
+        """Returns the engine's control (nu,) from targets of all robots (R, 12)."""
+        return placed(np.zeros(self.compiled.model.nu), self.index.actuator, targets)
 
     def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
         params, model, index = self.params, self.compiled.model, self.index

@@ -38,8 +38,7 @@ class BridgeParams(TaskParams):
     spawn_height: Length = 1.4
     platform: tuple[Length, Length] = (1.3, 2.5)
     """Extents of both platforms along x and y, m; their long sides are perpendicular to the bridge, as in the paper's
-    figure.
-    """
+    figure."""
     platform_x: Coordinates = (2.35, 7.65)
     """X of the platforms' centres, m."""
     top: Length = 1.02
@@ -50,8 +49,7 @@ class BridgeParams(TaskParams):
     """Thickness of the bridge, m."""
     spawn_x: Coordinates = (2.5, 7.5)
     """X of the robots' spawn poses, m. The released system spawns the first robot at 2.0, with its hind feet on the
-    platform's edge; here the two poses are symmetric.
-    """
+    platform's edge; here the two poses are symmetric."""
     off_height: Coordinate = 0.5
     """Height of a trunk below which a robot counts as off the bridge, m."""
     rewards: BridgeRewards = BridgeRewards()

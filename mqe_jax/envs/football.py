@@ -57,8 +57,7 @@ class FootballParams(TaskParams):
     head_start: Fraction = 0.0
     """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a match that of a team
     drawn at random, and the robots that attack it as far forward, so that agents first learn to score from near.
-    Inactive at assistance 0.
-    """
+    Inactive at assistance 0."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,23 +72,17 @@ F = TypeVar("F", bound=FootballParams)
 class Play:
     """Who touched the ball in this episode."""
 
-    touched: jax.Array
-    """Robots that touched it (R,) bool."""
-    last: jax.Array
-    """The robot that touched it last (R,) bool."""
-    passes: jax.Array
-    """Passes of each side (2,) int32: touches by a mate of the robot that touched the ball last."""
+    touched: jax.Array  # robots that touched it (R,) bool
+    last: jax.Array  # the robot that touched it last (R,) bool
+    passes: jax.Array  # passes of each side (2,) int32: touches by a mate of the robot that touched the ball last
 
 
 class Football(QuadrupedEnv[S, F]):
     """Base of the football tasks: the field, the ball and the kick-off."""
 
-    kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()
-    """Spawn pose x, y, yaw of each robot, m and rad."""
-    ball_spot: ClassVar[tuple[float, float]] = (7.0, 0.0)
-    """X, y of the ball at reset, m."""
-    colors: ClassVar[tuple[int, ...]] = ()
-    """Colours of the robots, as in `Scene`."""
+    kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()  # spawn pose x, y, yaw of each robot, m and rad
+    ball_spot: ClassVar[tuple[float, float]] = (7.0, 0.0)  # x, y of the ball at reset, m
+    colors: ClassVar[tuple[int, ...]] = ()  # colours of the robots, as in `Scene`
 
     def scene(self) -> Scene:
         params = self.params
@@ -201,10 +194,8 @@ class FootballMatchRewards:
 class FootballMatchState:
     """The task's own state."""
 
-    nearest: jax.Array
-    """Smallest distance of the ball to the goal that each team attacks in this episode (2,), m."""
-    play: Play
-    """Touches of the ball."""
+    nearest: jax.Array  # smallest distance of the ball to the goal that each team attacks in this episode (2,), m
+    play: Play  # touches of the ball
 
 
 @record

@@ -49,10 +49,8 @@ class DefenderParams(FootballParams):
 class DefenderState:
     """The task's own state."""
 
-    scored: jax.Array
-    """Whether the ball has been in the goal in this episode () bool."""
-    play: Play
-    """Touches of the ball before that."""
+    scored: jax.Array  # whether the ball has been in the goal in this episode () bool
+    play: Play  # touches of the ball before that
 
 
 class Go1FootballDefender(Football[DefenderState, DefenderParams]):

@@ -1,9 +1,7 @@
 """Matches: two teams of the same size against each other, with zero-sum rewards and mirrored observations.
 
-A match is symmetric under a half turn about its centre ("turn") or a reflection in the x-z plane ("reflect"). Agents of
-team 1 observe in the transformed frame, so that one policy can control either team.
-
-Team 0 has the first half of the agents, team 1 the second half.
+A match is symmetric under a half turn about its centre ("turn") or a reflection in the x-z plane ("reflect"). Team 1,
+the second half of the agents, observes in the transformed frame, so that one policy can control either team.
 """
 
 from __future__ import annotations

@@ -75,11 +75,7 @@ class ObservationLayout:
         return np.concatenate(rows)
 
     def slice(self, name: str) -> slice:
-        """Returns the position of a block in the vector.
-
-        Raises:
-            KeyError: if there is no such block.
-        """
+        """Returns the position of a block in the vector; KeyError if there is no such block."""
         start = 0
         for block in self.blocks:
             if block.name == name:
@@ -88,24 +84,14 @@ class ObservationLayout:
         raise KeyError(f"observation block: unknown name {name!r}; allowed: {', '.join(self.names)}")
 
     def pack(self, values: Mapping[str, jax.Array], agents: int | None = None) -> jax.Array:
-        """Concatenates named blocks (A, width) into observations (A, size); see `entities` for those of entities.
-
-        Raises:
-            ValueError: if names, widths or A, where it is given, do not match.
-        """
+        """Concatenates named blocks (A, width) into observations (A, size); ValueError for other names or widths."""
         named("observe", values, self.names)
         rows = (agents or len(values[self.names[0]]),)
         parts = [shaped(f"observe: {block.name}", values[block.name], (*rows, block.width)) for block in self.blocks]
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 
     def entities(self, observation: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:
-        """Returns a block of observations (..., size) by entity.
-
-        Entries are (..., count, width), and whether each is there (..., count) bool.
-
-        Raises:
-            KeyError: if there is no such block, or it is not of entities.
-        """
+        """Returns a block of observations by entity (..., count, width), and which are there (..., count) bool."""
         found = next((block.entities for block in self.blocks if block.name == name), None)
         if found is None:
             raise KeyError(f"observation block: {name!r} has no entities")
@@ -113,10 +99,7 @@ class ObservationLayout:
         return rows[..., : found.width], rows[..., -1] > 0.5 if found.masked else jnp.ones(rows.shape[:-1], bool)
 
     def split(self, observation: jax.Array) -> dict[str, jax.Array]:
-        """Returns the blocks (..., width) of observations (..., size) by name: the inverse of `pack`.
-
-        InputError for observations of another size.
-        """
+        """Returns the blocks (..., width) of observations (..., size) by name; InputError for another size."""
         if jnp.shape(observation)[-1:] != (self.size,):
             fail("obs", f"of shape {jnp.shape(observation)}", f"of {self.size} numbers for each agent")
         return {name: observation[..., self.slice(name)] for name in self.names}

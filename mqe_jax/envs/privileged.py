@@ -27,14 +27,9 @@ _ROBOT = (
 class PrivilegedObservation:
     """State of the R robots and all other moving bodies, anchors, physics parameters, gait phases, contact forces.
 
-    Physics parameters are included even if they are not randomised, so that the layout does not depend on the ranges.
-
-    `clock_size` is the length of the clock of a robot's skill, 0 without one; `contact_forces` adds those on trunks and
-    feet, which requires the scene's foot sensors.
+    Physics parameters are included even if not randomised. `clock_size` is the length of the clock of a robot's
+    skill; `contact_forces` adds those on trunks and feet, which requires the scene's foot sensors.
     """
-
-    layout: ObservationLayout
-    """Blocks in order; physical units, not normalised."""
 
     def __init__(
         self,

@@ -1,7 +1,4 @@
-"""go1pushbox, the paper's Push Box: two robots push a box through a gate.
-
-The box is too heavy for one robot to push effectively.
-"""
+"""go1pushbox, the paper's Push Box: two robots push a box, too heavy for one of them, through a gate."""
 
 from __future__ import annotations
 
@@ -62,8 +59,7 @@ class PushBoxParams(TaskParams):
     """Half-width of the uniform noise on the box's position, m."""
     head_start: NonNegative = 0.0
     """Curriculum: box and robots start up to head_start x `State.assistance` further along x, m, so that agents first
-    learn the end of the push. Inactive at assistance 0.
-    """
+    learn the end of the push. Inactive at assistance 0."""
     solver_iterations: Iterations = 8  # with 4 the pushed box does not converge on Warp
     contacts_per_robot: Buffer = 16
     rewards: PushBoxRewards = PushBoxRewards()
@@ -83,8 +79,7 @@ class PushBoxParams(TaskParams):
 class PushBoxState:
     """The task's own state."""
 
-    start: jax.Array
-    """X of the box at the reset (), m."""
+    start: jax.Array  # x of the box at the reset (), m
 
 
 class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):

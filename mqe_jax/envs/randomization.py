@@ -71,11 +71,7 @@ class RandomizedParams:
 
 
 class Randomizer:
-    """Samples randomised physics parameters and applies them to the model.
-
-    Raises:
-        InputError: if the lowest payload makes a trunk's mass zero or negative, or for `joint_mechanics` without any.
-    """
+    """Samples randomised physics parameters and applies them to the model."""
 
     def __init__(self, random: Randomization, model: mujoco.MjModel, index: RobotIndex, friction: float) -> None:
         self.random, self.model, self.index, self.friction = random, model, index, friction

@@ -6,7 +6,8 @@ A task's module is imported when its class is asked for, so that listing tasks i
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, MutableMapping
+from collections import UserDict
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from mqe_jax.core.errors import InputError, nearest
@@ -76,36 +77,16 @@ _NAMED: list[tuple[str, str, str]] = []
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
 
-class _Tasks(MutableMapping[str, "type[QuadrupedEnv]"]):
+class _Tasks(UserDict[str, Any]):
     """Task classes by id, of which the shipped ones are imported on demand."""
 
-    def __init__(self) -> None:
-        self._tasks: dict[str, type[QuadrupedEnv] | None] = dict.fromkeys(SHIPPED)
-
     def __getitem__(self, name: str) -> type[QuadrupedEnv]:
-        task = self._tasks[name]
-        if task is None:
-            task = self._tasks[name] = load("mqe_jax.envs", SHIPPED[name].task)
-            assert task.name == name, f"{task.__name__} has the id {task.name!r}, the registry {name!r}"
-        return task
-
-    def __setitem__(self, name: str, task: type[QuadrupedEnv]) -> None:
-        self._tasks[name] = task
-
-    def __delitem__(self, name: str) -> None:
-        del self._tasks[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._tasks
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._tasks)
-
-    def __len__(self) -> int:
-        return len(self._tasks)
+        if self.data[name] is None:
+            self.data[name] = load("mqe_jax.envs", SHIPPED[name].task)
+        return self.data[name]
 
 
-TASKS = _Tasks()
+TASKS = _Tasks(dict.fromkeys(SHIPPED))
 """Task classes by id."""
 
 PLANNERS: dict[str, Planner | str] = {name: task.planner for name, task in SHIPPED.items() if task.planner is not None}
@@ -118,11 +99,7 @@ NAMED_PLANNERS: dict[str, dict[str, Planner | str]] = {}
 
 @checked(task=str, name=str, planner=Callable | str)
 def register_planner(task: str, name: str, planner: Planner | str) -> None:
-    """Registers a further scripted policy of a task under a name.
-
-    Raises:
-        InputError: if the task is unknown, or another one has the name.
-    """
+    """Registers a further scripted policy of a task under a name that no other one has."""
     if task not in TASKS:
         raise InputError(f"planner {name!r}: unknown task {task!r}; allowed: {', '.join(TASKS)}")
     if NAMED_PLANNERS.setdefault(task, {}).setdefault(name, planner) is not planner:
@@ -133,8 +110,7 @@ def register_planner(task: str, name: str, planner: Planner | str) -> None:
 def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
-    Usable as a class decorator for a task without a scripted policy. InputError if it is no class of tasks, has no
-    name, or another class is registered under it.
+    A class decorator too. InputError if it is no class of tasks, has no name, or another class has that name.
     """
     from mqe_jax.envs.base import QuadrupedEnv
 

@@ -6,7 +6,6 @@ import dataclasses
 import io
 import json
 import pathlib
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -17,7 +16,6 @@ from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import archive, parse_json, write_atomically
 from mqe_jax.core.settings import Parameters, PathText, check, checked, fail, to_mapping
-from mqe_jax.core.types import AnySingle
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.physics.engines import STATE_FIELDS
@@ -30,31 +28,24 @@ _FIELDS = tuple("step anchors control actuators randomized task assistance froze
 class Recording:
     """Consecutive states of one environment within an episode, and the action taken in each."""
 
-    task: str
-    """Id of the task."""
-    params: dict[str, Any]
-    """The task's parameters as nested mappings."""
-    impl: str
-    """Physics engine."""
-    control: str
-    """Action mode."""
-    states: dict[str, np.ndarray]
-    """The fields of `State` on which a step depends, before each action, by path (T, ...)."""
-    actions: np.ndarray
-    """Actions (T, A, D)."""
+    task: str  # id of the task
+    params: dict[str, Any]  # the task's parameters as nested mappings
+    impl: str  # physics engine
+    control: str  # action mode
+    states: dict[str, np.ndarray]  # the fields of `State` on which a step depends, before each action, by path (T, ...)
+    actions: np.ndarray  # actions (T, A, D)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self) -> None:  # of a file
         for name, kind in {"task": str, "impl": str, "control": str, "params": Parameters}.items():
             check(name, getattr(self, name), kind)
         if "control" in self.params:
             raise InputError("params: the control mode is among them")
-        check("states", self.states, Mapping[str, Any])
-        for name, values in {"actions": self.actions, **self.states}.items():
-            if getattr(getattr(values, "dtype", None), "kind", "") not in (*"fiub",):
-                fail(name, values, "an array of numbers")
-        counts = {values.shape[:1] for values in (self.actions, *self.states.values())}
-        if self.actions.ndim != 3 or len(counts) > 1 or not len(self.actions):
-            fail("actions", f"of shape {self.actions.shape}", "(T, A, D), one for each of the T states")
+        arrays = {"actions": self.actions, **self.states}
+        for name, values in arrays.items():
+            if values.dtype.kind not in "fiub" or values.shape[:1] != self.actions.shape[:1]:
+                fail(name, values, "an array of numbers (T, ...)")
+        if self.actions.ndim != 3 or not len(self.actions):
+            fail("actions", f"of shape {self.actions.shape}", "(T, A, D)")
 
     def make_env(self, impl: str | None = None) -> QuadrupedEnv:
         """Creates the recorded environment, on the recorded engine if `impl` is None."""
@@ -64,22 +55,12 @@ class Recording:
         return make(self.task, impl=impl, control=self.control, num_envs=1, **self.params)
 
 
-@checked(file=PathText, env=AnySingle)
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
     """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
-    nq = env.compiled.model.nq
-    try:
-        flat, shape = _flat(states), (*states.step.shape, env.num_agents, env.action_size)
-    except AttributeError:
-        fail("states", states, f"those of {env.name}")
-    if flat["data/qpos"].shape[1:] != (nq,):
-        fail("states", f"with qpos {flat['data/qpos'].shape}", f"those of {env.name}, with qpos (T, {nq})")
-    if len(shape) != 3 or np.shape(actions) != shape:
-        fail("actions", f"of shape {np.shape(actions)}", f"{shape}, one for each state")
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
     first = int(np.flatnonzero(np.diff(steps, prepend=steps[0]) != 1)[-1])
     about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
-    arrays: dict[str, Any] = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in flat.items()}
+    arrays: dict[str, Any] = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()}
     arrays |= {"about": np.array(json.dumps(about)), "actions": np.asarray(actions)[first:]}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
@@ -99,13 +80,8 @@ def load_recording(file: str | pathlib.Path) -> Recording:
             raise ValueError(error) from None
 
 
-@checked(recording=Recording, env=AnySingle | None)
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
-    """Replays a recording, by default on the recorded engine; returns the states after each action (T, ...).
-
-    Raises:
-        InputError: if the recording's arrays do not fit the environment.
-    """
+    """Replays a recording, by default on the recorded engine; returns the states after each action (T, ...)."""
     env = recording.make_env() if env is None else env
     if (recording.task, recording.control) != (env.name, env.control):
         given = f"recording of {recording.task} with control {recording.control!r}"

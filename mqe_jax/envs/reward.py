@@ -15,23 +15,11 @@ from mqe_jax.envs.returned import named, shaped
 def weigh(
     terms: Mapping[str, jax.Array], weights: Any, teams: Sequence[Sequence[int]], active: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Returns the weighted sum of the terms per agent, and the weighted terms for logging.
+    """Returns the reward (A,), the weighted sum of the terms, and what is logged of it.
 
-    A term is () if it is shared by all agents, or (A,); of the latter the value of each team's first active agent is
-    logged. The reward of an agent that is not active is 0.
-
-    Args:
-        terms: unweighted terms by name.
-        weights: a record whose fields have the same names.
-        teams: agents of each team.
-        active: which agents take part (A,) bool.
-
-    Returns:
-        reward (A,), and `reward/<name>` () of every term with their sum `average_step_reward`, those of team 1 with the
-            prefix `team1/`.
-
-    Raises:
-        ValueError: if names or shapes differ.
+    A term is () if it is shared by all agents, or (A,); the fields of `weights` have the same names. Logged are
+    `reward/<name>` () and their sum `average_step_reward`, of each team's first active agent, those of team 1 with the
+    prefix `team1/`. The reward of an agent that is not `active` (A,) is 0. ValueError if names or shapes differ.
     """
     names, agents = [field.name for field in dataclasses.fields(weights)], sum(map(len, teams))
     named("rewards", terms, names)
@@ -63,10 +51,10 @@ def faded(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | floa
     return {name: term if getattr(weights, name) else factor * as_float(term) for name, term in terms.items()}
 
 
-def crowding(position: jax.Array, active: jax.Array, within: float = 0.5) -> jax.Array:
-    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below `within` m: (A, D) -> ()."""
+def crowding(position: jax.Array, active: jax.Array) -> jax.Array:
+    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below 0.5 m: (A, D) -> ()."""
     count = position.shape[0]
     apart = position[:, None] - position[None]
     square = jnp.sum(jnp.square(apart), axis=-1) + jnp.eye(count)
-    near = (square < within**2) & ~jnp.eye(count, dtype=bool) & active & active[:, None]
+    near = (square < 0.5**2) & ~jnp.eye(count, dtype=bool) & active & active[:, None]
     return jnp.sum(jnp.where(near, 1.0 / jnp.maximum(square, 1e-2), 0.0))

@@ -73,8 +73,7 @@ class SheepEasyParams(TaskParams):
     """Half-width of the uniform noise on each sheep's position, m."""
     restlessness: NonNegative = 0.08
     """Scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep of the released
-    system; in the paper sheep always move.
-    """
+    system; in the paper sheep always move."""
     sheep_friction: Friction = 1.0
     """Sliding friction between sheep and ground."""
     rewards: SheepRewards = SheepRewards()

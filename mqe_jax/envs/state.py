@@ -77,7 +77,7 @@ class State(EnvironmentState, Generic[S]):
     control: ControlState
     """Controller state."""
     actuators: Any
-    """Recurrent state of the actuators."""
+    """Recurrent state of the actuator network, empty without one."""
     randomized: RandomizedParams
     """Randomised physics parameters."""
     task: S

@@ -152,13 +152,7 @@ class Task(Generic[S, P]):
         return before.state.task
 
     def rewards(self, before: Moment[S], after: Moment[S], collision: jax.Array) -> dict[str, jax.Array]:
-        """Returns the unweighted reward terms of a step, () or (A,).
-
-        Args:
-            before: before the step.
-            after: after the step.
-            collision: whether there is any trunk contact of an agent () bool.
-        """
+        """Returns the unweighted reward terms of a step, () or (A,); `collision` (): an agent's trunk is touched."""
         raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
 
     def score(
@@ -175,12 +169,9 @@ class Task(Generic[S, P]):
         return jnp.zeros((), bool)
 
     def outcome(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Returns `success` () and further results by name (), which count at the end of an episode.
+        """Returns `success` () and further results by name () of an episode that ends here.
 
-        Args:
-            state: after the step.
-            robot_state: after the step.
-            failed: whether a fall, a collision or diverged physics ended the episode () bool.
+        `failed` () says whether a fall, a collision or diverged physics ends it.
         """
         return {"success": jnp.zeros(())}
 

@@ -68,8 +68,7 @@ class TugParams(TaskParams):
 class TugState:
     """The task's own state."""
 
-    previous_y: jax.Array
-    """Y of the cylinder one step earlier (), m."""
+    previous_y: jax.Array  # y of the cylinder one step earlier (), m
 
 
 class Go1Tug(Duel[TugState, TugParams]):

@@ -20,17 +20,12 @@ from mqe_jax.envs.state import EnvironmentState
 class WrappedState(EnvironmentState):
     """States of N environments as a wrapper shows them."""
 
-    inner: Any
-    """States of the wrapped batch."""
-    action: jax.Array
-    """Actions that the wrapped batch received in the last step (N, A, D)."""
+    inner: Any  # states of the wrapped batch
+    action: jax.Array  # actions that the wrapped batch received in the last step (N, A, D)
 
 
 class Outer(Batch):
-    """A batch of environments around another, whose attributes it has by default."""
-
-    inner: Any
-    """The wrapped batch."""
+    """A batch of environments around another, `inner`, whose attributes it has by default."""
 
     def __init__(self, inner: Any) -> None:
         self.inner, self.env, self.name, self.num_envs = inner, inner.env, inner.name, inner.num_envs

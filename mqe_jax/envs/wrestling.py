@@ -34,18 +34,14 @@ class WrestlingRewards:
 
 @record
 class WrestlingParams(TaskParams):
-    """Parameters of Sumo Wrestling.
-
-    A robot is eliminated when its |roll| or |pitch| exceeds the limit, or its trunk is outside the ring or too low.
-    """
+    """Parameters of Sumo Wrestling."""
 
     episode_length: TimeLimit = 15.0
     spawn_height: Length = 0.74
     max_roll: Positive = 0.4 * np.pi
     platform: Platform = Platform(center=(3.1, 0.0, 0.4), size=(4.37, 4.37, 0.5))
     """The platform, with the ring in its centre; its lower part is below the ground. Robots dropped from the spawn
-    height land on their feet.
-    """
+    height land on their feet."""
     ring_radius: Length = 1.7
     """Radius of the ring, m."""
     ring_depth: Distance = 0.2
@@ -54,8 +50,7 @@ class WrestlingParams(TaskParams):
     """Distance of the robots from the ring's centre, m; the first robot is on the side of negative y."""
     head_start: Distance = 0.0
     """Curriculum: both robots start up to head_start x `State.assistance` further along y, m, to a side drawn at
-    random, so that one is near the edge of the ring. Inactive at assistance 0.
-    """
+    random, so that one is near the edge of the ring. Inactive at assistance 0."""
     rewards: WrestlingRewards = WrestlingRewards()
     """Weights of the reward terms."""
 

@@ -29,11 +29,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def checked_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
-    """Returns the graph of a policy and its largest error against JAX in `STEPS` steps of the task.
-
-    Raises:
-        InputError: if it is larger than `LARGEST_ERROR`, or onnxruntime cannot run the graph.
-    """
+    """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above `LARGEST_ERROR`."""
     model = to_onnx(policy, env)
     return model, _largest(errors(model, *record(policy, env, STEPS)), f"{STEPS} steps of {env.name}")
 
@@ -58,10 +54,7 @@ def _largest(errors: Mapping[str, float], where: str) -> float:
 
 
 def record(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
-    """Returns inputs and outputs of `policy_step` by name, leading axis T, of episodes with mean actions.
-
-    The opponents of a match are idle.
-    """
+    """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and idle opponents."""
     shapes = input_shapes(policy, env)
 
     @jax.jit

@@ -19,8 +19,7 @@ class Package(NamedTuple):
 
     name: str
     version: str
-    sha256: str
-    """Of the archive."""
+    sha256: str  # of the archive
     files: tuple[str, ...]
 
 
@@ -52,19 +51,14 @@ PACKAGES = (
 
 
 def add_libraries(folder: Path, source: Path | None = None) -> None:
-    """Writes the libraries' files into a folder, from another folder with them or else from npm.
-
-    Raises:
-        InputError: for a file that the other folder lacks, or where npm cannot fetch a package of the pinned content.
-    """
+    """Writes the libraries' files into a folder, from another folder with them or else from npm."""
     contents = {}
     for package in PACKAGES:
-        archive = None if source is not None else _archive(package)
         for file in package.files:
             name = Path(file).name
             if source is not None and not (source / name).is_file():
                 raise InputError(f"libraries: {source} has no {name}, of {package.name}@{package.version}")
-            contents[name] = (source / name).read_bytes() if source is not None else _member(archive, file)
+            contents[name] = _member(_archive(package), file) if source is None else (source / name).read_bytes()
     for name, content in contents.items():
         write_atomically(folder / name, content)
 
@@ -81,8 +75,7 @@ def _archive(package: Package) -> Path:
     return archive
 
 
-def _member(archive: Path | None, name: str) -> bytes:
-    assert archive is not None
+def _member(archive: Path, name: str) -> bytes:
     with tarfile.open(archive) as files:
         content = files.extractfile(f"package/{name}")
         assert content is not None, name

@@ -15,10 +15,7 @@ from mqe_jax.physics.scene import build_spec
 
 @checked(env=QuadrupedEnv)
 def scene_xml(env: QuadrupedEnv) -> str:
-    """Returns the MJCF of the task's rendering model, which has the physics of the task's model.
-
-    MuJoCo writes six significant digits, so inertias and inertial frames differ by less than 1e-6 after recompilation.
-    """
+    """Returns the MJCF of the task's rendering model, with six significant digits."""
     spec, _ = build_spec(env.compiled.scene, visual=True)
     spec.compile()
     return spec.to_xml()

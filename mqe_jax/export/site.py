@@ -46,12 +46,9 @@ STARTS = 200
 class Entry:
     """A task with its parameters and its policies by name, the first of which plays by default."""
 
-    name: str
-    """Name of its folder."""
+    name: str  # of its folder
     env: QuadrupedEnv
-    """The task."""
-    policies: dict[str, Policy]
-    """Policies of a team; `idle` is always possible on the page."""
+    policies: dict[str, Policy]  # of a team; `idle` is always possible on the page
 
     def write(self, folder: Path) -> None:
         """Writes the task's files into its folder in a site; InputError for a graph that differs from JAX."""
@@ -89,14 +86,8 @@ def write_site(
 ) -> list[Entry]:
     """Writes the page with its tasks and libraries into a folder; returns the tasks.
 
-    Args:
-        sources: tasks, run folders and policy files; all tasks that have a policy if empty.
-        folder: new or existing.
-        libraries: folder of the browser libraries' files; fetched with npm if None.
-        say: receives what is done next, in a line.
-
-    Raises:
-        InputError: for a source that is none of these, a task or policy that cannot be exported, or without libraries.
+    `sources` are tasks, run folders and policy files, by default all tasks that have a policy. `libraries` is a folder
+    of the browser libraries' files, by default fetched with npm. `say` receives what is done next, in a line.
     """
     found = entries(sources)
     say("adding the browser libraries")
@@ -186,10 +177,9 @@ def start_states(env: QuadrupedEnv) -> dict[str, np.ndarray]:
 
 
 def packed(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
-    """Returns the columns of states that vary (N, K), and `fields`, `constant` and `varying` to restore them.
+    """Returns the columns of states that vary (N, K), and what restores them.
 
-    `fields` are the name and size of each array, in the order of a row; `constant` is the first row and `varying` the
-    positions in it that the columns replace.
+    `fields` are name and size of each array in a row, `constant` is the first row, `varying` the columns' positions.
     """
     rows = np.concatenate([x.reshape(len(x), -1) for x in states.values()], axis=1)
     varying = np.flatnonzero((rows != rows[0]).any(axis=0))
@@ -211,10 +201,7 @@ def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
 def _graph(
     function: Function, inputs: dict[str, tuple[int, ...]], name: str, states: dict[str, np.ndarray]
 ) -> onnx.ModelProto:
-    """Returns the graph of a function, checked on initial states as far as they have its inputs, else random numbers.
-
-    States before a step are those of other episodes.
-    """
+    """Returns the graph of a function, checked on initial states where they have its inputs, else on random numbers."""
     random = np.random.default_rng(0)
     known = {**states, **{f"before_{key}": np.roll(x, 1, axis=0) for key, x in states.items()}}
 

@@ -45,14 +45,8 @@ Arrays = Mapping[str, Any]
 class TaskFunctions:
     """The functions of a task, of one environment; domain randomisation is not part of them.
 
-    Raises:
-        InputError: for another control mode than `command`, or an actuator network.
+    InputError for another control mode than `command`, or an actuator network.
     """
-
-    env: QuadrupedEnv
-    """The task."""
-    outcomes: list[str]
-    """Names of the entries of the output `outcome`."""
 
     def __init__(self, env: QuadrupedEnv) -> None:
         if env.control != "command":
@@ -67,19 +61,17 @@ class TaskFunctions:
         self.env = env
         self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
         robots = env.read(self._start.data)
-        self.outcomes = list(env.result(self._start, robots, jnp.zeros((), bool)).named())
+        self.outcomes: list[str] = list(env.result(self._start, robots, jnp.zeros((), bool)).named())
         self._noise = _noise_size(lambda: env.step_npcs(self._start.data, robots, self._start.key))
 
     @property
     def control_inputs(self) -> Shapes:
-        """Shapes of the inputs of `control`."""
         actions = (self.env.num_agents, self.env.action_size)
         noise = {"noise": (self._noise,)} if self._noise else {}
         return self._state_inputs | {"action": actions, "drive": actions, "driven": actions[:1]} | noise
 
     @property
     def judge_inputs(self) -> Shapes:
-        """Shapes of the inputs of `judge`."""
         return self._state_inputs | {f"before_{name}": self._state_inputs[name] for name in PHYSICS}
 
     def control(self, inputs: Arrays) -> dict[str, jax.Array]:

@@ -1,4 +1,4 @@
-"""Actuators: targets of all robots' joints to the engine's control, and the physics under it."""
+"""An actuator network: torques of all robots' joints from their targets, at every physics step."""
 
 from __future__ import annotations
 
@@ -21,49 +21,13 @@ from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
 if TYPE_CHECKING:
     from mujoco import mjx
 
-
-@dataclasses.dataclass(frozen=True)
-class Actuators:
-    """The actuators of the compiled model, PD or torque, which the engine evaluates at every physics step."""
-
-    physics: Engine
-    """Physics of the environment."""
-    index: RobotIndex
-    """Index tables of the robots."""
-
-    def control(self, values: jax.Array) -> jax.Array:
-        """Returns the engine's control (nu,) from values of all robots (R, 12)."""
-        return placed(np.zeros(self.physics.model.nu), self.index.actuator, values)
-
-    def init_memory(self) -> Any:
-        """Returns the recurrent state after a reset."""
-        return ()
-
-    def step(
-        self,
-        data: mjx.Data,
-        memory: Any,
-        target: jax.Array,
-        fields: Mapping[str, jax.Array],
-        xfrc_applied: jax.Array | None,
-    ) -> tuple[mjx.Data, Any, jax.Array]:
-        """Advances the physics by one environment step under targets (R, 12); other arguments as `Engine.step`.
-
-        Returns:
-            Physics state, recurrent state, and whether any physics step may have dropped contacts () bool.
-        """
-        data, overflow = self.physics.step(data, self.control(target), fields=fields, xfrc_applied=xfrc_applied)
-        return data, memory, overflow
-
-
 ActuatorParams = dict[str, dict[str, jax.Array]]
 
 
 def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
     """Reads an actuator network (6-32-32-1, softsign) from safetensors: `0.weight` (32, 6), `0.bias`, `2...`, `4...`.
 
-    Raises:
-        InputError: if the file is missing, damaged, or holds other names or shapes.
+    InputError if the file is missing, damaged, or holds other names or shapes.
     """
     file = pathlib.Path(path)
     if not file.is_file():
@@ -74,12 +38,9 @@ def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
 
 
 def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Computes joint torques (...), N m, by the actuator network.
+    """Returns joint torques (...), N m, from joint position minus target, rad, and joint velocity, rad/s (3, ...).
 
-    Args:
-        params: weights of the network.
-        error: joint position minus target at this physics step and the two before (3, ...), rad.
-        velocity: joint velocity likewise (3, ...), rad/s.
+    The three are of this physics step and the two before.
     """
     x = jnp.moveaxis(jnp.concatenate([error, velocity]), 0, -1)
     for layer in ("0", "2"):
@@ -88,18 +49,19 @@ def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Arra
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkActuators(Actuators):
+class NetworkActuators:
     """An actuator network, which computes torques from joint targets at every physics step.
 
     Its recurrent state: joint position errors (rad) and velocities (rad/s) of the last two physics steps (2, R, 12).
     """
 
+    physics: Engine
+    index: RobotIndex
     robot: Robot
-    """Robot type."""
     params: ActuatorParams
-    """Weights of the network."""
 
     def init_memory(self) -> tuple[jax.Array, jax.Array]:
+        """Returns the recurrent state after a reset."""
         past = jnp.zeros((2, self.index.num_robots, NUM_JOINTS))
         return past, past
 
@@ -111,13 +73,16 @@ class NetworkActuators(Actuators):
         fields: Mapping[str, jax.Array],
         xfrc_applied: jax.Array | None,
     ) -> tuple[mjx.Data, Any, jax.Array]:
+        """Advances the physics by one environment step under joint targets (R, 12), rad; returns as `Engine.step`."""
+
         def substep(carry: Any, _: None) -> Any:
             data, (errors, velocities) = carry
             errors = jnp.concatenate([(data.qpos[self.index.joint_qpos] - target)[None], errors])
             velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
             limit = self.robot.torque_limit
-            torque = self.control(jnp.clip(actuator_torque(self.params, errors, velocities), -limit, limit))
-            data, overflow = self.physics.step(data, torque, fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
+            torque = jnp.clip(actuator_torque(self.params, errors, velocities), -limit, limit)
+            ctrl = placed(np.zeros(self.physics.model.nu), self.index.actuator, torque)
+            data, overflow = self.physics.step(data, ctrl, fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
             return (data, (errors[:2], velocities[:2])), overflow
 
         (data, memory), overflow = jax.lax.scan(substep, (data, memory), None, self.physics.num_substeps)

@@ -7,11 +7,7 @@ MAX_ROBOTS = 16
 
 
 def robot_bits(number: int) -> tuple[int, int]:
-    """Returns (contype, conaffinity) of all collision geoms of robot `number`.
-
-    Each robot has its own contype bit; its conaffinity includes ground, walls, objects and every other robot. Geoms of
-    different robots therefore collide, geoms of the same robot do not.
-    """
+    """Returns (contype, conaffinity) of a robot's geoms, which collide with all but its own."""
     first = 2 * OBJECT_BIT
     own, robots = first << number, (first << MAX_ROBOTS) - first
     return own, GROUND_BIT | WALL_BIT | OBJECT_BIT | (robots & ~own)

@@ -25,17 +25,12 @@ _JOINT = mujoco.mjtJoint
 class Poses(NamedTuple):
     """Poses of B bodies in the environment frame."""
 
-    position: jax.Array
-    """Origins of the bodies' frames (B, 3), m."""
-    quaternion: jax.Array
-    """Orientations, wxyz (B, 4)."""
+    position: jax.Array  # origins of the bodies' frames (B, 3), m
+    quaternion: jax.Array  # orientations, wxyz (B, 4)
 
 
 def poses(model: mujoco.MjModel, data: mjx.Data, bodies: Sequence[int] | np.ndarray) -> Poses:
-    """Returns the poses of bodies, given by their ids; only their ancestors are computed.
-
-    Quaternions in `data.qpos` are taken to be normalised.
-    """
+    """Returns the poses of bodies, given by their ids; quaternions in `data.qpos` are taken to be normalised."""
     found: dict[int, tuple[Any, Any]] = {0: (jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]))}
 
     def place(body: int) -> tuple[Any, Any]:

@@ -1,10 +1,4 @@
-"""Scene objects: boxes, balls, sheep, doors, planks, platforms.
-
-An object is a record (`mqe_jax.core.settings`), which a task's parameters may nest, that adds one body to a scene. The
-control laws of scripted NPCs are in `npc`.
-
-Frame: the environment's; metre, kilogram, second, radian, newton.
-"""
+"""Scene objects: records, which a task's parameters may nest, that add one body each to a scene; SI units."""
 
 from __future__ import annotations
 
@@ -78,7 +72,6 @@ class Box(Object):
     """Sliding friction; takes precedence over the ground's."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the box."""
         x, y, z = np.square(self.size)
         body = add_body(spec, name, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
         _add_joint(body, "free", _JOINT.mjJNT_FREE)
@@ -102,10 +95,7 @@ class Ball(Object):
     """Angular damping, N m s/rad."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the ball, a thin shell, on three slides and a ball joint.
-
-        A free joint is unsuitable, because it has a single damping coefficient for all six degrees of freedom.
-        """
+        # A thin shell on three slides and a ball joint: a free joint has a single damping coefficient.
         body = add_body(spec, name, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
         add_slides(body, "xyz", self.damping)
         _add_joint(body, "turn", _JOINT.mjJNT_BALL, self.angular_damping)
@@ -116,11 +106,7 @@ class Ball(Object):
 
 @record
 class Cylinder(Object):
-    """An upright cylinder that slides along y only. Coordinate: y, m; velocity likewise.
-
-    Its collision geom is a capsule whose cylindrical part has the cylinder's height; ground friction is modelled as
-    friction loss of the slide, which needs no contacts.
-    """
+    """An upright cylinder that slides along y only, with the ground's friction. Coordinate: y, m; velocity likewise."""
 
     x: Coordinate = 1.6
     """X of the axis, m."""
@@ -136,26 +122,12 @@ class Cylinder(Object):
     """Maximum |y|, m."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the cylinder."""
         body = add_body(spec, name, (self.x, 0.0, 0.0), self.mass, (1.0, 1.0, 1.0))
-        _add_joint(
-            body,
-            "y",
-            _JOINT.mjJNT_SLIDE,
-            axis=_AXES["y"],
-            limited=True,
-            range=(-self.reach, self.reach),
-            frictionloss=self.friction * self.mass * GRAVITY,
-        )
-        add_solid(
-            body,
-            _GEOM.mjGEOM_CAPSULE,
-            WOOD,
-            group=HIDDEN_GROUP,
-            size=(self.radius, 0, 0),
-            fromto=(0, 0, 0, 0, 0, self.height),
-            **_HELD,
-        )
+        limits = {"limited": True, "range": (-self.reach, self.reach)}
+        loss = self.friction * self.mass * GRAVITY
+        _add_joint(body, "y", _JOINT.mjJNT_SLIDE, axis=_AXES["y"], frictionloss=loss, **limits)
+        shape = {"size": (self.radius, 0, 0), "fromto": (0, 0, 0, 0, 0, self.height)}
+        add_solid(body, _GEOM.mjGEOM_CAPSULE, WOOD, group=HIDDEN_GROUP, **shape, **_HELD)
         if visual:
             bodies.drum(body, self.radius, self.height)
 
@@ -176,7 +148,6 @@ class Door(Object):
     """Damping of the hinge, N m s/rad."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the door."""
         body = add_body(spec, name, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia))
         _add_joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
         half, group = np.array(self.size) / 2, HIDDEN_GROUP if visual else 1
@@ -202,22 +173,12 @@ class Seesaw(Object):
     limit: Length = 0.254
     """Maximum |angle|, rad; at the lower limit the near end is on the ground."""
     damping: Damping = 1000.0
-    """Damping of the hinge, N m s/rad; limits its speed: a Go1 (111 N) at the far end, 1.9 m from the hinge, turns it
-    at 0.21 rad/s.
-    """
+    """Damping of the hinge, N m s/rad: a Go1 (111 N) at the far end, 1.9 m from it, turns it at 0.21 rad/s."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the plank, and its posts as visual geoms."""
         body = add_body(spec, name, self.hinge, self.mass, (self.inertia,) * 3)
-        _add_joint(
-            body,
-            "pitch",
-            _JOINT.mjJNT_HINGE,
-            self.damping,
-            axis=_AXES["y"],
-            limited=True,
-            range=(-self.limit, self.limit),
-        )
+        limits = {"limited": True, "range": (-self.limit, self.limit)}
+        _add_joint(body, "pitch", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["y"], **limits)
         half = np.array(self.size) / 2
         add_solid(body, _GEOM.mjGEOM_BOX, WOOD, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
         if visual:
@@ -237,7 +198,6 @@ class Platform(Object):
     """Radius of the supporting column, m; none if 0."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the block."""
         x, y, top = self.center
         body = spec.worldbody.add_body(name=name, pos=(x, y, top - self.size[2] / 2))
         add_solid(body, _GEOM.mjGEOM_BOX, STONE, size=np.array(self.size) / 2, **_FLOOR)
@@ -272,20 +232,14 @@ class Ring(Object):
     """Width of the line, m."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the line."""
         body = spec.worldbody.add_body(name=name, pos=self.center)
-        if not visual:
-            return
-        for part in circle((0.0, 0.0), self.radius, width=self.width):
+        for part in circle((0.0, 0.0), self.radius, width=self.width) if visual else ():
             part.add(body)
 
 
 @record
 class Sheep(Object):
-    """An upright sheep that slides over the ground without rotating. Coordinates: x, y; velocity likewise.
-
-    Ground friction is part of `flock`, which needs no contacts.
-    """
+    """An upright sheep that slides without friction or rotation (see `flock`). Coordinates: x, y; velocity likewise."""
 
     radius: Length = 0.2
     """Radius, m."""
@@ -295,17 +249,10 @@ class Sheep(Object):
     """Mass, kg."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the sheep: a capsule whose lower end is below the ground, so that it is cylindrical at ground level."""
+        # The lower end of the capsule is below the ground, so that it is cylindrical at ground level.
         body = add_body(spec, name, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
         add_slides(body, "xy")
-        add_solid(
-            body,
-            _GEOM.mjGEOM_CAPSULE,
-            STONE,
-            group=HIDDEN_GROUP if visual else 1,
-            size=(self.radius, 0, 0),
-            fromto=(0, 0, 0, 0, 0, self.height - self.radius),
-            **_HELD,
-        )
+        shape = {"size": (self.radius, 0, 0), "fromto": (0, 0, 0, 0, 0, self.height - self.radius)}
+        add_solid(body, _GEOM.mjGEOM_CAPSULE, STONE, group=HIDDEN_GROUP if visual else 1, **shape, **_HELD)
         if visual:
             bodies.sheep(body, self.radius, self.height)

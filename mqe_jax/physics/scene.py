@@ -50,12 +50,9 @@ class Scene:
     """Physics step, s."""
     solver_iterations: int = 4
     """Maximum Newton iterations per physics step."""
-    line_search_iterations: int = 8
-    """Maximum line search steps per iteration."""
     max_contacts: int = 32
     """Maximum active contacts per environment on MJX-JAX (deepest first). Without the cap MJX allocates constraints for
-    every candidate geom pair, which halves CPU throughput. The other engines keep all.
-    """
+    every candidate geom pair, which halves CPU throughput. The other engines keep all."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_robots <= MAX_ROBOTS:
@@ -85,35 +82,20 @@ class CompiledScene:
     """A compiled scene."""
 
     scene: Scene
-    """Source scene."""
-    model: mujoco.MjModel
-    """Model for the physics, without visual geoms."""
+    model: mujoco.MjModel  # of the physics, without visual geoms
     index: RobotIndex
-    """Index tables of the robots."""
     objects: Mapping[str, ObjectIndex]
-    """Index tables of the objects, by name."""
     layout: Layout
-    """The track's walls, anchors and spawn poses."""
     motors: Motors
-    """Motors of the robots."""
     mocap_offset: np.ndarray
     """Offset of each moving wall from its anchor (W, 3), m; the anchor's z is 0."""
     mocap_anchor: np.ndarray
     """Anchor of each moving wall (W,)."""
 
-    @property
-    def anchor_mean(self) -> np.ndarray:
-        """Mean anchor positions (G, 2), m."""
-        return np.array([anchor.position for anchor in self.layout.anchors]).reshape(-1, 2)
-
-    @property
-    def anchor_spread(self) -> np.ndarray:
-        """Half-widths of the anchors' ranges (G, 2), m."""
-        return np.array([anchor.spread for anchor in self.layout.anchors]).reshape(-1, 2)
-
     def sample_anchors(self, key: jax.Array) -> jax.Array:
         """Samples the anchors' positions (G, 2), m."""
-        mean, spread = self.anchor_mean, self.anchor_spread
+        anchors = self.layout.anchors
+        mean, spread = np.array([(a.position, a.spread) for a in anchors]).reshape(-1, 2, 2).swapaxes(0, 1)
         return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
 
     def wall_positions(self, anchors: jax.Array) -> jax.Array:
@@ -138,7 +120,7 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
     spec.compiler.degree = False
     spec.option.timestep = scene.timestep
     spec.option.iterations = scene.solver_iterations
-    spec.option.ls_iterations = scene.line_search_iterations
+    spec.option.ls_iterations = 8
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     # Without islands the C engine's solver iterates over the whole scene, as MJX does, and the engines agree.

@@ -176,9 +176,9 @@ def render(
         InputError: as `evaluate`.
     """
     from mqe_jax.viz.recording import record
-    from mqe_jax.viz.render import load_gl
+    from mqe_jax.viz.render import gl_backend
 
-    threading.Thread(target=load_gl, daemon=True).start()  # while the episode is computed
+    threading.Thread(target=gl_backend, daemon=True).start()  # while the episode is computed
     playing = build.players(task, policy, opponent, env=env, impl=impl, num_envs=episodes, deterministic=deterministic)
     key = jax.random.PRNGKey(seed)
     recorded = record(playing.env, playing.policy, key, episodes=episodes, seconds=seconds)

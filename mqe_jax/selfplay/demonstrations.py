@@ -33,22 +33,20 @@ MOMENTS = 16
 class DemonstratedState(State[Any]):
     """States of N environments, and M states in which episodes can start."""
 
-    demonstrations: PyTree
-    """Fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`."""
+    demonstrations: PyTree  # fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`
 
 
 class Demonstrated(VectorEnv):
-    """A batch of environments whose episodes start in states of a demonstrator's.
+    """A batch of environments whose episodes start, with the probability `assistance`, in states of a demonstrator's.
 
-    They do with the probability `assistance`, in any state. The time of such a state counts, so its episode has the
-    time that was left to the demonstrator. The states are the same in all runs of a task.
+    Such an episode has the time that was left to the demonstrator. The states are the same in all runs of a task.
     """
 
     @checked(demonstrator=AnyPolicy)
     def __init__(
         self, env: QuadrupedEnv, num_envs: int, demonstrator: Policy, copies: int = 1, *, final: Sequence[str] = SEEN
     ) -> None:
-        """Creates the batch; `demonstrator` acts for all agents, the others are those of `VectorEnv`."""
+        """Creates the batch, as `VectorEnv`; `demonstrator` acts for all agents."""
         super().__init__(env, num_envs, copies, final=final)
         if (demonstrator.task, demonstrator.agents) != (env.name, env.num_agents):
             given = f"one of {demonstrator.agents} agents on {demonstrator.task}"
@@ -85,7 +83,6 @@ class Demonstrated(VectorEnv):
         return DemonstratedState(**vars(after), demonstrations=demonstrations)
 
     def _record(self) -> PyTree:
-        """Returns the fields of the demonstrator's states."""
         guide, policy = self._guide, self.demonstrator
         first = policy.initial_memory(EPISODES)
 

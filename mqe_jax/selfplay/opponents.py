@@ -38,16 +38,11 @@ from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 class Opponent:
     """The opponent of a block of B environments."""
 
-    arrays: PyTree
-    """Arrays of the opponent; empty where it cannot change."""
-    before: PyTree
-    """Arrays of the opponent before the last change."""
-    waiting: jax.Array
-    """Environments whose episode is still against the opponent before the change (B,) bool."""
-    memory: Memory
-    """Recurrent state, leading axis B."""
-    outcomes: jax.Array
-    """Episodes that team 0 won, drew and lost against it (3,) int32, in the order of `RESULTS`."""
+    arrays: PyTree  # arrays of the opponent; empty where it cannot change
+    before: PyTree  # arrays of the opponent before the last change
+    waiting: jax.Array  # environments whose episode is still against the opponent before the change (B,) bool
+    memory: Memory  # recurrent state, leading axis B
+    outcomes: jax.Array  # episodes that team 0 won, drew and lost against it (3,) int32, in the order of `RESULTS`
 
 
 @jax.tree_util.register_dataclass
@@ -58,12 +53,9 @@ class TeamState(EnvironmentState):
     Every (M / N)th of `step` and `assistance` is that of a match; `key` is that of the opponents' actions.
     """
 
-    match: EnvironmentState
-    """State of the matches, leading axis N."""
-    action: jax.Array
-    """Actions of all agents in the last step (N, A, D)."""
-    opponents: tuple[Opponent, ...]
-    """The opponent of each block of environments."""
+    match: EnvironmentState  # state of the matches, leading axis N
+    action: jax.Array  # actions of all agents in the last step (N, A, D)
+    opponents: tuple[Opponent, ...]  # the opponent of each block of environments
 
 
 class OneTeam(Outer):
@@ -82,6 +74,17 @@ class OneTeam(Outer):
         match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
         return self.inner.step(match, action)
 
+    def _state(self, match: EnvironmentState, of_agents: Any, of_match: Any, **own: Any) -> TeamState:
+        """Returns the state of the environments: fields of agents (N, A, ...) and others (N, ...) mapped, or `own`."""
+        agents = ("obs", "final_obs", "reward", "active", "groups", "final_groups")
+        others = ("privileged_obs", "final_privileged_obs", "terminated", "truncated", "step", "assistance")
+        others += ("metrics", "outcome")
+        metrics = {name: x for name, x in match.metrics.items() if not name.startswith("team1/")}
+        team0 = dataclasses.replace(match, metrics=metrics, outcome=match.outcome.by_team(lambda x: x[:, :1]))
+        fields = {name: jax.tree.map(of_agents, getattr(match, name)) for name in agents}
+        fields |= {name: jax.tree.map(of_match, getattr(team0, name)) for name in others}
+        return TeamState(**{**fields, "match": match, **own})
+
 
 class Versus(OneTeam):
     """N matches as N environments of team 0, in K equal blocks with one opponent each; see `versus`.
@@ -89,16 +92,13 @@ class Versus(OneTeam):
     Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
     """
 
-    opponents: tuple[Policy, ...]
-    """Opponent of each block at the start."""
-
     @checked(matches=AnyBatch, opponents=Sequence[AnyPolicy], draw_reward=Number)
     def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
         super().__init__(matches, matches.num_envs)
         self.draw_reward = draw_reward
         for policy in opponents:
             check_policy(policy, matches, "an opponent")
-        self.opponents = tuple(opponents)
+        self.opponents = tuple(opponents)  # of the blocks at the start
         self._check_blocks(self.num_envs)
 
     def __repr__(self) -> str:
@@ -131,7 +131,6 @@ class Versus(OneTeam):
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
         self.check_step(state, action, TeamState)
-        self._check_opponents(state)
         key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
         others, opponents = [], []
         for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
@@ -152,22 +151,11 @@ class Versus(OneTeam):
 
     @checked(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
-        """Returns the state with another opponent in a block.
+        """Returns the state with another opponent in a block, a trained policy of the same architecture.
 
-        Each environment keeps its opponent until its episode ends; the state holds both until then. While environments
-        still wait for an earlier change, only the opponent for which they wait is replaced, also where it already
-        plays.
-
-        Args:
-            state: of the environments.
-            block: index of the block.
-            policy: the new opponent, of the same architecture as the first one.
-            at_once: exchange the opponent within the episodes, as for an opponent that is the newest policy itself.
-
-        Raises:
-            InputError: for a block whose opponent is not a trained policy, or a policy of another architecture.
+        Each environment keeps its opponent until its episode ends, unless `at_once`. While environments still wait for
+        an earlier change, only the opponent for which they wait is replaced, also where it already plays.
         """
-        self._check_opponents(state)
         if not block < len(self.opponents):
             fail("block", block, f"below {len(self.opponents)}, the number of blocks")
         check_policy(policy, self.inner)
@@ -179,12 +167,6 @@ class Versus(OneTeam):
             raise InputError(f"policy: of another architecture than block {block}: {other}")
         changed = exchange(opponent, _arrays(policy), at_once=at_once)
         return dataclasses.replace(state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :]))
-
-    def _check_opponents(self, state: TeamState) -> None:
-        """Raises an InputError for a state against opponents of other kinds."""
-        ours = [(_arrays(policy), policy.initial_memory(1)) for policy in self.opponents]
-        if jax.tree.structure(ours) != jax.tree.structure([(each.arrays, each.memory) for each in state.opponents]):
-            fail("state", "one against other opponents", f"one that `reset` of this {type(self).__name__} returns")
 
     @property
     def _size(self) -> int:
@@ -205,27 +187,8 @@ class Versus(OneTeam):
         self, match: EnvironmentState, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array
     ) -> TeamState:
         """Returns the state of team 0."""
-        own = slice(0, self.num_agents)
-        return TeamState(
-            match=match,
-            action=action,
-            obs=match.obs[:, own],
-            privileged_obs=match.privileged_obs,
-            final_obs=jax.tree.map(lambda x: x[:, own], match.final_obs),
-            final_privileged_obs=match.final_privileged_obs,
-            reward=match.reward[:, own],
-            terminated=match.terminated,
-            truncated=match.truncated,
-            outcome=match.outcome.by_team(lambda x: x[:, :1]),
-            metrics={name: value for name, value in match.metrics.items() if not name.startswith("team1/")},
-            step=match.step,
-            assistance=match.assistance,
-            opponents=opponents,
-            key=key,
-            active=jax.tree.map(lambda x: x[:, own], match.active),
-            groups=jax.tree.map(lambda x: x[:, own], match.groups),
-            final_groups=jax.tree.map(lambda x: x[:, own], match.final_groups),
-        )
+        cut = lambda x: x[:, : self.num_agents]  # noqa: E731
+        return self._state(match, cut, lambda x: x, action=action, opponents=opponents, key=key)
 
 
 @checked(env=AnyBatch, draw_reward=Number)
@@ -235,19 +198,11 @@ def versus(
     *,
     draw_reward: float = 0.0,
 ) -> Versus:
-    """Returns matches as environments of team 0 alone, against opponents that control team 1.
+    """Returns matches as environments of team 0, against opponents that control team 1.
 
-    The environments meet the opponents in turn, equally many each. Trained policies act as they are loaded (sampled,
-    unless deterministic) and can be exchanged (`Versus.change`); others are fixed.
-
-    Args:
-        env: the matches.
-        opponents: policies, or what `load_policy` accepts; their number divides the number of environments. A single
-            one may be given without a list.
-        draw_reward: added to the reward of a step that ends an episode with a draw.
-
-    Raises:
-        InputError: for a task that is not a match, another number of opponents, or a policy of another task.
+    The environments meet the opponents, policies or what `load_policy` accepts, in turn, equally many each. Trained
+    policies act as they are loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`). A draw adds
+    `draw_reward`. InputError for a task that is not a match, and for a policy of another task.
     """
     alone = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
     given: Any = [opponents] if alone else opponents
@@ -290,29 +245,12 @@ class Mirror(OneTeam):
         def privileged(x: jax.Array) -> jax.Array:
             return jnp.concatenate([twice(x), jnp.tile(jnp.arange(2.0), len(x))[:, None]], axis=1)
 
-        metrics = {name: twice(value) for name, value in match.metrics.items() if not name.startswith("team1/")}
-        for name in ("diverged", "overflow"):
-            metrics[name] = jnp.where(jnp.arange(self.num_envs) % 2 == 0, metrics[name], 0.0)
-        return TeamState(
-            match=match,
-            action=action,
-            obs=teams(match.obs),
-            privileged_obs=privileged(match.privileged_obs),
-            final_obs=jax.tree.map(teams, match.final_obs),
-            final_privileged_obs=jax.tree.map(privileged, match.final_privileged_obs),
-            reward=teams(match.reward),
-            terminated=twice(match.terminated),
-            truncated=twice(match.truncated),
-            outcome=jax.tree.map(twice, match.outcome.by_team(lambda x: x[:, :1])),
-            metrics=metrics,
-            step=twice(match.step),
-            assistance=twice(match.assistance),
-            opponents=(),
-            key=jnp.zeros((2,), jnp.uint32),
-            active=jax.tree.map(teams, match.active),
-            groups=jax.tree.map(teams, match.groups),
-            final_groups=jax.tree.map(teams, match.final_groups),
-        )
+        names = "privileged_obs", "final_privileged_obs"
+        own = {name: jax.tree.map(privileged, getattr(match, name)) for name in names}
+        state = self._state(match, teams, twice, action=action, opponents=(), key=jnp.zeros((2,), jnp.uint32), **own)
+        first = jnp.arange(self.num_envs) % 2 == 0
+        once = {name: jnp.where(first, state.metrics[name], 0.0) for name in ("diverged", "overflow")}
+        return dataclasses.replace(state, metrics=state.metrics | once)
 
 
 def exchange(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> Opponent:

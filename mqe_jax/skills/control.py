@@ -1,4 +1,4 @@
-"""Control: from agents' actions to actuator targets (`mqe_jax.physics.actuators` applies them).
+"""Control: from agents' actions to actuator targets.
 
 | mode | per robot | meaning |
 |---|---|---|

@@ -52,8 +52,7 @@ def _per_column(scores: Array) -> Array:
 def band(runs: Sequence[Run], column: str = REWARD) -> tuple[Array, Array, Array, Array]:
     """Returns steps (K,), interquartile mean and interval bounds (K,) of a column over a cell's seeds.
 
-    Curves are interpolated to the first seed's steps, up to the last step that all seeds have reached. A reward term
-    that a curve lacks is zero.
+    Curves are interpolated to the first seed's steps, as far as all seeds have come; a missing reward term is zero.
     """
     steps = runs[0].curve["env_steps"]
     steps = steps[steps <= min(run.curve["env_steps"][-1] for run in runs)]
@@ -80,10 +79,7 @@ def absolute(run: Run, name: str) -> float:
 
 
 def evaluated(cells: Cells) -> Cells:
-    """Returns the cells whose runs all have evaluations, with these as curves: env_steps, REWARD under sampled actions.
-
-    Training curves include shaping rewards and assistance; evaluations are always of the unmodified task.
-    """
+    """Returns the cells whose runs all have evaluations, with these, of the unmodified task, as curves."""
     chosen: dict[Cell, list[Run]] = {}
     for cell, runs in cells.items():
         curves = [
@@ -110,10 +106,7 @@ def curve_rows(cells: Cells) -> Rows:
 
 
 def final_rows(cells: Cells, reference: Reference) -> Rows:
-    """Returns the table of final values, a row for each cell; `reference` only where it has values.
-
-    An estimate is NaN if a seed has no value.
-    """
+    """Returns the table of final values, a row for each cell; an estimate is NaN if a seed has no value."""
     rows = []
     for cell, runs in cells.items():
         row: dict[str, Any] = {**dataclasses.asdict(cell), "seeds": len(runs)}

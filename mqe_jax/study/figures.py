@@ -49,10 +49,7 @@ def _color(algorithm: str, algorithms: Sequence[str]) -> str:
 
 
 def draw_curves(cells: Cells, reference: Reference) -> bytes:
-    """Returns the training curves: for each variant a block of tasks, two per row, with bands over seeds.
-
-    Dashed lines are the reference's values, in the algorithm's colour.
-    """
+    """Returns the training curves, a block of tasks for each variant; dashed lines are the reference's values."""
     variants, algorithms, tasks = (names(cells, field) for field in ("variant", "algorithm", "task"))
     figure = _figure(max(5.0, 3.7 * min(2, len(tasks)) * len(variants)), 2.5 * -(-len(tasks) // 2) + 0.9)
     blocks = figure.subfigures(1, len(variants), squeeze=False)[0]
@@ -75,12 +72,9 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
 
 
 def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
-    """Draws dashed lines at values by algorithm or `best`; where several coincide, dashes alternate."""
+    """Draws dashed lines at values by algorithm or `best`."""
     for name, value in values.items():
-        same = [other for other in values if values[other] == value]
-        dashes = (_DASHES[1][0], _DASHES[1][1] + (len(same) - 1) * sum(_DASHES[1]))
-        offset = -same.index(name) * sum(_DASHES[1])
-        axes.axhline(value, color=_COLORS.get(name, _INK), lw=1.0, ls=(offset, dashes), alpha=0.8)
+        axes.axhline(value, color=_COLORS.get(name, _INK), lw=1.0, ls=_DASHES, alpha=0.8)
 
 
 def draw_evaluations(

@@ -1,13 +1,9 @@
-"""The report of a sweep: figures, tables and aggregates over seeds, generated from its finished runs alone.
-
-The output is deterministic: bootstrap intervals use a fixed seed, and figures contain no timestamp.
-"""
+"""The report of a sweep, generated from its finished runs: the same files from the same runs."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +11,12 @@ from mqe_jax.core.files import check_folder, write_atomically
 from mqe_jax.core.literal import to_markdown
 from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, evaluated, final_rows, group
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
-from mqe_jax.study.runs import PLAIN, REWARD, Reference, Run, read_runs, table
+from mqe_jax.study.runs import Reference, Run, read_runs, table
 from mqe_jax.train.logs import number
 
 
 def report(folder: Path, reference: Reference | None = None) -> list[Path]:
-    """Writes FOLDER/report from the finished runs of a sweep; returns the files.
-
-    Raises:
-        InputError: if no run is finished, or a file of one is damaged.
-    """
+    """Writes FOLDER/report from the finished runs of a sweep; returns the files. InputError if there are none."""
     runs = read_runs(folder)
     check_folder(folder / "report", "folder")
     return write_report(runs, folder / "report", reference or Reference())
@@ -52,8 +44,6 @@ def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> lis
     if aggregates:
         files["profiles.png"] = draw_profiles(cells, reference)
         text += ["![Performance profiles](profiles.png)", ""]
-    if any(run.absolute is not None for run in runs):
-        files["marl_eval.json"] = (json.dumps(to_marl_eval(runs), indent=1) + "\n").encode()
     files["report.md"] = "\n".join(text).encode()
     for name, content in files.items():
         write_atomically(target / name, content)
@@ -71,10 +61,7 @@ _HEADINGS = {
 
 
 def markdown(rows: Rows, names: Mapping[str, str] | None = None) -> str:
-    """Returns rows as a Markdown table of the columns `names`, with these headings; of all columns by default.
-
-    NAME, NAME_low and NAME_high (or low and high) share one column.
-    """
+    """Returns rows as a Markdown table of the columns `names`, with these headings; an interval joins its value."""
     ends = [name for name in rows[0] if name in ("low", "high") or name.endswith(("_low", "_high"))]
     names = names or {name: name for name in rows[0] if name not in ends}
     lines = [list(names.values()), ["---"] * len(names), *([_shown(row, name) for name in names] for row in rows)]
@@ -95,28 +82,3 @@ def _shown(row: Mapping[str, Any], name: str) -> str:
 
 def _short(value: float) -> str:
     return number(value) if float(value).is_integer() else f"{value:.3g}"
-
-
-def to_marl_eval(runs: Iterable[Run]) -> dict[str, Any]:
-    """Returns the nested mapping that the package `marl-eval` reads (Gorsane et al. 2022, arXiv 2209.10485).
-
-    Environment -> task -> algorithm -> run -> step_k -> {step_count, metric: [value]}, absolute_metrics. Runs without
-    evaluations are left out; a variant is a task of its own, TASK+VARIANT. Each list holds one value, the mean over the
-    evaluation's episodes under sampled actions; the format allows this instead of one value per episode.
-    """
-    tree: dict[str, Any] = {}
-    for run in runs:
-        if run.absolute is None:
-            continue
-        steps: dict[str, Any] = {
-            f"step_{i}": {"step_count": point["env_steps"], **_metrics(point)}
-            for i, point in enumerate(run.evaluations, start=1)
-        }
-        steps["absolute_metrics"] = _metrics(run.absolute)
-        task = run.cell.task if run.cell.variant == PLAIN else f"{run.cell.task}+{run.cell.variant}"
-        tree.setdefault(task, {}).setdefault(run.cell.algorithm, {})[f"seed_{run.seed}"] = steps
-    return {"mqe": tree}
-
-
-def _metrics(point: Mapping[str, Any]) -> dict[str, list[float]]:
-    return {name: [point["sampled"][name]] for name in (REWARD, "success_rate") if name in point["sampled"]}

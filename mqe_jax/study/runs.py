@@ -57,8 +57,7 @@ class Run:
 
     cell: Cell
     seed: int
-    curve: Curve
-    """Columns of metrics.csv, (updates,) each."""
+    curve: Curve  # columns of metrics.csv, (updates,) each
     evaluations: list[dict[str, Any]]
     """Evaluations during training: {env_steps, sampled, deterministic}; `sampled` and `deterministic` map names such as
     average_step_reward and success_rate to numbers or None."""
@@ -81,11 +80,7 @@ def finished(run_dir: Path) -> bool:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Reads the finished runs of a sweep's folder, ordered by path and seed.
-
-    Raises:
-        InputError: if there is none, or a file of one is damaged.
-    """
+    """Reads the finished runs of a sweep's folder, ordered by path and seed; InputError if there is none."""
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
         if path.parent.name.removeprefix("seed").isdecimal() and finished(path.parent):

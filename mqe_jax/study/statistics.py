@@ -19,10 +19,7 @@ Array = NDArray[np.float64]
 
 
 def interquartile_mean(scores: ArrayLike) -> Array:
-    """Returns the mean of the middle half of all scores: (..., runs, tasks) -> (...).
-
-    The lowest and the highest quarter, rounded down to whole scores, are discarded.
-    """
+    """Returns the mean of scores without the lowest and the highest quarter: (..., runs, tasks) -> (...)."""
     flat = _flat(np.asarray(scores, np.float64))
     cut = flat.shape[-1] // 4
     return np.sort(flat, axis=-1)[..., cut : flat.shape[-1] - cut].mean(axis=-1)
@@ -35,11 +32,7 @@ def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Array:
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
-    """Returns P(score of x > score of y), mean over tasks; ties count half.
-
-    Shapes: x (..., runs of x, tasks), y (..., runs of y, tasks) -> (...). Per task it is the Mann-Whitney U statistic
-    over the number of pairs.
-    """
+    """Returns P(score of x > score of y), mean over tasks: (..., runs, tasks) both -> (...); ties count half."""
     pairs = np.asarray(x, np.float64)[..., :, None, :] - np.asarray(y, np.float64)[..., None, :, :]
     return np.mean((pairs > 0) + 0.5 * (pairs == 0), axis=(-3, -2, -1))
 
@@ -51,9 +44,7 @@ def bootstrap_interval(
 
     `scores` are the statistic's arguments, resampled independently where there are several. Tasks are the strata and
     stay fixed. `random` is a `numpy.random.Generator`, or has its `integers`. The bounds of one run are the statistic.
-
-    Raises:
-        InputError: if scores are not (runs, tasks), or not finite.
+    InputError if scores are not (runs, tasks), or not finite.
     """
     groups = [np.asarray(group, np.float64) for group in scores]
     for group in groups:

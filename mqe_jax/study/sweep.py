@@ -21,7 +21,7 @@ import yaml
 from annotated_types import MaxLen, MinLen
 
 from mqe_jax.core.errors import InputError, InUseError, NonFiniteError, nearest
-from mqe_jax.core.files import check_folder, locked, making, write_atomically
+from mqe_jax.core.files import check_folder, locked, write_atomically
 from mqe_jax.core.limits import Seed, Seeds
 from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.core.types import Cast
@@ -73,8 +73,7 @@ class Job:
     cell: Cell
     configs: tuple[TrainConfig, ...]
     folders: tuple[Path, ...]
-    steps_done: int
-    """Environment steps of the slowest seed's newest checkpoint."""
+    steps_done: int  # environment steps of the slowest seed's newest checkpoint
 
     @property
     def steps_left(self) -> int:
@@ -84,11 +83,7 @@ class Job:
 
 
 def load_sweep(path: Path, part: str | None = None) -> Sweep:
-    """Reads a sweep's YAML file; of a file that maps names to sweeps, the sweep `part`.
-
-    Raises:
-        InputError: naming the file, for invalid content or an unknown part.
-    """
+    """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to sweeps; InputError names the file."""
     values = load_yaml(path)
     if part is not None:
         if not isinstance(values.get(part), dict):
@@ -103,11 +98,7 @@ def load_sweep(path: Path, part: str | None = None) -> Sweep:
 
 
 def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
-    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all without patterns.
-
-    Raises:
-        InputError: for a pattern that matches no cell.
-    """
+    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all without patterns."""
     product = itertools.product(sweep.tasks, sweep.algorithms, sweep.variants)
     cells = {cell.path.as_posix(): cell for cell in itertools.starmap(Cell, product)}
     wanted = set()
@@ -128,13 +119,11 @@ def plan(
     seeds: Sequence[int] = (),
     check: Callable[[TrainConfig, int], object] = lambda config, seeds: None,
 ) -> list[Job]:
-    """Returns the remaining jobs in the order of training, of the cells that `select` returns for `cells`.
+    """Returns the remaining jobs, in the order of training, of the cells that `select` returns for `cells`.
 
-    Of the sweep's seeds those in `seeds` are trained, or all if it is empty. `config_of(task, algorithm)` gives the
-    settings that those of the sweep override, and `check(config, seeds)` raises an InputError for settings with which
-    so many seeds could not start: here, before the first cell is trained. Finished runs are left out. Seeds whose
-    newest checkpoints differ are trained in separate jobs, so that all seeds of a job start from the same step.
-    InputError for a task, an algorithm, a setting, a pattern, a seed or a run folder that is not allowed.
+    `seeds` are some of the sweep's, all if empty. `config_of(task, algorithm)` gives the settings that those of the
+    sweep override; `check(config, seeds)` raises an InputError for settings with which so many seeds could not start,
+    before the first cell is trained. Seeds whose newest checkpoints differ are trained in separate jobs.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
@@ -193,10 +182,7 @@ def _run(folder: Path, cell: Cell, seed: int) -> Path:
 
 
 def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
-    """Returns the estimated duration of each job, s, from the speed of runs in the folder; NaN if there are none.
-
-    The speed is that of runs of the same task and algorithm, or else of all.
-    """
+    """Returns the estimated duration of each job, s, from runs of the same task and algorithm, else of all; or NaN."""
     speeds: dict[tuple[str, ...], list[float]] = {}
     for path in sorted(folder.glob("runs/*/*/seed*/metrics.csv")):
         with contextlib.suppress(InputError, KeyError):  # stopped before the first update, or without fps
@@ -212,12 +198,9 @@ def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
 
 
 def prepare(sweep: Sweep, folder: Path, *, write: bool = True) -> None:
-    """Writes sweep.yaml into a folder; tasks, algorithms, variants and seeds may be added later.
+    """Writes sweep.yaml into a folder, or without `write` only checks that this is possible.
 
-    Without `write` it only checks what the sweep will need.
-
-    Raises:
-        InputError: if the folder contains a sweep with different settings, or cannot be written.
+    Tasks, algorithms, variants and seeds may be added later; InputError for a sweep with different settings.
     """
     for place in (folder, folder / "report"):
         check_folder(place, "folder")
@@ -238,10 +221,8 @@ def prepare(sweep: Sweep, folder: Path, *, write: bool = True) -> None:
 class Unfinished(NamedTuple):
     """The jobs that `run` did not finish."""
 
-    others: list[Job]
-    """Those whose cells other processes have locked."""
-    failed: list[tuple[Job, Exception]]
-    """Those that failed, each with its error."""
+    others: list[Job]  # those whose cells other processes have locked
+    failed: list[tuple[Job, Exception]]  # those that failed, each with its error
 
 
 def run(
@@ -252,11 +233,8 @@ def run(
 ) -> Unfinished:
     """Trains the jobs sequentially, until `stop()`; each resumes from its checkpoints.
 
-    One that fails does not stop the others.
-
-    Several processes may run the same sweep at the same time, each job being trained by the one that locks its run
-    folders first. `on_failure` is called at once for a job that fails with bad input, a file that cannot be read or
-    written, a training that became non-finite, or memory that does not suffice.
+    A job that fails (bad input, files, numbers that are not finite, memory) does not stop the others: `on_failure` is
+    called at once. Several processes may run the same sweep: the one that locks a job's run folders first trains it.
     """
     unfinished = Unfinished([], [])
     for job in jobs:
@@ -278,7 +256,6 @@ def _train(job: Job, environments: MakeEnvironments, stop: Callable[[], bool]) -
         return
     with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
         for run_dir in job.folders:
-            locks.enter_context(making(run_dir))
             locks.enter_context(locked(run_dir))
     cast = environments(job.configs[0], len(job.configs))
     train_seeds(configs=job.configs, run_dirs=job.folders, resume=True, stop=stop, **cast._asdict())

@@ -50,10 +50,7 @@ def _hidden(params: Params, x: jax.Array, settings: ActorCritic) -> jax.Array:
 def _trunk(
     params: Params, memory: Memory, is_first: jax.Array, x: jax.Array, settings: ActorCritic
 ) -> tuple[jax.Array, Memory]:
-    """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ..., n_out), memory.
-
-    `memory` is the recurrent state. Only the recurrent unit is sequential; the other layers are batched over all steps.
-    """
+    """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ..., n_out), memory."""
     x = _hidden(params, x, settings)
     if settings.recurrent:
 

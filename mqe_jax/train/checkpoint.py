@@ -69,11 +69,7 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
 
 @checked(path=PathText, metadata=Mapping[str, Any], kind=Kind)
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
-    """Writes a pytree of arrays with JSON metadata; `kind` is the kind of file that `load_tree` checks.
-
-    The same content gives the same bytes: safetensors writes several entries of metadata in random order, so that
-    there is one.
-    """
+    """Writes a pytree of arrays with JSON metadata, whose same content gives the same bytes, as a file of a kind."""
     try:
         text = json.dumps(dict(metadata), sort_keys=True)
     except (TypeError, ValueError):
@@ -100,7 +96,10 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
             if FORMAT not in found:
                 raise InputError(f"not a file of this package, or of a version before 0.2.0; a {kind} is needed")
             header = parse_json(found[FORMAT], "header")
-            _check_header(header, kind)
+            if header["kind"] != kind:
+                raise InputError(f"holds a {brief(str(header['kind']))}; a {kind} is needed")
+            if header["version"] != str(VERSION):
+                raise InputError(f"has format version {brief(str(header['version']))}; version {VERSION} is needed")
             arrays = {name: file.get_tensor(name) for name in file.keys()}
             metadata = parse_json(header["metadata"], "metadata")
             if not isinstance(metadata, dict):
@@ -109,24 +108,8 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
                 raise ValueError("its content does not match its checksum")
     except InputError as error:
         text = str(error)
-        raise InputError(f"{text if str(path) in text else f'{path}: {text}'}{_older(path)}") from None
+        raise InputError(text if str(path) in text else f"{path}: {text}") from None
     return arrays, metadata
-
-
-def _check_header(header: Any, kind: str) -> None:
-    """Raises an InputError for a file of another kind or version."""
-    if header["kind"] != kind:
-        raise InputError(f"holds a {brief(str(header['kind']))}; a {kind} is needed")
-    if header["version"] != str(VERSION):
-        raise InputError(f"has format version {brief(str(header['version']))}; version {VERSION} is needed")
-
-
-def _older(path: Path) -> str:
-    """Returns what happens without a damaged checkpoint if the run has an older one, or an empty string."""
-    older = [other for other in list_checkpoints(path.parent.parent) if other.name < path.name]
-    if not older or path.parent != checkpoint_folder(path.parent.parent):
-        return ""
-    return f"; without this file the run resumes from {older[-1].name}"
 
 
 @checked(path=PathText, kind=Kind)
@@ -139,10 +122,9 @@ def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
 def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False, part: str = "") -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 
-    With `half`, float16 leaves are allowed where the template has float32, and are converted to it. With `part`, the
-    leaves below this path name alone are read, such as "extra/pool/". InputError in one line naming the file, for a
-    missing, damaged or truncated file, another format or format version, and leaves that are missing, unknown or of
-    another shape or dtype.
+    With `half`, float16 leaves are converted to float32. With `part`, only the leaves below this path name are read,
+    such as "extra/pool/". InputError, naming the file, if it is missing, damaged or of another version, and for leaves
+    that are missing, unknown, impossible or of another shape or dtype.
     """
     path = Path(path)
     arrays, metadata = _read(path, kind)

@@ -1,7 +1,4 @@
-"""Unbiased evaluation: each environment contributes a fixed quota of episodes.
-
-Short episodes are therefore not over-represented.
-"""
+"""Unbiased evaluation: a fixed quota of episodes from each environment, so that short ones are not over-represented."""
 
 from __future__ import annotations
 
@@ -99,23 +96,13 @@ class Result:
         """Rate of success."""
         return Rate.of(self.success_rate, self.episodes)
 
-    @property
-    def win(self) -> Rate | None:
-        """Rate of wins of a match; None of another task."""
-        return self._rate("win_rate")
-
-    @property
-    def draw(self) -> Rate | None:
-        """Rate of draws of a match; None of another task."""
-        return self._rate("draw_rate")
-
-    @property
-    def loss(self) -> Rate | None:
-        """Rate of losses of a match; None of another task."""
-        return self._rate("loss_rate")
-
     def _rate(self, name: str) -> Rate | None:
         return Rate.of(self.match[name], self.episodes) if name in self.match else None
+
+    # Rates of a match; None of another task.
+    win = property(lambda self: self._rate("win_rate"))
+    draw = property(lambda self: self._rate("draw_rate"))
+    loss = property(lambda self: self._rate("loss_rate"))
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values for JSON; the entries of all mappings but `terms` become top-level keys."""
@@ -147,18 +134,12 @@ class Result:
 class _Progress(NamedTuple):
     env_state: Any
     memory: Memory
-    finished: jax.Array
-    """Finished episodes (N,) int32."""
-    steps: jax.Array
-    """Counted steps (N,) int32."""
-    returns: jax.Array
-    """Rewards of team 0 summed over counted steps (N,)."""
-    step_sums: dict[str, jax.Array]
-    """Sums of metrics over counted steps (N,) each."""
-    outcome: Outcome
-    """Sums over counted episodes, leading axis N."""
-    diverged: jax.Array
-    """Counted episodes that ended because the physics diverged (N,)."""
+    finished: jax.Array  # finished episodes (N,) int32
+    steps: jax.Array  # counted steps (N,) int32
+    returns: jax.Array  # rewards of team 0 summed over counted steps (N,)
+    step_sums: dict[str, jax.Array]  # sums of metrics over counted steps (N,) each
+    outcome: Outcome  # sums over counted episodes, leading axis N
+    diverged: jax.Array  # counted episodes that ended because the physics diverged (N,)
 
 
 def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
@@ -203,27 +184,12 @@ def evaluate_batch(
     """Runs `episodes` episodes from fresh resets and returns their means.
 
     Each environment contributes its first `episodes // N` episodes, every few of them one more; later ones are ignored,
-    so the sample is not biased by episode length.
-
-    Args:
-        env: the environments.
-        policy: the policy of the environments' agents, or a function as its `act`.
-        episodes: number of episodes.
-        key: random key.
-        memory: initial recurrent state of a function, leading axis N; a policy brings its own.
-        block: steps per compiled call.
-        max_steps: limit on the steps of an environment.
-
-    Raises:
-        InputError: for `episodes` < 1, a policy of another task or with a `memory` too, or episodes that do not end
-            within `max_steps`.
+    so the sample is not biased by episode length. `policy` may be a function like a policy's `act`, and `memory` its
+    initial recurrent state, leading axis N. A compiled call makes `block` steps. InputError for a policy of another
+    task, and for episodes that do not end within `max_steps`.
     """
     act, memory = acting(policy, env, env.num_envs, memory)
-
-    def act_of(params: Any, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-        return act(obs, memory, key)
-
-    evaluator = Evaluator(env, act_of, memory, block=block, max_steps=max_steps)
+    evaluator = Evaluator(env, lambda params, *seen: act(*seen), memory, block=block, max_steps=max_steps)
     return evaluator(None, episodes, key[None])[0]
 
 
@@ -247,10 +213,7 @@ class Evaluator:
         self._env, self._block, self._max_steps = env, block, max_steps
 
         def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> _Progress:
-            def own_act(obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-                return act(params, obs, memory, key)
-
-            return _run_block(env, own_act, progress, key, memory, quota, block)
+            return _run_block(env, functools.partial(act, params), progress, key, memory, quota, block)
 
         def run(
             progress: _Progress, params: Any, keys: jax.Array, done_steps: jax.Array, quota: jax.Array

@@ -16,7 +16,7 @@ from pathlib import Path
 import yaml
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import check_folder, locked, making, remove_temporaries, write_atomically
+from mqe_jax.core.files import check_folder, locked, write_atomically
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.train.checkpoint import checkpoint_step, latest, list_checkpoints
 from mqe_jax.train.config import TrainConfig, load_config
@@ -38,10 +38,7 @@ def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
     with contextlib.ExitStack() as locks:
         check_folders(folders, resume)
         for folder in folders:
-            locks.enter_context(making(folder))
             locks.enter_context(locked(folder))
-            for inner in (folder, *folder.glob("*/")):
-                remove_temporaries(inner)
         for folder in folders:
             check_run(folder, resume)
         yield
@@ -69,11 +66,7 @@ def load_run_config(run_dir: str | Path) -> TrainConfig:
 
 
 def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
-    """Returns each folder's checkpoint at the newest step common to all; None (start from scratch) if any has none.
-
-    Raises:
-        InputError: if the folders have no step in common.
-    """
+    """Returns each folder's checkpoint at the newest common step; None (start from scratch) if any has none."""
     if not folders:
         return []
     by_step = [{checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders]
@@ -109,22 +102,10 @@ def check_alone(run_dir: Path) -> None:
 
 
 def check_run(run_dir: Path, resume: bool = False) -> None:
-    """Checks that a folder holds no run, or with `resume` one that can be resumed.
-
-    Raises:
-        InputError: if it holds a run that is not to be resumed or, without a checkpoint, anything but hidden files,
-            empty folders, and the output of commands.
-    """
+    """Raises an InputError for a folder with a run that is not to be resumed, or with other files but no checkpoint."""
     checkpoint = latest(run_dir)
-    found = [name for name in RUN_FILES if (run_dir / name).exists()] + ["checkpoints"] * (checkpoint is not None)
-    if found and not resume:
-        advice = "name another folder" if checkpoint is None else "resume it, or name another folder"
-        raise InputError(f"run_dir: {run_dir} already holds a run ({', '.join(found)}); {advice}")
-    if checkpoint is None and {CONFIG_FILE, POLICY_FILE} <= {*found}:
-        raise InputError(
-            f"run_dir: {run_dir} holds a run without a checkpoint, which cannot be resumed; name another folder, "
-            "and start from its policy by the setting 'start'"
-        )
+    if checkpoint is not None and not resume:
+        raise InputError(f"run_dir: {run_dir} already holds a run; resume it, or name another folder")
     inside = [path for path in sorted(run_dir.glob("[!.]*")) if path.suffix not in _OUTPUT]
     held = [path.name for path in inside if not path.is_dir() or any(path.glob("[!.]*"))]
     if held and checkpoint is None:

@@ -56,15 +56,11 @@ class TrainState:
     optimizer: AdamState
     obs_normalizer: ObservationNormalizer
     value_normalizer: ValueStatistics
-    learning_rate: jax.Array
-    """Learning rate before the schedule () float32."""
+    learning_rate: jax.Array  # learning rate before the schedule () float32
     rollout: RolloutState
-    key: jax.Array
-    """Random key."""
-    updates: jax.Array
-    """Updates done () int32."""
-    extra: PyTree = ()
-    """State of the league (`mqe_jax.core.types.Matchmaker`); empty without one."""
+    key: jax.Array  # random key
+    updates: jax.Array  # updates done () int32
+    extra: PyTree = ()  # state of the league (`mqe_jax.core.types.Matchmaker`); empty without one
 
 
 class Learner(NamedTuple):
@@ -84,18 +80,10 @@ def make_learner(
     processes: int = 1,
     stages: type[Stages] = Stages,
 ) -> Learner:
-    """Returns the learner of an environment.
+    """Returns the learner of an environment; InputError if the settings do not fit it.
 
-    Args:
-        env: the environments; with several processes, the share of one.
-        config: settings.
-        league: gives the environments their opponents between updates.
-        teacher: the policy that `imitation` imitates, without recurrent state.
-        processes: number of processes; `devices.Processes` compiles the functions of several.
-        stages: advantages, loss and update; a subclass is another algorithm.
-
-    Raises:
-        InputError: if the settings do not fit the environment.
+    Of several `processes`, `env` is the share of one, and `devices.Processes` compiles the functions. `teacher` is the
+    policy that `imitation` imitates. A subclass of `Stages` (advantages, loss and update) is another algorithm.
     """
     check_environment(env, config, processes)
     check_teacher(config, teacher)

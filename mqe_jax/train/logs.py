@@ -17,12 +17,12 @@ import uuid
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import jax
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from mqe_jax.core.errors import InputError
@@ -35,19 +35,18 @@ _PLAIN_SECONDS = 10.0
 _OUTPUT_SECONDS = 0.5
 
 
-class MetricsLog(Protocol):
+class MetricsLog:
     """Receives one row of numbers per update; a row has `env_steps`, which only increases."""
 
     def write(self, row: Mapping[str, float]) -> None:
         """Logs one row."""
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Flushes and closes."""
-        ...
+        """Ends the log; by default every row is on disk already."""
 
 
-class CsvLog:
+class CsvLog(MetricsLog):
     """Rows of `metrics.csv`, one per update; a resumed run drops rows after `env_steps`."""
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -66,9 +65,6 @@ class CsvLog:
             self._columns += new
             self._rewrite(rows)
         append(self._path, (",".join(number(row.get(name, math.nan)) for name in self._columns) + "\n").encode())
-
-    def close(self) -> None:
-        """Does nothing: every row is on disk."""
 
     def _rewrite(self, rows: list[dict[str, str]]) -> None:
         text = io.StringIO()
@@ -113,11 +109,10 @@ def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]
     return columns, rows
 
 
-class TensorBoardLog:
+class TensorBoardLog(MetricsLog):
     """TensorBoard events where tensorboardX is installed, otherwise nothing.
 
-    Written without tensorboardX's writer, whose thread dies where the disk is full, after which the training would wait
-    for it for ever.
+    Its own writer has a thread, which dies where the disk is full; the training would wait for it for ever.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -139,15 +134,9 @@ class TensorBoardLog:
         """Adds every finite number of the row at its `env_steps`."""
         if self._proto is None:
             return
-        values = [
-            {"tag": name, "simple_value": value}
-            for name, value in row.items()
-            if name != "env_steps" and math.isfinite(value)
-        ]
+        kept = ((name, x) for name, x in row.items() if name != "env_steps" and math.isfinite(x))
+        values = [{"tag": name, "simple_value": x} for name, x in kept]
         self._append(step=int(row["env_steps"]), summary={"value": values})
-
-    def close(self) -> None:
-        """Does nothing: every row is on disk."""
 
     def _append(self, **fields: Any) -> None:
         """Appends an event as TensorFlow's records are: length, its checksum, data, their checksum."""
@@ -157,13 +146,11 @@ class TensorBoardLog:
         append(self._path, length + checksums[0] + data + checksums[1])
 
 
-class WandbLog:
+class WandbLog(MetricsLog):
     """A Weights & Biases run, logged offline to `run_dir/wandb` unless WANDB_MODE=online is set.
 
-    `wandb sync` uploads it later. A resumed training run keeps its run id. The file is written by wandb's own process,
-    for whose last rows `close` does not wait: they follow at the latest when the program ends. `wandb.teardown()` waits
-    for them, but ends all runs of the program, so it is left to the caller. That process loses rows on a full disk and
-    does not report it; metrics.csv, on the same disk, does.
+    `wandb sync` uploads it later. A resumed training run keeps its run id. wandb's own process writes the file, the
+    last rows at the latest when the program ends; `wandb.teardown()` waits for them, but ends all runs of the program.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -190,7 +177,6 @@ class WandbLog:
         self._run.log(values, step=int(row["env_steps"]))
 
     def close(self) -> None:
-        """Finishes the run; the last rows may reach the file later."""
         self._run.finish()
 
 
@@ -223,8 +209,9 @@ class ProgressLog:
             display = importlib.import_module("IPython.display").display
             self._output = display({"text/plain": title}, raw=True, display_id=True)
         if shown and console.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(10), _Column(self._text))
-            self._bar = Progress(*columns, console=console)
+            text: Any = TextColumn("")  # what follows the bar
+            text.render = lambda task: Text(self._text())
+            self._bar = Progress(TextColumn("{task.description}"), BarColumn(10), text, console=console)
             self._task = self._bar.add_task(title, total=total_steps)
 
     def __enter__(self) -> Self:
@@ -310,17 +297,6 @@ class ProgressLog:
             print(f"{self._title}: {text}", file=sys.stderr, flush=True)
 
 
-class _Column(ProgressColumn):
-    """The text that a function returns."""
-
-    def __init__(self, text: Callable[[], str]) -> None:
-        super().__init__()
-        self._text = text
-
-    def render(self, task: Any) -> Text:
-        return Text(self._text())
-
-
 def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
@@ -330,10 +306,7 @@ def _clock(seconds: float) -> str:
 def row_of(
     updates: int, metrics: Mapping[str, Any], config: TrainConfig, start_time: float, update_began: float
 ) -> dict[str, float]:
-    """Returns a row of metrics.csv: steps and times first, then the update's metrics by name.
-
-    Means over episodes are NaN where none has ended.
-    """
+    """Returns a row of metrics.csv: steps and times, then the metrics by name; means over no episodes are NaN."""
     now = time.perf_counter()
     row: dict[str, float] = {
         "env_steps": updates * config.steps_per_update,

@@ -38,23 +38,22 @@ def clipped_surrogate(
     return -objective
 
 
-def huber(error: jax.Array, delta: float) -> jax.Array:
-    """Returns error^2 / 2 within +-delta and the tangent line beyond it."""
-    size = jnp.abs(error)
-    return jnp.where(size <= delta, 0.5 * jnp.square(error), delta * (size - 0.5 * delta))
-
-
 def value_loss(
     value: jax.Array, old_value: jax.Array, target: jax.Array, clip: float | None, huber_delta: float | None
 ) -> jax.Array:
-    """Returns the value loss per element: Huber (or half the square), clipped around `old_value`.
+    """Returns the value loss per element: half the square, linear beyond `huber_delta`; all of the same shape.
 
     With `clip`, the larger of the losses of `value` and of `value` clipped to `old_value` +- clip.
-    Shapes: all the same. Source: Yu et al., arXiv 2103.01955.
+    Source: Yu et al., arXiv 2103.01955.
     """
 
     def loss(error: jax.Array) -> jax.Array:
-        return 0.5 * jnp.square(error) if huber_delta is None else huber(error, huber_delta)
+        size, half = jnp.abs(error), 0.5 * jnp.square(error)
+        return (
+            half
+            if huber_delta is None
+            else jnp.where(size <= huber_delta, half, huber_delta * (size - 0.5 * huber_delta))
+        )
 
     unclipped = loss(value - target)
     if clip is None:
@@ -71,23 +70,10 @@ def ratio_per_agent(new: jax.Array, old: jax.Array) -> jax.Array:
     return jnp.sum(new - old, axis=-1, keepdims=True)
 
 
-def ratio_per_dimension(new: jax.Array, old: jax.Array) -> jax.Array:
-    """Returns one log-ratio per action dimension, as OpenRL does: (..., A, D) -> (..., A, D)."""
-    return new - old
-
-
-def ratio_joint(new: jax.Array, old: jax.Array) -> jax.Array:
-    """Returns the log of the product of the agents' ratios: (..., A, D) -> (..., 1, 1).
-
-    Source: JRPO, PPO on the joint policy of a team.
-    """
-    return jnp.sum(ratio_per_agent(new, old), axis=-2, keepdims=True)
-
-
 RATIOS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
     "agent": ratio_per_agent,
-    "dimension": ratio_per_dimension,
-    "joint": ratio_joint,
+    "dimension": lambda new, old: new - old,  # as OpenRL: (..., A, D) -> (..., A, D)
+    "joint": lambda new, old: jnp.sum(ratio_per_agent(new, old), axis=-2, keepdims=True),  # JRPO: (..., 1, 1)
 }
 """Log-ratio functions by the name of `ppo.ratio`."""
 

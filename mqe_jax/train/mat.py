@@ -22,8 +22,6 @@ from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import EnvDims, Evaluation, Mat, Network
 
-# -- layers ----------------------------------------------------------------------------------------------------------
-
 
 def attention(
     params: Params, query: jax.Array, context: jax.Array, heads: int, active: jax.Array | None, *, causal: bool
@@ -31,7 +29,6 @@ def attention(
     """Multi-head attention of `query` to `context`: (..., A, W), (..., A, W) -> (..., A, W).
 
     An agent attends to itself and to the active ones (..., A); with `causal`, to none after itself.
-
     Source: Vaswani et al., arXiv 1706.03762, equation 1.
     """
 
@@ -56,9 +53,6 @@ def _gelu(x: jax.Array) -> jax.Array:
 
 def _head(params: Params, x: jax.Array) -> jax.Array:
     return nn.dense(params["out"], nn.layer_norm(params["norm"], _gelu(nn.dense(params["hidden"], x))))
-
-
-# -- encoder and decoder ---------------------------------------------------------------------------------------------
 
 
 def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:

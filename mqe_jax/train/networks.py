@@ -132,10 +132,7 @@ NETWORKS: dict[str, type[NetworkSettings]] = {}
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
-    """Makes a class a settings record (see `mqe_jax.core.settings.record`) and registers it.
-
-    The functions of its network compute in single precision.
-    """
+    """Makes a class a settings record and registers it; the functions of its network compute in single precision."""
     check("name", name, str)
 
     def register(cls: type[Any]) -> type[Any]:
@@ -159,11 +156,7 @@ def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
 
 
 def network_settings(value: Any) -> Any:
-    """Returns the settings record that a mapping with a `name` describes (by default actor_critic).
-
-    Raises:
-        InputError: for a name that is not registered, or settings that fail validation.
-    """
+    """Returns the settings record that a mapping with a `name` describes (by default actor_critic)."""
     if not isinstance(value, Mapping):
         return value
     name = value.get("name", "actor_critic")
@@ -204,7 +197,6 @@ class ActorCritic(GaussianSettings):
         return ("privileged_obs",) if self.critic_input == "privileged" else ("obs",)
 
     def build(self, dims: EnvDims) -> Network:
-        """Returns the network; see `Network`."""
         from mqe_jax.train import actor_critic
 
         return actor_critic.network(self, dims)
@@ -224,8 +216,7 @@ class Mat(GaussianSettings):
     """Gain of the orthogonal initialisation of attention, of residual branches' last layers, and of output layers."""
     deviation: Literal["sigmoid", "free"] = "sigmoid"
     """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 initially (OpenRL), or an unconstrained
-    log, the only choice that uses log_std_*.
-    """
+    log, the only choice that uses log_std_*."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -237,7 +228,6 @@ class Mat(GaussianSettings):
         return ("obs",)
 
     def build(self, dims: EnvDims) -> Network:
-        """Returns the network; see `Network`."""
         from mqe_jax.train import mat
 
         return mat.network(self, dims)

@@ -45,12 +45,7 @@ def dense(params: Params, x: jax.Array, *, precision: str | None = PRECISION) ->
 
 
 def mlp_init(key: jax.Array, sizes: Sequence[int], *, final_scale: float = 1.0) -> Params:
-    """Initialises a chain of affine layers `"0"`, `"1"`, ... of widths `sizes`; the last has gain `final_scale`.
-
-    Shapes: layer i is (sizes[i], sizes[i + 1]). `sizes` holds at least two widths.
-    """
-    if len(sizes) < 2:
-        raise ValueError(f"sizes: {tuple(sizes)}; at least an input and an output width are needed")
+    """Initialises affine layers `"0"`, `"1"`, ... of shapes (sizes[i], sizes[i + 1]); the last has `final_scale`."""
     count = len(sizes) - 1
     keys = jax.random.split(key, count)
     gains = [math.sqrt(2.0)] * (count - 1) + [final_scale]
@@ -93,10 +88,7 @@ def layer_norm(params: Params, x: jax.Array) -> jax.Array:
 
 
 def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
-    """Initialises a gated recurrent unit: gates reset, update, candidate concatenated, each orthogonal.
-
-    Shapes: `input.weight` (n_in, 3 n_hidden), `hidden.weight` (n_hidden, 3 n_hidden), biases (3 n_hidden,).
-    """
+    """Initialises a gated recurrent unit: gates reset, update, candidate concatenated, each orthogonal."""
     keys = jax.random.split(key, 6)
 
     def three_gates(gate_keys: jax.Array, rows: int) -> Params:

@@ -51,10 +51,7 @@ def running_update(statistics: RunningStatistics, batch: jax.Array, active: jax.
 
 
 def running_normalize(statistics: RunningStatistics, x: jax.Array) -> jax.Array:
-    """Returns x (..., size) normalised to mean 0 and standard deviation 1, clipped to +-10.
-
-    The standard deviation is floored at 0.01, so that a constant entry becomes 0.
-    """
+    """Returns x (..., size) normalised to mean 0 and deviation 1, clipped to +-10; constant entries become 0."""
     std = jnp.maximum(jnp.sqrt(statistics.variance), _OBSERVATION_MIN_STD)
     return jnp.clip((x - statistics.mean) / std, -10.0, 10.0)
 
@@ -68,10 +65,7 @@ class ValueStatistics(NamedTuple):
 
 
 def value_init(enabled: bool = True) -> ValueStatistics:
-    """Returns statistics before the first update; if not `enabled`, those that leave values unchanged.
-
-    Before the first update the reward scale is unknown, and values denormalise to 0.
-    """
+    """Returns statistics with which values denormalise to 0; if not `enabled`, those that leave values unchanged."""
     return ValueStatistics(jnp.zeros(()), jnp.float32(not enabled), jnp.float32(not enabled))
 
 
@@ -89,8 +83,7 @@ def value_update(statistics: ValueStatistics, target: jax.Array, active: jax.Arr
 def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
     """Returns mean and standard deviation, both 0 before the first update.
 
-    The standard deviation is at least a thousandth of the root mean square, so that the normalisation is the same at
-    any scale of rewards and float32 rounding of nearly constant targets is not magnified.
+    The standard deviation is at least a thousandth of the root mean square: rounding errors are not magnified.
     """
     weight = jnp.where(statistics.weight > 0.0, statistics.weight, 1.0)
     mean, square = statistics.mean / weight, statistics.square / weight

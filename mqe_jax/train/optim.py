@@ -31,8 +31,7 @@ class Optimizer(NamedTuple):
 def begun_anew(state: AdamState, when: jax.Array | bool) -> AdamState:
     """Returns the initial state where `when` is true, else the state itself.
 
-    After updates with gradients of 0 the corrections of both moments are gone: the first real steps would be several
-    times as long as the learning rate.
+    After updates with gradients of 0, without corrections of the moments, the first real steps would be too long.
     """
     return state if when is False else jax.tree.map(lambda x: jnp.where(when, jnp.zeros_like(x), x), state)
 

@@ -19,12 +19,9 @@ class RolloutState(NamedTuple):
 
     env_state: Any
     memory: NetworkMemory
-    is_first: jax.Array
-    """Whether the next step is the first of an episode (N,) bool."""
-    episode_steps: jax.Array
-    """Steps in this episode (N,) int32."""
-    episode_return: jax.Array
-    """Sum of rewards in this episode, mean over agents (N,)."""
+    is_first: jax.Array  # whether the next step is the first of an episode (N,) bool
+    episode_steps: jax.Array  # steps in this episode (N,) int32
+    episode_return: jax.Array  # sum of rewards in this episode, mean over agents (N,)
 
 
 class ObservationNormalizer(NamedTuple):
@@ -71,8 +68,7 @@ def rollout(
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
     The environment receives `action_scale` times the sampled action. Metrics are means over steps and environments,
-    but `diverged` and `overflow` are counts; `ended` has the number of `episodes` that ended, and means over them, 0
-    without any, of their length, return and outcome.
+    but `diverged` and `overflow` are counts; `ended` has the number of `episodes` that ended and means over them.
     """
 
     def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
@@ -111,16 +107,12 @@ def rollout(
             episode_steps=jnp.where(done, 0, episode_steps),
             episode_return=jnp.where(done, 0.0, episode_return),
         )
-        return state, (transition, _sums(after.metrics), _sums({**_masked(ended, done), "episodes": done}))
+        last = {name: jnp.where(done, value, 0.0) for name, value in ended.items()}
+        return state, (transition, _sums(after.metrics), _sums({**last, "episodes": done}))
 
     state, (transitions, *sums) = jax.lax.scan(one_step, state, jax.random.split(key, length))
     steps, ended = devices.total(jax.tree.map(lambda x: jnp.sum(x, axis=0), sums))
     return state, transitions, _means(steps, ended, length * env.num_envs * devices.size())
-
-
-def _masked(values: dict[str, jax.Array], done: jax.Array) -> dict[str, jax.Array]:
-    """Returns values (N,) of environments whose episode ended, 0 for the others."""
-    return {name: jnp.where(done, value, 0.0) for name, value in values.items()}
 
 
 def _sums(values: dict[str, jax.Array]) -> dict[str, jax.Array]:
@@ -153,8 +145,7 @@ def take(batch: Batch, index: jax.Array) -> Batch:
 def minibatches(ppo: PPO, key: jax.Array, parts: int, envs: int) -> jax.Array:
     """Returns the chunks of every minibatch (M, C / M), of the C = parts x envs chunks of this process.
 
-    The environments of all processes are `ppo.groups` groups. The chunks of each are permuted, and every minibatch gets
-    equally many of them, so that a process with whole groups has its share of every minibatch.
+    The chunks of each of `ppo.groups` groups of environments are permuted, every minibatch gets equally many of them.
     """
     groups = ppo.groups // devices.size()
     keys = key[None] if ppo.groups == 1 else devices.rows(lambda n: jax.random.split(key, n), groups)

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core import interrupts
 from mqe_jax.core.devices import Processes, connected
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import PathText, check, fail, to_mapping
-from mqe_jax.core.types import AnyBatch, Matchmaker, VectorEnv, generator
-from mqe_jax.train.checkpoint import checkpoint_step, save_checkpoint
+from mqe_jax.core.types import AnyBatch, Matchmaker, PyTree, VectorEnv, generator, raw_keys
+from mqe_jax.train.checkpoint import checkpoint_step, latest, nonfinite, save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.finite import all_finite, check_finite, nonfinite_metrics
 from mqe_jax.train.folder import common_checkpoints, open_folders, write_config
 from mqe_jax.train.learner import Learner, TrainState
 from mqe_jax.train.logs import LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
@@ -29,6 +30,7 @@ from mqe_jax.train.seeds import Seeds, without_shared
 from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
+_METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
 
 
 def train(
@@ -41,24 +43,15 @@ def train(
     league: Matchmaker | None = None,
     teacher: Any = None,
 ) -> TrainState:
-    """Trains until `config.total_steps` and returns the last state.
+    """Trains until `config.total_steps` and returns the last state; without a `run_dir`, nothing is written.
 
-    Args:
-        env: the environments; of a task, with the parameters in the settings, where these name any or the task.
-        config: settings.
-        run_dir: folder of the run (see `mqe_jax.train.folder`); None writes nothing.
-        resume: resume a run in the folder from its newest checkpoint; an empty folder starts a new run.
-        on_update: called after every update with the state and its row of metrics.csv.
-        eval_env: separate environments, one for each of `config.evaluation.episodes`; needed where
-            `config.evaluation.every` is set.
-        league: gives the environments their opponents between updates.
-        teacher: the policy that `config.imitation` imitates.
+    `resume` resumes the run in the folder from its newest checkpoint; an empty one starts a new run. `on_update` gets
+    the state and the row of metrics.csv of every update. `eval_env` has an environment for each of
+    `config.evaluation.episodes`, `teacher` is the policy that `config.imitation` imitates.
 
-    Raises:
-        InputError: before anything in the folder is changed: where it cannot be written, is in use by another
-            process, or holds a run that is not to be resumed, has no checkpoint, or has other settings.
-        NonFiniteError: after the first update with a non-finite loss or weight. Checkpoints and policy
-            on disk are from before that update.
+    InputError, before anything is changed, for a folder that cannot be written, is in use, or holds a run that cannot
+    be resumed. NonFiniteError after the first update with a loss or weight that is not finite; what is on disk is from
+    before that update.
     """
     return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, league, teacher)[0]
 
@@ -76,8 +69,8 @@ def train_seeds(
 ) -> list[TrainState]:
     """Trains several seeds in one program, equivalently to separate runs, each with its own run folder; see `train`.
 
-    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all.
-    Where `stop()` is true before an update, the runs are saved and end there, to be resumed.
+    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all. If `stop()`
+    before an update, they are saved and end, to be resumed.
     """
     with open_training(env, configs, run_dirs, resume, eval_env, league, teacher) as training:
         return training.run(on_update, stop)
@@ -123,15 +116,6 @@ def open_training(
 class Training:
     """A training of S seeds, with their states stacked, in checked and locked folders or in none."""
 
-    env_steps: int
-    """Environment steps done by each seed."""
-    rows: list[list[dict[str, float]]]
-    """The rows of metrics.csv that `run` has added, of each seed."""
-    evaluations: list[EvaluationLog]
-    """Evaluations of each seed; empty without evaluation."""
-    resumed: bool
-    """Whether it continues from checkpoints."""
-
     def __init__(
         self,
         env: VectorEnv,
@@ -154,14 +138,15 @@ class Training:
         self._stacked = processes.stacked(seeds.shared)
         self._state = self._stacked.together(seeds.stack([state for state, _ in first]))
         self._update = self._stacked.compile(seeds.map(learner.update), more=True)
-        self.env_steps = int(first[0][0].updates) * self._config.steps_per_update
+        self.env_steps = int(first[0][0].updates) * self._config.steps_per_update  # done by each seed
         self.resumed = checkpoints[0] is not None
         self._saved = self.env_steps if self.resumed else -1
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
         if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
             self._monitor = Monitor(eval_env, self._config)
-        self.rows, self.evaluations = [[] for _ in configs], []
+        self.rows: list[list[dict[str, float]]] = [[] for _ in configs]  # of metrics.csv, added by `run`
+        self.evaluations: list[EvaluationLog] = []  # of each seed; empty without evaluation
 
     def run(self, on_update: OnUpdate | None = None, stop: Callable[[], bool] = lambda: False) -> list[TrainState]:
         """Runs the remaining updates, until `stop()`, and returns the last states."""
@@ -225,15 +210,15 @@ class Training:
         """Performs and logs one update of every seed; returns the rows of metrics.csv."""
         began = time.perf_counter()
         after, metrics = self._update(self._state)
-        metrics, finite = jax.device_get((metrics, all_finite(learned(after))))
+        metrics, finite = jax.device_get((metrics, _all_finite(learned(after))))
         updates, rows = self.env_steps // self._config.steps_per_update + 1, []
         for i in range(len(self._configs)):
             own = jax.tree.map(lambda x: x[i], metrics)  # noqa: B023
             row = row_of(updates, own, self._config, self._start_time, began)
             row["fps"] *= len(self._configs)
-            if not finite or nonfinite_metrics(row):
+            if not finite or not all(math.isfinite(row[name]) for name in _METRICS):
                 folder = self._folders[i] if self._folders else None
-                check_finite(learned(self._seeds.take(self._stacked.own(after), i)), row, folder)
+                _check_finite(learned(self._seeds.take(self._stacked.own(after), i)), row, folder)
             rows.append(row)
         for logs, done, row in zip(files, self.rows, rows, strict=True):
             for log in logs:
@@ -309,3 +294,25 @@ class Training:
             results = self._monitor.evaluate(policies, steps, episodes, absolute=True)
         for log, result in zip(self.evaluations, results, strict=True):
             log.end(result, self.env_steps)
+
+
+def _all_finite(tree: PyTree) -> jax.Array:
+    """Returns whether all numbers of a pytree are finite (), computed on the device."""
+    arrays = jax.tree.leaves(raw_keys(tree))
+    return _finite([x for x in arrays if x.size])  # jaxlib cannot compile empty ones of several processes
+
+
+@jax.jit
+def _finite(arrays: list[jax.Array]) -> jax.Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in arrays]))
+
+
+def _check_finite(learned: PyTree, row: Mapping[str, float], run_dir: Path | None) -> None:
+    """Raises a NonFiniteError naming the first metrics and learned arrays that an update made NaN or infinite."""
+    wrong = [name for name in _METRICS if not math.isfinite(row[name])] + nonfinite(learned)
+    if wrong:
+        kept = None if run_dir is None else latest(run_dir)
+        raise NonFiniteError(
+            f"{run_dir or 'training'}: update {row['updates']:.0f} ({row['env_steps']:.0f} environment steps) made "
+            f"{', '.join(wrong[:3])} NaN or infinite; the last finite checkpoint is {kept.name if kept else 'missing'}"
+        )

@@ -13,20 +13,13 @@ from mqe_jax.train.config import TrainConfig
 class Scheduled(NamedTuple):
     """Values of the scheduled settings in one update, () float32 each."""
 
-    assistance: jax.Array
-    """`curriculum.assistance`."""
-    failure_bootstrap: jax.Array
-    """`curriculum.failure_bootstrap`."""
-    entropy_coef: jax.Array
-    """`ppo.entropy_coef`."""
-    imitation: jax.Array
-    """`imitation.weight`."""
-    actor_coef: jax.Array | float
-    """Weight of all losses but the critic's: 0 during `ppo.critic_warmup`, then 1."""
-    actor_begins: jax.Array | bool
-    """Whether it is the first update with all losses after `ppo.critic_warmup`."""
-    learning_rate_factor: jax.Array
-    """Factor of `optimizer.schedule` on the learning rate."""
+    assistance: jax.Array  # `curriculum.assistance`
+    failure_bootstrap: jax.Array  # `curriculum.failure_bootstrap`
+    entropy_coef: jax.Array  # `ppo.entropy_coef`
+    imitation: jax.Array  # `imitation.weight`
+    actor_coef: jax.Array | float  # weight of all losses but the critic's: 0 during `ppo.critic_warmup`, then 1
+    actor_begins: jax.Array | bool  # whether it is the first update with all losses after `ppo.critic_warmup`
+    learning_rate_factor: jax.Array  # factor of `optimizer.schedule` on the learning rate
 
 
 def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:

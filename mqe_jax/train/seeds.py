@@ -1,7 +1,6 @@
 """States of several seeds in one pytree: where seeds become a `jax.vmap`.
 
-Warp keeps contacts of all environments in shared buffers, which `vmap` leaves unbatched. They are
-overwritten in every physics step, so one copy suffices for all seeds, and checkpoints omit them.
+Warp's contact buffers are shared and overwritten in every step: one copy suffices, and checkpoints omit them.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ class Seeds:
         self.count = count
         self.shared = jax.tree.map(lambda one, many: one.shape == many.shape, alone, batched)
         """Whether each leaf of a state is unbatched under `vmap`."""
-        self._take = jax.jit(self._at)
+        self.take = jax.jit(self._at)
+        """`take(states, seed)` returns one seed's state."""
 
     def map(self, update: Callable[[PyTree], tuple[PyTree, PyTree]]) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
         """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled; metrics gain a leading axis S.
@@ -41,10 +41,6 @@ class Seeds:
     def stack(self, states: Sequence[Any]) -> Any:
         """Returns the states of all seeds as one."""
         return jax.tree.map(lambda once, *x: x[0] if once else jnp.stack(x), self.shared, *states)
-
-    def take(self, states: Any, seed: int) -> Any:
-        """Returns one seed's state."""
-        return self._take(states, seed)
 
     def _at(self, states: Any, seed: int) -> Any:
         return jax.tree.map(lambda once, x: x if once else x[seed], self.shared, states)

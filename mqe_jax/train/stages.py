@@ -38,13 +38,9 @@ class Stages:
     def advantages(
         self, now: Scheduled, transitions: Transition, value: jax.Array, next_value: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Returns the advantages and the value targets, in units of reward, of a rollout (T, N, V).
+        """Returns the advantages and the value targets of a rollout (T, N, V), in units of reward.
 
-        Args:
-            now: scheduled settings of this update.
-            transitions: the rollout, leading axes (T, N).
-            value: values of the observations, in units of reward (T, N, V).
-            next_value: values of the states that the steps reached.
+        `value` are those of the observations and `next_value` those of the states that the steps reached (T, N, V).
         """
         config, active = self.config, transitions.active
         reward = jnp.where(active, transitions.reward, jnp.zeros_like(transitions.reward))

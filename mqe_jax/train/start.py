@@ -57,10 +57,7 @@ def first_state(
     league: Matchmaker | None = None,
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> tuple[TrainState, float]:
-    """Returns this process's initial or restored state and the seconds already spent.
-
-    `learner` has the environments of one process; `shared` as in `Seeds`; `doing` shows what is done after the checks.
-    """
+    """Returns this process's initial or restored state and the seconds already spent; `shared` as in `Seeds`."""
     start = processes.compile(learner.init, start=True)
 
     def init(key: jax.Array) -> TrainState:
@@ -108,10 +105,7 @@ def first_state(
 
 
 def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> TrainedPolicy:
-    """Returns the policy that `config.start` names.
-
-    InputError unless it fits the environment, the parameters, given their shapes, and the settings of its mean actions.
-    """
+    """Returns the policy that `config.start` names; InputError unless it fits environment, parameters and settings."""
     start = str(config.start)
     if start not in NAMED and not Path(start).exists():
         shipped = (

@@ -23,12 +23,9 @@ _LONGEST = 256  # of an option, characters; messages are no longer
 class Choice:
     """A task with its policies, `DEFAULT` where none is named."""
 
-    task: str
-    """Id of the task."""
-    policy: str = DEFAULT
-    """Policy of all agents, or of team 0 of a match."""
-    opponent: str = DEFAULT
-    """Policy of team 1 of a match."""
+    task: str  # id of the task
+    policy: str = DEFAULT  # policy of all agents, or of team 0 of a match
+    opponent: str = DEFAULT  # policy of team 1 of a match
 
 
 @dataclass
@@ -37,10 +34,8 @@ class Menu:
 
     open: Callable[[Choice], Session]
     """Creates the session of a choice; raises an InputError where that is not possible."""
-    shown: Choice
-    """The choice on the page."""
-    runs: dict[str, str] = field(default_factory=dict)
-    """Task of each run folder."""
+    shown: Choice  # the choice on the page
+    runs: dict[str, str] = field(default_factory=dict)  # task of each run folder
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -18,13 +18,10 @@ _FORCE, _SHAPE = (224, 60, 40), (224, 138, 44)
 class Overlay:
     """Contacts of one environment and collision shapes of all, drawn below the movable root frame of a `Stage`."""
 
-    contacts: bool
-    """Whether contact points and forces are drawn."""
-
     def __init__(self, server: Any, model: mujoco.MjModel, offset: np.ndarray) -> None:
         """Draws nothing yet; `offset` (N, 3) is the place of each environment, m."""
         self._server, self._model, self._data, self._offset = server, model, mujoco.MjData(model), offset
-        self.contacts = False
+        self.contacts = False  # whether they are drawn
         self._arrows: Any = None
         self._shapes: list[tuple[int, Any]] = []
 

@@ -37,17 +37,6 @@ _POINTS = 200
 class Panel:
     """The viewer's controls, which modify the session."""
 
-    camera: str
-    """Label of the followed body, or `free`."""
-    env: int
-    """Index of the selected environment, for plots, state, camera and teleoperation."""
-    back: int
-    """Number of steps by which the shown step lies back."""
-    contacts: bool
-    """Whether contacts are shown."""
-    shapes: bool
-    """Whether collision shapes are shown."""
-
     def __init__(
         self,
         server: Any,
@@ -66,8 +55,9 @@ class Panel:
         self._robots = tuple(robots) or tuple(f"robot {i + 1}" for i in range(session.env.num_agents))
         self._wanted_steps, self._wants_reset = 0, False
         self._wanted: Choice | None = None
-        self.camera, self.env, self.back = ACTION if session.num_envs == 1 else FREE, 0, 0
-        self.contacts = self.shapes = False
+        self.camera = ACTION if session.num_envs == 1 else FREE  # or the label of the followed body
+        self.env, self.back = 0, 0  # the selected environment, and the steps by which the shown one lies back
+        self.contacts = self.shapes = False  # what is shown of them
         self._state = self._gui.add_html("")
         if menu is not None:
             self._add_menu(menu)
@@ -115,7 +105,11 @@ class Panel:
         head = paragraph(f"at {(session.steps - self.back) * session.env.dt:.2f} s, {pace}", session.env.name)
         head += self._score(float(session.rewards[index][self.env, -1]) if session.rewards else 0.0)
         self._state.content = head + table(("robot", "x", "y", "z", "vx", "vy", "turn"), rows)
-        self._read_out(index)
+        if session.rewards:
+            terms = [name.removeprefix("reward/") for name in (*session.terms[:-1], "sum")]
+            self._bars.content = bars(terms, session.rewards[index][self.env].tolist())
+        obs = session.moment(self.back).obs[self.env, session.drive.robot or 0]
+        self._observation.content = observation_table(getattr(session.env, "observation_layout", None), obs)
 
     def _score(self, reward: float) -> str:
         """Returns the lines with episode, reward, and the outcomes of the episodes that ended."""
@@ -126,17 +120,7 @@ class Panel:
         last = f"; last: {session.last[self.env]}" if session.last[self.env] else ""
         return paragraph(text) + paragraph(f"{team}: {counts} of {session.episodes.sum()}{last}")
 
-    def _read_out(self, index: int) -> None:
-        """Shows reward terms and observation of a step of the history."""
-        session = self._session
-        if session.rewards:
-            terms = [name.removeprefix("reward/") for name in (*session.terms[:-1], "sum")]
-            self._bars.content = bars(terms, session.rewards[index][self.env].tolist())
-        obs = session.moment(self.back).obs[self.env, session.drive.robot or 0]
-        self._observation.content = observation_table(getattr(session.env, "observation_layout", None), obs)
-
     def plot(self) -> None:
-        """Updates the plots with the recent history of the selected environment."""
         session = self._session
         if len(session.times) < 2:
             return

@@ -15,8 +15,6 @@ import functools
 import http
 import io
 import ipaddress
-import sys
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,25 +23,8 @@ import websockets.asyncio.server as websockets_server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from mqe_jax.core.errors import InputError
-from mqe_jax.core.literal import line
-
-_LINES = 10  # logged per second at most
-_LENGTH = 200  # of a logged line, characters
-
-
-class _Log:
-    """Prints at most `_LINES` lines per second to standard error, and drops the rest."""
-
-    def __init__(self) -> None:
-        self._second, self._lines = 0, 0
-
-    def __call__(self, text: str) -> None:
-        second = int(time.monotonic())
-        self._lines = self._lines + 1 if second == self._second else 1
-        self._second = second
-        if self._lines <= _LINES:
-            print(f"mqe: view: {line(text[:_LENGTH])}", file=sys.stderr, flush=True)
+from mqe_jax.core.errors import InputError, brief
+from mqe_jax.core.literal import echo
 
 
 def open_server(host: str, port: int, label: str) -> viser.ViserServer:
@@ -51,7 +32,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
 
     Raises an InputError for a version of viser in which the restrictions would have no effect.
     """
-    log, original = _Log(), websockets_server.serve
+    original = websockets_server.serve
     serving = False
 
     def answer(page: Any, connection: ServerConnection, request: Request) -> Response | None:
@@ -60,7 +41,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
         headers = request.headers
         reason = refusal(headers.get_all("Host"), headers.get_all("Origin"), authorities(host, address, local_port))
         if reason is not None:
-            log(f"refused a connection: {reason}")
+            echo(f"mqe: view: refused a connection: {brief(reason)}")
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"mqe view: {reason}\n")
         response = page(connection, request) if page is not None else None
         if response is not None:
@@ -85,10 +66,9 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
 
 
 def authorities(host: str, address: str, port: int) -> frozenset[str]:
-    """Returns the values of the header `Host` that name this server, in lower case.
+    """Returns the values of the header `Host` that name this server, in lower case, on loopback localhost too.
 
-    `host` is the host given to listen on, `address` the local IP address of the connection, `port` its port. On the
-    loopback interface the names localhost, 127.0.0.1 and [::1] are valid too.
+    `host` is the host given to listen on, `address` the local IP address of the connection, `port` its port.
     """
     names = {host.lower(), address}
     if ipaddress.ip_address(address.partition("%")[0]).is_loopback:

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,36 +23,26 @@ HOLD_TIME = 0.35
 """Time after a button's last hold message at which it counts as released, s; the browser sends ten per second."""
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """What is drawn of a step."""
 
-    frame: Episode
-    """Poses, those of an environment in each frame."""
-    qvel: np.ndarray
-    """Velocities (N, nv)."""
-    ctrl: np.ndarray
-    """Actuator targets (N, nu)."""
-    obs: np.ndarray
-    """Observations of the agents (N, A, O)."""
+    frame: Episode  # poses, those of an environment in each frame
+    qvel: np.ndarray  # velocities (N, nv)
+    ctrl: np.ndarray  # actuator targets (N, nu)
+    obs: np.ndarray  # observations of the agents (N, A, O)
 
 
 @dataclass
 class Drive:
     """Teleoperation of one robot: a command set by keys, plus the commands of held buttons."""
 
-    low: np.ndarray
-    """Lowest command (3,), m/s and rad/s."""
-    high: np.ndarray
-    """Highest command (3,), m/s and rad/s."""
-    env: int = 0
-    """Index of its environment."""
-    robot: int | None = None
-    """Index of the agent, or None if no robot is driven."""
+    low: np.ndarray  # lowest command (3,), m/s and rad/s
+    high: np.ndarray  # highest command (3,), m/s and rad/s
+    env: int = 0  # index of its environment
+    robot: int | None = None  # index of the agent, or None if no robot is driven
     command: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """Command set by keys: vx, vy, yaw_rate (3,), m/s and rad/s."""
-    clock: Callable[[], float] = time.monotonic
-    """Clock, s."""
+    clock: Callable[[], float] = time.monotonic  # clock, s
 
     def __post_init__(self) -> None:
         self._held: dict[tuple[float, ...], float] = {}
@@ -74,42 +64,19 @@ class Drive:
         return np.clip(total, self.low, self.high)
 
     def _scaled(self, direction: tuple[float, ...]) -> np.ndarray:
-        """Returns fractions of the maximum command as a command (3,)."""
         return np.abs(direction) * np.where(np.asarray(direction) < 0, self.low, self.high)
 
 
 class Session:
     """N environments stepped under a policy, with a history of recent steps."""
 
-    env: QuadrupedEnv
-    """The task."""
-    num_envs: int
-    """N."""
-    paused: bool
-    """Whether the simulation is paused."""
-    speed: float
-    """Target real-time factor."""
-    drive: Drive
-    """Teleoperation."""
-    terms: tuple[str, ...]
-    """Names of the logged rewards: the terms, then their sum."""
-    steps: int
-    """Environment steps so far."""
-    episodes: np.ndarray
-    """Number of finished episodes of each environment (N,)."""
-    outcomes: tuple[str, ...]
-    """Names of the outcomes of an episode: win, draw and loss in a match, else success."""
-    counts: np.ndarray
-    """How many finished episodes of all environments had each outcome."""
-    last: list[str]
-    """Outcome of the last finished episode of each environment, empty before its end and where none applies."""
-
     def __init__(
         self, env: QuadrupedEnv, vector_env: VectorEnv, policy: Policy, seed: int = 0, history: float = 20.0
     ) -> None:
         """Creates the environments; `policy` acts for all agents, `history` is the length of the history, s."""
         self.env, self.num_envs = env, vector_env.num_envs
-        self.paused, self.speed, self.drive = False, 1.0, Drive(np.zeros(3), np.zeros(3))
+        self.paused, self.speed = False, 1.0  # a real-time factor
+        self.drive = Drive(np.zeros(3), np.zeros(3))
         self._vector_env, self._policy = vector_env, policy
         self._first_memory = policy.initial_memory(self.num_envs)
         self._key = jax.random.PRNGKey(seed)
@@ -120,13 +87,13 @@ class Session:
             self._columns = np.array([env.params.commands.index(name) for name in DRIVEN])
             self.drive.low, self.drive.high = env.controller.changes[self._columns].T
         self.steps = 0
-        self.episodes = np.zeros(self.num_envs, int)
-        self.last = [""] * self.num_envs
+        self.episodes = np.zeros(self.num_envs, int)  # finished ones
+        self.last = [""] * self.num_envs  # outcome of the last finished episode, if any
         self.reset()
-        self.outcomes = ("success",) if self.state.outcome.win is None else RESULTS
-        self.counts = np.zeros(len(self.outcomes), int)
+        self.outcomes: tuple[str, ...] = ("success",) if self.state.outcome.win is None else RESULTS
+        self.counts = np.zeros(len(self.outcomes), int)  # of finished episodes with each outcome
         rewards = [name for name in self.state.metrics if name.startswith("reward/")]
-        self.terms = (*rewards, "average_step_reward")
+        self.terms: tuple[str, ...] = (*rewards, "average_step_reward")
         length = max(2, round(history / env.dt))
         self.times: deque[float] = deque(maxlen=length)
         self.rewards: deque[np.ndarray] = deque(maxlen=length)  # (N, terms)
@@ -168,10 +135,6 @@ class Session:
     def at(self, back: int) -> int:
         """Returns the index into the history of the step `back` steps ago, at most its oldest."""
         return -1 - min(back, len(self.moments) - 1)
-
-    def frame(self) -> Episode:
-        """Returns the current poses, those of an environment in each frame."""
-        return self.moment().frame
 
     def _count(self, done: np.ndarray, ended: np.ndarray) -> None:
         """Counts the outcomes (N, K) of the environments whose episode ended (N,)."""

@@ -18,7 +18,7 @@ from mqe_jax.viz.recording import Episode
 _GAP = 0.6  # m between environments
 _SKY, _SUN = 2.4, 2.7  # intensities of the light
 _OPAQUE = 0.5  # opacity below which geoms are left out: meshes of several colours have none
-_PLANES = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,7 @@ class _Batch:
 class Stage:
     """Renders N environments under one movable root frame, which keeps a followed body at the origin."""
 
-    bodies: dict[str, int]
-    """Ids of the bodies that a camera can follow, by label."""
-    offset: np.ndarray
-    """Place of each environment (N, 3), m."""
-    span: float = 0.0
-    """Diagonal of the box about the followed bodies, m."""
+    span = 0.0  # diagonal of the box about the followed bodies, m
 
     def __init__(self, server: Any, model: mujoco.MjModel, frame: Episode) -> None:
         self._server, self._model = server, model
@@ -94,7 +89,6 @@ class Stage:
         return seen(self.centre * [1.0, 0.0, 0.0], 1.4 * float(size))
 
     def release(self) -> None:
-        """Resets the position of the root frame."""
         self._root.position = (0.0, 0.0, 0.0)
 
     def _draw_walls(self, frame: Episode) -> None:
@@ -119,7 +113,7 @@ class Stage:
     def _add_floor(self, low: np.ndarray, high: np.ndarray) -> None:
         side = [float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 2 * float(self.offset[-1, 1]) + 4.0]
         middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
-        floor = np.flatnonzero(np.isin(self._model.geom_type, _PLANES) & (self._model.geom_group == GROUND_GROUP))[0]
+        floor = np.flatnonzero((self._model.geom_type == _PLANE) & (self._model.geom_group == GROUND_GROUP))[0]
         colour = tuple(round(255 * float(c)) for c in self._model.geom_rgba[floor, :3])
         self._server.scene.add_box(
             "/world/floor", color=colour, dimensions=(*side, 0.02), position=(*middle, -0.012), cast_shadow=False
@@ -193,7 +187,7 @@ def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, 
     walls = []
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
-        if int(model.geom_group[geom]) == COLLISION_GROUP or int(model.geom_type[geom]) in _PLANES:
+        if int(model.geom_group[geom]) == COLLISION_GROUP or int(model.geom_type[geom]) == _PLANE:
             continue
         if model.geom_rgba[geom, 3] < _OPAQUE:
             continue

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-import viser
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
@@ -31,11 +30,6 @@ class Viewer:
     """Shows a session in the browser."""
 
     session: Session
-    """The simulation."""
-    server: viser.ViserServer
-    """The web server; it listens on `host` only, and accepts connections from its own page only."""
-    url: str
-    """Address of the page."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 8080, menu: Menu | None = None) -> None:
         """Starts the server with an empty page; `menu` lets the page choose other sessions."""
@@ -70,7 +64,7 @@ class Viewer:
         if self._announced:
             self._clear()
         else:
-            self._build(model, session.frame())
+            self._build(model, session.moment().frame)
         self._announced = False
         self._overlay, self._shapes = Overlay(self.server, model, self._stage.offset), False
         robots = robot_labels(model)
@@ -130,7 +124,6 @@ class Viewer:
         return True
 
     def _draw(self) -> None:
-        """Draws the step that the panel shows."""
         moment, panel = self.session.moment(self._panel.back), self._panel
         self._stage.draw(moment.frame, self._followed())
         if panel.shapes != self._shapes:
@@ -151,19 +144,16 @@ class Viewer:
         return True
 
     def _positions(self) -> np.ndarray:
-        """Returns the agents' positions (A, 3), m, in the selected environment."""
         env, frame = self.session.env, self.session.moment(self._panel.back).frame
         return frame.qpos[self._panel.env, env.index.base_qpos[: env.num_agents, :3]]
 
     def _followed(self) -> tuple[int, list[int]] | None:
-        """Returns the environment and the bodies that the camera follows."""
         camera = self._panel.camera
         if camera == FREE:
             return None
         return self._panel.env, list(self._bodies.values()) if camera == ACTION else [self._bodies[camera]]
 
     def _aim(self) -> None:
-        """Points the cameras at what the panel chooses."""
         self._point(self.session.moment(self._panel.back).frame, self._followed())
 
     def _point(self, frame: Episode, followed: tuple[int, list[int]] | None) -> None:

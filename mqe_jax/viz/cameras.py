@@ -40,12 +40,11 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
     if view == "side":
         return _beside(model, episode)
     points, goals = _points(model, episode), goal_points(model, episode)
-    fixed = view == "near"
+    fixed = len(episode) if view == "near" else 0
     direction = _direction(model, episode, points, goals, aspect, fixed)
-    if fixed:
-        return _fixed(model, points, goals, direction, aspect)
     width = max(1, min(round(_SMOOTHING / episode.dt), len(episode) // 5))
-    return smoothed(_following(model, points, goals, direction, aspect, width), width)
+    views = _following(model, points, goals, direction, aspect, fixed or width)
+    return views if fixed else smoothed(views, width)
 
 
 def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
@@ -62,7 +61,7 @@ def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
 
 
 def _direction(
-    model: mujoco.MjModel, episode: Episode, points: list[np.ndarray], goals: np.ndarray, aspect: float, fixed: bool
+    model: mujoco.MjModel, episode: Episode, points: list[np.ndarray], goals: np.ndarray, aspect: float, width: int
 ) -> Camera:
     """Returns a camera of the direction in which the targets are hidden least and never far away."""
     sample = np.unique(np.linspace(0, len(episode) - 1, _SAMPLES).astype(int))
@@ -71,7 +70,7 @@ def _direction(
     for azimuth, elevation in _DIRECTIONS:
         camera = replace(best, azimuth=azimuth, elevation=elevation)
         few = [points[i] for i in sample]
-        views = _fixed(model, few, goals, camera, aspect) if fixed else _following(model, few, goals, camera, aspect, 0)
+        views = _following(model, few, goals, camera, aspect, width)
         away = [np.linalg.norm(box - view.position, axis=-1).mean() for box, view in zip(few, views, strict=True)]
         unseen = hidden(model, part, views).mean(axis=0).max()
         cost = max(away) + _BEHIND * _alignment(model, part, camera.axes[1]) + _HIDDEN * unseen
@@ -90,13 +89,6 @@ def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> fl
         across = np.abs(apart @ right[:2]) / np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         values.append(1.0 - across.mean() if len(across) else 0.0)
     return float(np.mean(values))
-
-
-def _fixed(
-    model: mujoco.MjModel, points: list[np.ndarray], goals: np.ndarray, direction: Camera, aspect: float
-) -> list[Camera]:
-    """Returns the same camera for each frame, which contains the targets of all frames and the goal."""
-    return [fitted(model, np.concatenate([*points, goals]), direction, aspect, _DISTANCES)] * len(points)
 
 
 def _following(

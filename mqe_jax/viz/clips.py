@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import itertools
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from annotated_types import Gt
 from PIL import Image
 
 from mqe_jax.core import files
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import replacing
-from mqe_jax.core.settings import PathText, checked, fail
+from mqe_jax.core.settings import fail
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
 
 def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at: float | None = None) -> Path:
-    """Returns the path if it can be written, with options of `render_episode`.
-
-    The InputError names what is allowed.
-    """
+    """Returns the path if it can be written, with options of `render_episode`; else InputError."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
@@ -45,30 +41,14 @@ def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at
     return path
 
 
-@checked(path=PathText, frames=Iterable, fps=Annotated[float, Gt(0)])
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
-    path = check_output(Path(path))
-    suffix, frames = path.suffix.lower(), _checked_frames(frames)
+    suffix = path.suffix.lower()
     with replacing(path) as temporary:
         if suffix == ".mp4":
             _write_mp4(temporary, frames, fps)
         else:
             _write_images(temporary, [Image.fromarray(frame) for frame in frames], suffix, fps)
-
-
-def _checked_frames(frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yields at least one frame, each (H, W, 3) uint8, as the first."""
-    first = None
-    for index, frame in enumerate(frames):
-        shape, dtype = getattr(frame, "shape", ()), getattr(frame, "dtype", type(frame).__name__)
-        first = first or shape
-        if dtype != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape or shape != first:
-            expected = "(H, W, 3)" if shape == first else str(first)
-            raise InputError(f"frames: frame {index} is {dtype} {shape}; it must be uint8 {expected}")
-        yield np.asarray(frame)
-    if first is None:
-        raise InputError("frames: there are none")
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:

@@ -6,16 +6,14 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from annotated_types import MinLen
 from numpy.typing import ArrayLike
 
 from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
-from mqe_jax.core.settings import checked
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
@@ -35,7 +33,6 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
     return [float(window.mean()) if window.size else math.nan for window in windows]
 
 
-@checked(tables=Annotated[Sequence[Mapping[str, Any]], MinLen(1)], title=str)
 def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> Figure:
     """Returns a figure of average step reward (else return) and success over environment steps.
 
@@ -78,13 +75,12 @@ def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> Figur
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Writes a figure atomically, in a folder that it creates."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         figure.savefig(temporary)
 
 
 def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots with their trajectories."""
+    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon
@@ -108,22 +104,17 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
     body_shape = np.array([[-0.25, -0.13], [0.2, -0.13], [0.33, 0.0], [0.2, 0.13], [-0.25, 0.13]])
     for body in bases:
         colour = robot_color(model, body)
-        (trail,) = axes.plot([], [], color=colour, lw=1.5, alpha=0.5, zorder=3)
         patch = axes.add_patch(Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4))
-        robots.append((body, patch, trail, []))
-    label = axes.text(0.99, 0.01, "", ha="right", va="bottom", transform=axes.transAxes, fontsize=9)
+        robots.append((body, patch))
     for index in range(len(episode)):
         pose(model, data, episode, index)
         for geom, patch in scenery:
             points = box_corners(model, data, geom)[:, :2]
             patch.set_xy(points[ConvexHull(points).vertices])
-        for body, patch, trail, way in robots:
+        for body, patch in robots:
             rotation = data.xmat[body].reshape(3, 3)
             yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
             turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
             patch.set_xy(body_shape @ turn + data.xpos[body][:2])
-            way.append(data.xpos[body][:2].copy())
-            trail.set_data(*np.array(way).T)
-        label.set_text(f"{index * episode.dt:.1f} s")
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()

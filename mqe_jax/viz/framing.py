@@ -22,14 +22,10 @@ _ROOM = 1.07  # factor of the distance at which the points would reach the image
 class Camera:
     """A free camera, in MuJoCo's convention; angles in degrees."""
 
-    lookat: tuple[float, float, float]
-    """Point in the centre of the view, m."""
-    distance: float
-    """Distance from that point, m."""
-    azimuth: float = 60.0
-    """Azimuth, degrees: 0 points along +x, 90 along +y."""
-    elevation: float = -46.0
-    """Elevation, degrees: -90 points straight down."""
+    lookat: tuple[float, float, float]  # point in the centre of the view, m
+    distance: float  # distance from that point, m
+    azimuth: float = 60.0  # azimuth, degrees: 0 points along +x, 90 along +y
+    elevation: float = -46.0  # elevation, degrees: -90 points straight down
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,17 +2,15 @@
 
 import dataclasses
 import functools
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from annotated_types import MinLen
 
-from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength, Positive
+from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.settings import checked, fail
 from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.evaluate import Act, acting
@@ -38,21 +36,9 @@ class Episode:
     settled: float = 0.0
     """Time from which `success` has its last value, s."""
 
-    def __post_init__(self) -> None:
-        shapes = [getattr(x, "shape", ()) for x in (self.qpos, self.mocap_pos, self.mocap_quat)]
-        bodies = (*shapes[0][:1], *shapes[1][1:2])
-        if len(shapes[0]) != 2 or shapes[1:] != [(*bodies, 3), (*bodies, 4)]:
-            allowed = "(T, nq), (T, M, 3) and (T, M, 4)"
-            raise InputError(f"Episode: qpos, mocap_pos and mocap_quat have the shapes {shapes}; expected {allowed}")
-        check("dt", self.dt, Positive)
-        for name in ("success", "reward", "settled"):
-            if not isinstance(value := getattr(self, name), int | float | np.number):
-                fail(name, value, "a number")
-
     def __len__(self) -> int:
         return len(self.qpos)
 
-    @checked(frames=slice)
     def cut(self, frames: slice) -> "Episode":
         """Returns the episode with a part of its frames, such as every n-th; `settled` stays that of the whole."""
         poses = {name: getattr(self, name)[frames] for name in ("qpos", "mocap_pos", "mocap_quat")}
@@ -64,14 +50,9 @@ class Episode:
 def record(
     env: QuadrupedEnv, policy: Policy | Act, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
 ) -> list[Episode]:
-    """Records one episode in each of several environments, without automatic reset.
+    """Records one episode in each of several environments, until it ends or for `seconds`.
 
-    Args:
-        env: the task.
-        policy: the policy of all agents, or a function as its `act` without recurrent state; batched over episodes.
-        key: random key.
-        episodes: number of environments.
-        seconds: time limit of an episode; otherwise its last frame is that of the termination or truncation.
+    `policy` is that of all agents, or a function like its `act` without recurrent state; batched over episodes.
     """
     numbers = episodes * round(seconds / env.dt) * (env.mj_model.nq + 7 * env.mj_model.nmocap)
     if 4 * numbers > CLIP_BYTES:
@@ -127,19 +108,13 @@ def record(
     return recorded
 
 
-@checked(episodes=Annotated[list[Any], MinLen(1)])
 def best(episodes: list[Episode]) -> Episode:
     """Returns the best episode: by success, then by average step reward."""
-    for episode in episodes:
-        check("episodes", episode, Episode)
     return max(episodes, key=lambda episode: (episode.success, episode.reward))
 
 
-@checked(episodes=Annotated[list[Any], MinLen(1)])
 def typical(episodes: list[Episode]) -> Episode:
     """Returns the median of the successful episodes, by success, then by average step reward; of all if none is."""
-    for episode in episodes:
-        check("episodes", episode, Episode)
     successful = [episode for episode in episodes if episode.success > 0] or episodes
     ranked = sorted(successful, key=lambda episode: (episode.success, episode.reward))
     return ranked[len(ranked) // 2]

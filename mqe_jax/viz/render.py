@@ -16,7 +16,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
-from mqe_jax.core.settings import PathText, checked, fail
+from mqe_jax.core.settings import PathText, checked
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GROUND_GROUP
@@ -77,16 +77,6 @@ def _gl_context(backend: str) -> Any:
     return import_module(f"mujoco.{backend}").GLContext
 
 
-def load_gl() -> None:
-    """Finds and loads the GL library, as a thread may do while an episode is computed."""
-    backend = gl_backend()
-    if backend is not None:
-        with _probing, contextlib.suppress(Exception):  # drawing tells what is wrong, if the command gets so far
-            context = _gl_context(backend)(64, 64)
-            context.make_current()
-            context.free()
-
-
 def _draw_gl(
     model: mujoco.MjModel, episode: Episode, cameras: Sequence[Camera], size: tuple[int, int], backend: str
 ) -> Iterator[np.ndarray]:
@@ -138,11 +128,6 @@ def grain(model: mujoco.MjModel) -> None:
     model.geom_matid[model.geom_group == GROUND_GROUP] = material
 
 
-_SIZE = tuple[Pixels, Pixels]
-_BACKEND = Literal["auto", "egl", "osmesa"] | None
-
-
-@checked(env=AnySingle, episode=Episode, size=_SIZE, backend=_BACKEND)
 def render_frames(
     env: QuadrupedEnv,
     episode: Episode,
@@ -152,19 +137,14 @@ def render_frames(
 ) -> Iterator[np.ndarray]:
     """Yields the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
 
-    `views` holds a camera for each frame; the view is `scene` if None.
-
-    `backend` is `auto` (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
+    `views` holds a camera for each frame, by default those of the view `scene`. `backend` is `auto` (from
+    `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
-    _check_fits(env, episode)
     model = rendering_model(env.mj_model, episode)
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
         return draw_top(model, episode, size)
-    views = cameras(model, episode, "scene", size[0] / size[1]) if views is None else views
-    if not isinstance(views, Sequence) or len(views) != len(episode) or not all(isinstance(x, Camera) for x in views):
-        fail("views", views, f"a Camera for each of the {len(episode)} frames")
-    return _draw_gl(model, episode, views, size, backend)
+    return _draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
 
 
 def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
@@ -182,11 +162,11 @@ def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
     episode=Episode,
     path=PathText,
     view=str | None,
-    size=_SIZE | None,
+    size=tuple[Pixels, Pixels] | None,
     fps=FrameRate | None,
     speed=Speed,
     at=Time | None,
-    backend=_BACKEND,
+    backend=Literal["auto", "egl", "osmesa"] | None,
 )
 def render_episode(
     env: QuadrupedEnv,

@@ -1,10 +1,7 @@
 """Training and evaluation environment of skills that walk: one robot that tracks commands.
 
-Slopes are rotations of gravity: a robot on an infinite slope of angle t behaves, in the frame of the slope, as one on
-flat ground under gravity rotated by t. Each environment thus has its own slope without its own geometry. All positions
-and velocities here are in the slope's frame.
-
-Randomisation and rewards (`mqe_jax.walk.rewards`) follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238).
+Slopes are rotations of gravity, so each environment has its own without its own geometry. All positions and velocities
+here are in the slope's frame. Randomisation and rewards follow walk-these-ways (arXiv 2212.03238).
 """
 
 from __future__ import annotations
@@ -112,8 +109,6 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         """Returns an initial state with another spec, without observations."""
         walk = dataclasses.replace(state.task, spec=spec, slope=spec.slope, force=spec.force)
         return dataclasses.replace(state, task=walk)
-
-    # -- step ---------------------------------------------------------------------------------------------------
 
     def advance(self, state: State[WalkState], action: jax.Array) -> State[WalkState]:
         """Changes slope, force, push and shove, then advances the environment."""
@@ -223,8 +218,6 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         """Success: the robot has not fallen."""
         return {"success": 1.0 - jnp.asarray(failed, jnp.float32)}
 
-    # -- observations -------------------------------------------------------------------------------------------
-
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((Block("skill", self.trainee.observation_size, "the skill's own, of one step"),))
@@ -285,12 +278,6 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
             "payload": random.payload / 2.0,
         }
 
-    # -- measures -----------------------------------------------------------------------------------------------
-
-    def foot_force(self, data: mjx.Data) -> jax.Array:
-        """Returns the strongest contact force on each foot (4,), N."""
-        return jnp.linalg.norm(data.sensordata[self.index.foot_force[0]], axis=-1)
-
     @property
     def weight(self) -> float:
         """Weight of the robot, N."""
@@ -303,6 +290,10 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         torque = robot.kp * (robot.joint_targets(state.task.actions[0]) - robot_state.joint_position[0])
         torque = jnp.clip(torque - robot.kd * velocity, -robot.torque_limit, robot.torque_limit)
         return jnp.sum(jnp.abs(torque * velocity))
+
+    def foot_force(self, data: mjx.Data) -> jax.Array:
+        """Returns the strongest contact force on each foot (4,), N."""
+        return jnp.linalg.norm(data.sensordata[self.index.foot_force[0]], axis=-1)
 
 
 def gravity_w(slope: jax.Array) -> jax.Array:

@@ -66,16 +66,12 @@ _COMMANDS = _signs(*(command.mirror for command in walk_policy.COMMANDS))
 class Form:
     """What the network of a skill has of its own."""
 
-    networks: Networks
-    """Its networks and their files."""
-    rows: np.ndarray
-    """Rows of the history that it sees, from the oldest on; the last one is the newest."""
-    row_size: int
-    """Numbers of an observation that a row has; the others are of the newest observation alone."""
+    networks: Networks  # its networks and their files
+    rows: np.ndarray  # rows of the history that it sees, from the oldest on; the last one is the newest
+    row_size: int  # numbers of an observation that a row has; the others are of the newest observation alone
     infer: Callable[..., tuple[jax.Array, Any]]
     """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an adaptation network."""
-    mirror: Mirror
-    """Of an input."""
+    mirror: Mirror  # of an input
 
     @property
     def past(self) -> int:
@@ -92,10 +88,7 @@ class Form:
         return inputs[..., self.mirror[0]] * self.mirror[1]
 
     def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
-        """Returns the mean square difference () between actions of mirrored inputs and mirrored actions.
-
-        `inputs` are (B, n) and `mean` their actions (B, 12).
-        """
+        """Returns the mean square difference () of actions of mirrored inputs (B, n) from mirrored actions (B, 12)."""
         other, _ = self.infer(params, self.mirrored(inputs), precision=_PRECISION)
         return jnp.mean(jnp.square(other - mirror_action(mean)))
 
@@ -136,7 +129,6 @@ class HistorySettings(GaussianSettings):
         raise NotImplementedError
 
     def build(self, dims: EnvDims) -> Network:
-        """Returns the network; see `Network`."""
         form = self.form()
         inputs = next(iter(form.networks.widths.values()))[0]
         expected = inputs - (len(form.rows) - 1) * form.row_size
@@ -153,7 +145,6 @@ class WalkNetwork(HistorySettings):
     """Weight of the adaptation network's regression loss."""
 
     def form(self) -> Form:
-        """Returns what the network has of its own."""
         return WALK_FORM
 
 
@@ -162,18 +153,13 @@ class AgileNetwork(HistorySettings):
     """Settings of the agile skill and its critic."""
 
     def form(self) -> Form:
-        """Returns what the network has of its own."""
         return AGILE_FORM
 
 
 def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.ndarray) -> jax.Array:
-    """Returns rows of the histories of a chunk's steps (L, C, H, O); rows before an episode's start are zero.
+    """Returns H rows of the histories of a chunk's steps (L, C, H, O); rows before an episode's start are zero.
 
-    Args:
-        memory: the rows before the chunk (C, T, O).
-        is_first: whether a step is the first of an episode (L, C) bool.
-        obs: rows of the chunk (L, C, O).
-        kept: the H rows to return, of the T + 1 of a history.
+    `memory` are the rows before the chunk (C, T, O), `obs` its rows (L, C, O), `kept` the rows to return, of T + 1.
     """
     steps, count = is_first.shape
     before = jnp.moveaxis(memory, 1, 0)

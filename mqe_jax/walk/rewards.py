@@ -1,8 +1,4 @@
-"""Reward terms for training skills that walk.
-
-They follow walk-these-ways (Margolis and Agrawal, arXiv 2212.03238): positive terms times the exponential of the sum
-of the negative ones.
-"""
+"""Reward terms of skills that walk, after walk-these-ways (Margolis and Agrawal, arXiv 2212.03238)."""
 
 from __future__ import annotations
 

@@ -73,12 +73,9 @@ class EpisodeSpec:
     """Commands of the walk policy (15,); those after the velocity describe the gait that the rewards ask for."""
     slope: jax.Array
     """Inclination of the ground along x and y (2,), rad; positive in x where the ground rises towards +x."""
-    force: jax.Array
-    """Sustained force on the trunk (2,), N, along its heading and to its left, horizontal."""
-    push: jax.Array
-    """Instantaneous change of the trunk's velocity at each push (), m/s."""
-    shove: jax.Array
-    """Maximum force of a shove (), N."""
+    force: jax.Array  # sustained force on the trunk (2,), N, along its heading and to its left, horizontal
+    push: jax.Array  # instantaneous change of the trunk's velocity at each push (), m/s
+    shove: jax.Array  # maximum force of a shove (), N
 
 
 @record
@@ -106,22 +103,14 @@ class WalkParams(TaskParams):
 class WalkState:
     """The task's own state. Slopes, forces, pushes and shoves are scaled by 1 - `assistance`."""
 
-    spec: EpisodeSpec
-    """Commands and disturbances."""
-    slope: jax.Array
-    """Current slope, rate-limited towards the spec's (2,), rad."""
-    force: jax.Array
-    """Current force, rate-limited towards the spec's (2,), N."""
-    shove: jax.Array
-    """Force (3,), N, and torque (3,), N m, of the current shove on the trunk, world frame (6,)."""
-    shove_steps: jax.Array
-    """Steps until the current shove ends () int32."""
-    actions: jax.Array
-    """The last three actions, newest first (3, 12)."""
-    gait: jax.Array
-    """Phase of the gait cycle () in [0, 1)."""
-    mean_error: jax.Array
-    """Exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s."""
+    spec: EpisodeSpec  # commands and disturbances
+    slope: jax.Array  # current slope, rate-limited towards the spec's (2,), rad
+    force: jax.Array  # current force, rate-limited towards the spec's (2,), N
+    shove: jax.Array  # force (3,), N, and torque (3,), N m, of the current shove on the trunk, world frame (6,)
+    shove_steps: jax.Array  # steps until the current shove ends () int32
+    actions: jax.Array  # the last three actions, newest first (3, 12)
+    gait: jax.Array  # phase of the gait cycle () in [0, 1)
+    mean_error: jax.Array  # exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s
 
 
 def sample_spec(key: jax.Array, task: WalkTask, trainee: Trainee, assistance: jax.Array | float) -> EpisodeSpec:

@@ -31,10 +31,8 @@ _NUMBER = re.compile(r", (-?[\d.]+(?:e[+-]?\d+)?)(?=[,)])")  # as an argument in
 class _Module:
     """Placeholder for a module class of the archive."""
 
-    kind: ClassVar[str]
-    """Qualified name of the class."""
-    source: ClassVar[str]
-    """Name of the archive's member that defines it."""
+    kind: ClassVar[str]  # qualified name of the class
+    source: ClassVar[str]  # name of the archive's member that defines it
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -95,9 +93,7 @@ class _Unpickler(_PurePython):
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Returns the tensors of a scripted or traced `Sequential` by dotted name, float32, such as 0.weight.
 
-    Raises:
-        InputError: if the file is not such an archive, exceeds the limits, or holds anything but linear layers with an
-            ELU (alpha 1) between each two.
+    InputError for another file, beyond the limits, or with anything but linear layers with an ELU between each two.
     """
     with archive(Path(path), limits.WEIGHTS_BYTES, "a TorchScript Sequential of Linear and ELU layers") as opened:
         names = [name for name in opened.namelist() if name.endswith("/data.pkl") and name.count("/") == 1]

@@ -23,11 +23,7 @@ Chance = Callable[[float], jax.Array]
 
 
 class Trainee(abc.ABC):
-    """A skill of a robot, as the walking environment trains it.
-
-    Commands are those of the walk policy (15,): the velocity, which every skill is given, and the gait that the rewards
-    ask for.
-    """
+    """A skill as the walking environment trains it, by commands of the walk policy (15,): velocity and gait."""
 
     skill: Skill
     observation_size: int

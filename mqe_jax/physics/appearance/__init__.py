@@ -1,7 +1,4 @@
-"""What scenes look like: colours, and shapes without mass or contacts that only rendering models have.
-
-Plain MuJoCo geoms with a colour, so that renderer, viewer and web page show the same. Frame: the environment's; metres.
-"""
+"""What scenes look like: colours, and geoms without mass or contacts that only rendering models have; metres."""
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mqe_jax.physics.appearance import DARK_WOOD, GLASS, INK, STEEL, WHITE, WOOD, YELLOW, Color, mixed
@@ -25,23 +24,13 @@ def crate(body: Any, half: np.ndarray) -> None:
                 size[axis] = half[axis] + _PROUD
                 place[[other, third]] = a * (half[other] - thick + _PROUD), b * (half[third] - thick + _PROUD)
                 add_box(body, DARK_WOOD, size, place)
-    brace = float(np.hypot(half[1], half[2])) - 2 * thick
-    for axis in (0, 1):
-        flat = np.array([brace, 0.8 * thick, half[axis] + _PROUD / 2])
-        angle = float(np.arctan2(half[2], half[1 - axis]))
-        # The brace lies in the side's plane: its length turned about the side's normal.
-        quat = _turned(axis, angle)
-        add_box(body, mixed(WOOD, DARK_WOOD, 0.55), flat, (0, 0, 0), quat=quat)
-
-
-def _turned(axis: int, angle: float) -> np.ndarray:
-    """Returns the quaternion of a beam whose length is in the plane normal to `axis` and whose depth is along it."""
-    normal = np.eye(3)[axis]
-    along = np.cos(angle) * np.eye(3)[1 - axis] + np.sin(angle) * np.eye(3)[2]
-    matrix = np.stack([along, np.cross(normal, along), normal], axis=1)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, matrix.ravel())
-    return quat
+    for axis, sign in ((0, 1), (1, -1)):  # diagonal braces
+        size = np.full(3, 0.8 * thick)
+        size[axis], size[1 - axis] = half[axis] + _PROUD / 2, np.hypot(half[1], half[2]) - 2 * thick
+        angle = np.arctan2(half[2], half[1 - axis]) / 2
+        quat = np.array([np.cos(angle), 0.0, 0.0, 0.0])
+        quat[1 + axis] = sign * np.sin(angle)
+        add_box(body, mixed(WOOD, DARK_WOOD, 0.55), size, (0, 0, 0), quat=quat)
 
 
 def football(body: Any, radius: float) -> None:
@@ -63,9 +52,6 @@ def drum(body: Any, radius: float, height: float) -> None:
         add_visual(body, Kind.mjGEOM_CYLINDER, STEEL, size=(radius + 0.006, 0.035, 0), pos=(0, 0, z))
     lid = mixed(WOOD, WHITE, 0.35)
     add_visual(body, Kind.mjGEOM_CYLINDER, lid, size=(0.93 * radius, 0.003, 0), pos=(0, 0, height))
-    for y in np.linspace(-0.7, 0.7, 5) * radius:
-        reach = float(np.sqrt((0.93 * radius) ** 2 - y**2))
-        add_box(body, mixed(WOOD, DARK_WOOD, 0.35), (reach, 0.008, 0.004), (0, y, height))
 
 
 def door(body: Any, half: np.ndarray) -> None:

@@ -59,8 +59,7 @@ class Shape(NamedTuple):
     kind: Any
     color: Color
     group: int
-    options: Mapping[str, Any]
-    """Options of `add_geom`."""
+    options: Mapping[str, Any]  # options of `add_geom`
 
     def add(self, body: Any) -> None:
         """Adds the geom to a body, usually the world."""
@@ -98,12 +97,9 @@ def slab(center: Place, size: Place, color: Color) -> Shape:
 class Ground:
     """What the ground of a scene, and whatever stands on it, looks like."""
 
-    color: Color = MEADOW
-    """Colour of the plane."""
-    shapes: tuple[Shape, ...] = ()
-    """What is painted on it or stands on it."""
-    goals: tuple[Place, ...] = ()
-    """Points that a camera keeps in view, such as goal posts, m."""
+    color: Color = MEADOW  # colour of the plane
+    shapes: tuple[Shape, ...] = ()  # what is painted on it or stands on it
+    goals: tuple[Place, ...] = ()  # points that a camera keeps in view, such as goal posts, m
 
     def add(self, world: Any) -> None:
         """Adds all of it to the world's body."""

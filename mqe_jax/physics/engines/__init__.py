@@ -29,11 +29,7 @@ on this machine."""
 
 
 def resolve(impl: str = "auto") -> str:
-    """Returns the name of an engine that this machine can run; `auto` is warp on an NVIDIA GPU, c on a CPU, else jax.
-
-    Raises:
-        InputError: for an unknown engine, or one that this machine cannot run; names what is missing.
-    """
+    """Returns the name of an engine that can run here; `auto` is warp on an NVIDIA GPU, c on a CPU, else jax."""
     allowed = ("auto", *ENGINES)
     if impl not in allowed:
         raise InputError(f"impl: unknown engine {impl!r}{nearest(impl, allowed)}; allowed: {', '.join(allowed)}")

@@ -22,18 +22,8 @@ from mqe_jax.physics.robots.motors import Motors
 if TYPE_CHECKING:
     from mujoco import mjx
 
-# Fields of `mjx.Data` that carry the state; all others are recomputed from them in every step.
-STATE_FIELDS = (
-    "qpos",
-    "qvel",
-    "qacc_warmstart",
-    "ctrl",
-    "mocap_pos",
-    "mocap_quat",
-    "xfrc_applied",
-    "time",
-    "sensordata",
-)
+STATE_FIELDS = tuple("qpos qvel qacc_warmstart ctrl mocap_pos mocap_quat xfrc_applied time sensordata".split())
+"""Fields of `mjx.Data` that carry the state; all others are recomputed from them in every step."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -43,23 +33,16 @@ class Engine(abc.ABC):
     An engine defines `impl`, `blank` and `advance`, and where it cannot always run, `preferred` and `obstacle`.
     """
 
-    impl: ClassVar[str]
-    """Name of the engine in the registry."""
-    model: mujoco.MjModel
-    """Compiled model."""
+    impl: ClassVar[str]  # name of the engine in the registry
+    model: mujoco.MjModel  # compiled model
     _: dataclasses.KW_ONLY
-    motors: Motors | None = None
-    """Motors that drive its actuators; without them the actuators have no speed limit."""
-    num_substeps: int = 4
-    """Physics steps per call of `step`."""
-    num_envs: int = 4096
-    """Environments for which buffers are sized that environments share."""
+    motors: Motors | None = None  # motors that drive its actuators; without them the actuators have no speed limit
+    num_substeps: int = 4  # physics steps per call of `step`
+    num_envs: int = 4096  # environments for which buffers are sized that environments share
     contacts_per_env: int = 32
     """Contacts per environment for which such buffers are sized, on average over environments."""
     max_constraints_per_env: int = 160
     """Maximum constraints of each environment, for engines with such a limit (Warp's njmax)."""
-
-    # -- defined by each engine ---------------------------------------------------------------------------------
 
     @classmethod
     def preferred(cls) -> bool:
@@ -83,29 +66,14 @@ class Engine(abc.ABC):
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances one environment by `num_substeps` physics steps under the control `data.ctrl`.
+        """Advances one environment by `num_substeps` physics steps under the control `data.ctrl`, which stays.
 
-        Args:
-            data: state of the environment.
-            fields: model fields that this environment overrides, by their `mjModel` names.
-            forced: whether `data.xfrc_applied` may differ from zero.
-            num_substeps: physics steps.
-
-        Returns:
-            Data with the same control, and the overflow flag of `step`.
+        `fields` are as of `step`, whose overflow flag it also returns; `forced` says whether `data.xfrc_applied` may
+        differ from zero.
         """
-
-    # -- common to all engines ----------------------------------------------------------------------------------
 
     def init(self, qpos: jax.Array, qvel: jax.Array, mocap_pos: jax.Array, ctrl: jax.Array) -> mjx.Data:
-        """Returns the initial state of one environment, without a forward pass.
-
-        Args:
-            qpos: (nq,).
-            qvel: (nv,).
-            mocap_pos: positions of the mocap bodies (nmocap, 3), m.
-            ctrl: (nu,).
-        """
+        """Returns the initial state of one environment, without a forward pass; `mocap_pos` are (nmocap, 3), m."""
         as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
         return self._template.replace(
             qpos=as_float(qpos),
@@ -128,17 +96,11 @@ class Engine(abc.ABC):
         xfrc_applied: jax.Array | None = None,
         num_substeps: int | None = None,
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances one environment by `num_substeps` physics steps under a constant control.
+        """Advances one environment by steps under a constant control (nu,), joint targets (rad) or torques (N m).
 
-        Args:
-            data: state of the environment.
-            ctrl: (nu,), joint targets (rad) or torques (N m).
-            fields: model fields that this environment overrides, by their `mjModel` names.
-            xfrc_applied: external forces and torques on the bodies (nbody, 6), N and N m, world frame.
-            num_substeps: physics steps; `self.num_substeps` if None.
-
-        Returns:
-            The state, and whether contacts or constraints may have been dropped in any physics step () bool.
+        `fields` are the model fields that this environment overrides, by their `mjModel` names, `xfrc_applied` external
+        forces and torques on the bodies (nbody, 6), N and N m, world frame. Returns the state, and whether contacts or
+        constraints may have been dropped in any physics step () bool.
         """
         data = data.replace(ctrl=ctrl.astype(jnp.float32))
         if xfrc_applied is not None:

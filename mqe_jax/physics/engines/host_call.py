@@ -82,12 +82,8 @@ def host_call(
 ) -> jax.Array:
     """Returns the result of a host function in a compiled program; batched with all its arguments by `vmap`.
 
-    Args:
-        number: of the function, the same in every process (64 bits); functions of one number do the same.
-        owner: an object; functions whose owners live are preferred.
-        function: called with the arguments as arrays; it must not reference the owner.
-        result: shape and dtype of its result without batch axes.
-        arguments: arrays.
+    Functions of one number (64 bits), the same in every process, do the same; those whose owners live are preferred,
+    which they must not reference. `result` has the shape and dtype without batch axes.
     """
     _owners.setdefault(number, weakref.WeakKeyDictionary())[owner] = function
     _latest.pop(number, None)

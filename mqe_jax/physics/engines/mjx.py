@@ -39,8 +39,7 @@ _TERMS: dict[int, tuple[str, ...]] = {
 class MjxEngine(Engine):
     """Base of the engines that are implementations of MJX."""
 
-    mjx_model: mjx.Model
-    """The model on the device."""
+    mjx_model: mjx.Model  # the model on the device
     unroll = 1
     """Physics steps in one iteration of the loop over them; more compile longer."""
     last_apart = False
@@ -48,11 +47,7 @@ class MjxEngine(Engine):
 
     @abc.abstractmethod
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """Advances by one physics step of `mjx_model`, possibly with other field values.
-
-        Returns:
-            Data, and whether contacts may have been dropped () bool.
-        """
+        """Advances by one physics step of `mjx_model`, possibly with other field values; returns the overflow flag."""
 
     def unused_terms(self, fields: Collection[str]) -> int:
         """Returns the disable flags of terms that need no computation where environments override some fields."""

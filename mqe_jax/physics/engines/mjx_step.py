@@ -27,22 +27,14 @@ _ROUND = (int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE))
 class MarginStep:
     """`mjx.step` of a model for MJX's JAX implementation (Euler integration)."""
 
-    model: mjx.Model
-    """The model without the margins that the step applies itself."""
-    max_contacts: int
-    """Maximum number of contacts that are kept of each dimension, -1 without a limit."""
-
     def __init__(self, model: mujoco.MjModel) -> None:
-        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
-            raise ValueError("the integrator must be Euler")
         inflation = np.where(np.isin(model.geom_type, _ROUND), model.geom_margin, 0.0)
-        without_margins = copy.copy(model)  # which MJX refuses beside a height field; `_collision` sets them
+        without_margins = copy.copy(model)  # `_collision` sets them
         without_margins.geom_margin[:] = 0.0
         without_margins.geom_rbound[:] += inflation
         self.model = mjx.put_model(without_margins, jax.local_devices()[0], impl="jax")
-        names = [model.numeric(i).name for i in range(model.nnumeric)]
-        capped = "max_contact_points" in names
-        self.max_contacts = int(model.numeric("max_contact_points").data[0]) if capped else -1
+        capped = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "max_contact_points") >= 0
+        self.max_contacts = int(model.numeric("max_contact_points").data[0]) if capped else -1  # of each dimension
         self._inflation = inflation.astype(np.float32)
         self._size = model.geom_size.astype(np.float32)
         self._size[:, 0] += self._inflation

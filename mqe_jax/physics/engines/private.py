@@ -122,14 +122,10 @@ def is_constrained(data: mjx.Data) -> bool:
 class GeomPairs(NamedTuple):
     """K pairs of geoms that may touch, of the same types."""
 
-    types: tuple[Any, Any]
-    """Types of both geoms."""
-    condim: int
-    """Dimension of their contacts."""
-    geoms: np.ndarray
-    """Numbers of the geoms (K, 2)."""
-    contact: mjx.Contact
-    """Parameters of their contacts (K, ...)."""
+    types: tuple[Any, Any]  # types of both geoms
+    condim: int  # dimension of their contacts
+    geoms: np.ndarray  # numbers of the geoms (K, 2)
+    contact: mjx.Contact  # parameters of their contacts (K, ...)
     collide: Callable[[mjx.Model, mjx.Data], tuple[jax.Array, jax.Array, jax.Array]]
     """Returns distances (K C,), positions (K C, 3) and frames (K C, 3, 3) of C contacts for each pair."""
 

@@ -21,11 +21,7 @@ def get(name: str) -> Robot:
 
 @checked(robot=Robot)
 def register(robot: Robot) -> Robot:
-    """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it.
-
-    Raises:
-        InputError: if another robot has that name.
-    """
+    """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it."""
     if ROBOTS.setdefault(robot.name, robot) is not robot:
         raise InputError(f"robot: the name {robot.name!r} is already registered")
     return robot

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from mqe_jax.physics.appearance import HIDDEN_GROUP, ROBOT_COLORS, VISUAL_GROUP
 from mqe_jax.physics.collision import robot_bits
@@ -41,7 +42,7 @@ def _add_geom(body: Any, primitive: Primitive, left: int, **properties: Any) -> 
     place: dict[str, Any] = {"pos": (x, left * y, z)}
     if primitive.end is not None:
         place = {"fromto": (x, left * y, z, primitive.end[0], left * primitive.end[1], primitive.end[2])}
-    size = (*primitive.size, 0.0, 0.0)[:3]
+    size = (*np.atleast_1d(primitive.size), 0.0, 0.0)[:3]
     body.add_geom(type=_GEOM_TYPES[primitive.kind], size=size, mass=0.0, **place, **properties)
 
 
@@ -58,15 +59,8 @@ def build_robot(
 ) -> mujoco.MjSpec:
     """Builds one robot with a free base as an `MjSpec`, to be attached to a scene under a prefix.
 
-    Args:
-        robot: robot type.
-        number: robot index in the scene, for its collision bits.
-        contacts: set of its collision geoms, one of `CONTACTS`.
-        visual: whether to add the visual geoms.
-        friction: sliding friction of its collision geoms, which takes precedence over the other geom's.
-        torque_control: actuators take torques (N m) instead of PD joint targets (rad).
-        joint_mechanics: whether its joints have rotor inertia, damping and dry friction.
-        color: index of its colour in `ROBOT_COLORS`; `number` if None.
+    `number` is its index in the scene, for its collision bits and, without `color`, its colour in `ROBOT_COLORS`. The
+    others are those of `Scene`; with `torque_control` actuators take torques (N m) instead of joint targets (rad).
     """
     agent_color = ROBOT_COLORS[(number if color is None else color) % len(ROBOT_COLORS)]
     shapes = robot.shapes(contacts)

@@ -33,7 +33,6 @@ _BLACK = (0.06, 0.06, 0.08, 1.0)
 _DARK = (0.19, 0.20, 0.23, 1.0)
 _GREY = (0.36, 0.38, 0.42, 1.0)
 _SILVER = (0.68, 0.70, 0.74, 1.0)
-_LIGHT = (0.70, 0.95, 1.0, 1.0)
 
 # Trunk box 0.376 x 0.094 x 0.114 and the head box 0.27 ahead of its centre as one capsule, wide enough to leave at most
 # 2 cm of their edges outside; hip cylinders r 0.046; thigh boxes 0.034 x 0.0245; calf boxes 0.016 x 0.016; feet.
@@ -63,16 +62,13 @@ _VISUALS = (
     VisualShape("trunk", capsule(0.006, (-0.12, 0.026, 0.066), (0.12, 0.026, 0.066)), _DARK),
     VisualShape("trunk", capsule(0.006, (-0.12, -0.026, 0.066), (0.12, -0.026, 0.066)), _DARK),
     VisualShape("trunk", box((0.045, 0.02, 0.006), (-0.06, 0, 0.064)), _SILVER),
-    # Neck and head: angular snout, dark face with two cameras and a light below.
+    # Neck and head: angular snout, dark face with two cameras.
     VisualShape("trunk", box((0.05, 0.036, 0.03), (0.2, 0, 0.016)), tint=1.0),
     VisualShape("trunk", capsule(0.032, (0.235, 0.014, 0.034), (0.275, 0.014, 0.036)), tint=1.0),
     VisualShape("trunk", capsule(0.032, (0.235, -0.014, 0.034), (0.275, -0.014, 0.036)), tint=1.0),
     VisualShape("trunk", ellipsoid((0.022, 0.047, 0.035), (0.296, 0, 0.032)), _BLACK),
     VisualShape("trunk", cylinder(0.013, (0.29, 0.021, 0.038), (0.315, 0.021, 0.038)), _SILVER),
     VisualShape("trunk", cylinder(0.013, (0.29, -0.021, 0.038), (0.315, -0.021, 0.038)), _SILVER),
-    VisualShape("trunk", cylinder(0.0095, (0.29, 0.021, 0.038), (0.316, 0.021, 0.038)), _BLACK),
-    VisualShape("trunk", cylinder(0.0095, (0.29, -0.021, 0.038), (0.316, -0.021, 0.038)), _BLACK),
-    VisualShape("trunk", capsule(0.003, (0.312, 0.012, 0.014), (0.312, -0.012, 0.014)), _LIGHT),
     # Legs: round covers in the agent's colour, tapered thighs, slim shanks, dark feet.
     VisualShape("hip", cylinder(0.044, (0, 0.028, 0), (0, 0.062, 0)), _SILVER),
     VisualShape("hip", cylinder(0.036, (0, 0.02, 0), (0, 0.075, 0)), _DARK),

@@ -19,30 +19,20 @@ from mqe_jax.physics.rotation import quaternion_to_euler, rotate_inverse
 class RobotIndex:
     """Index tables of the R robots of a compiled model, as host integers."""
 
-    base_qpos: np.ndarray
-    """Addresses of (position 3, quaternion wxyz 4) in qpos (R, 7)."""
-    base_qvel: np.ndarray
-    """Addresses of (linear 3 world, angular 3 body) in qvel (R, 6)."""
-    joint_qpos: np.ndarray
-    """Joint angles in qpos (R, 12)."""
-    joint_qvel: np.ndarray
-    """Joint velocities in qvel (R, 12)."""
-    actuator: np.ndarray
-    """Rows of ctrl (R, 12)."""
-    trunk_body: np.ndarray
-    """Trunk body ids (R,)."""
-    bodies: np.ndarray
-    """All body ids of each robot (R, 13)."""
-    geoms: np.ndarray
-    """Collision geom ids of each robot (R, G)."""
+    base_qpos: np.ndarray  # addresses of (position 3, quaternion wxyz 4) in qpos (R, 7)
+    base_qvel: np.ndarray  # addresses of (linear 3 world, angular 3 body) in qvel (R, 6)
+    joint_qpos: np.ndarray  # joint angles in qpos (R, 12)
+    joint_qvel: np.ndarray  # joint velocities in qvel (R, 12)
+    actuator: np.ndarray  # rows of ctrl (R, 12)
+    trunk_body: np.ndarray  # trunk body ids (R,)
+    bodies: np.ndarray  # all body ids of each robot (R, 13)
+    geoms: np.ndarray  # collision geom ids of each robot (R, G)
     trunk_force: np.ndarray
     """Addresses in sensordata of the strongest contact force on each of the trunk's T collision geoms (R, T, 3),
-    contact frame, N.
-    """
+    contact frame, N."""
     foot_force: np.ndarray
     """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless the scene has foot
-    sensors.
-    """
+    sensors."""
 
     @property
     def num_robots(self) -> int:
@@ -117,12 +107,9 @@ def index_robots(
 class Proprioception(NamedTuple):
     """What a skill senses of one robot."""
 
-    gravity_b: jax.Array
-    """Unit gravity vector in the trunk frame (3,)."""
-    joint_position: jax.Array
-    """Joint angles (12,), rad."""
-    joint_velocity: jax.Array
-    """Joint velocities (12,), rad/s."""
+    gravity_b: jax.Array  # unit gravity vector in the trunk frame (3,)
+    joint_position: jax.Array  # joint angles (12,), rad
+    joint_velocity: jax.Array  # joint velocities (12,), rad/s
 
 
 @jax.tree_util.register_dataclass
@@ -130,22 +117,14 @@ class Proprioception(NamedTuple):
 class RobotState:
     """Backend-independent robot state after a step (R robots, NPC robots included)."""
 
-    position_w: jax.Array
-    """Trunk origin in the environment frame (R, 3), m."""
-    quaternion: jax.Array
-    """Trunk orientation, wxyz (R, 4)."""
-    linear_velocity_w: jax.Array
-    """Velocity of the trunk origin in the environment frame (R, 3), m/s."""
-    angular_velocity_b: jax.Array
-    """Angular velocity of the trunk in its own frame (R, 3), rad/s."""
-    joint_position: jax.Array
-    """Joint angles (R, 12), rad."""
-    joint_velocity: jax.Array
-    """Joint velocities (R, 12), rad/s."""
-    trunk_force: jax.Array
-    """Strongest contact force on the trunk (R,), N."""
-    active: jax.Array
-    """Robots that take part (R,) bool; the others count nowhere."""
+    position_w: jax.Array  # trunk origin in the environment frame (R, 3), m
+    quaternion: jax.Array  # trunk orientation, wxyz (R, 4)
+    linear_velocity_w: jax.Array  # velocity of the trunk origin in the environment frame (R, 3), m/s
+    angular_velocity_b: jax.Array  # angular velocity of the trunk in its own frame (R, 3), rad/s
+    joint_position: jax.Array  # joint angles (R, 12), rad
+    joint_velocity: jax.Array  # joint velocities (R, 12), rad/s
+    trunk_force: jax.Array  # strongest contact force on the trunk (R,), N
+    active: jax.Array  # robots that take part (R,) bool; the others count nowhere
 
     def count(self, values: jax.Array) -> jax.Array:
         """Returns values (R',) of the first R' robots, 0 for those that take no part."""
@@ -175,10 +154,7 @@ class RobotState:
 def read_robots(
     index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array, active: jax.Array | None = None
 ) -> RobotState:
-    """Reads all robots from the state vectors of one environment (nq,), (nv,), (nsensordata,).
-
-    `active` (A,) says which of the first robots take part; by default all.
-    """
+    """Reads all robots from state vectors; `active` (A,) says which of the first take part, default all."""
     every = jnp.ones(index.num_robots, bool)
     base, base_velocity = qpos[index.base_qpos], qvel[index.base_qvel]
     return RobotState(

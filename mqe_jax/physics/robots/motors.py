@@ -51,20 +51,13 @@ def leg_response(robot: Robot) -> np.ndarray:
 class Motors:
     """The motors of R robots of one type in a compiled scene, J = 12 R joints."""
 
-    joint_qpos: np.ndarray
-    """Joint angles in qpos (J,)."""
-    joint_qvel: np.ndarray
-    """Joint velocities in qvel (J,)."""
-    speed: np.ndarray
-    """Speed limits V (J,), rad/s."""
-    torque: np.ndarray
-    """Torque limits of the controller L (J,), N m."""
-    stall: np.ndarray
-    """Stall torques S (J,), N m."""
-    response: np.ndarray
-    """Accelerations of a leg's joints per torque (3, 3), 1/(kg m^2)."""
-    timestep: float
-    """Physics step, s."""
+    joint_qpos: np.ndarray  # joint angles in qpos (J,)
+    joint_qvel: np.ndarray  # joint velocities in qvel (J,)
+    speed: np.ndarray  # speed limits V (J,), rad/s
+    torque: np.ndarray  # torque limits of the controller L (J,), N m
+    stall: np.ndarray  # stall torques S (J,), N m
+    response: np.ndarray  # accelerations of a leg's joints per torque (3, 3), 1/(kg m^2)
+    timestep: float  # physics step, s
 
     @classmethod
     def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> Motors:
@@ -82,19 +75,11 @@ class Motors:
         )
 
     def limit(self, xp: Any, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> tuple[Any, Any]:
-        """Returns the control and the armature of one physics step.
+        """Returns the control of one physics step under which the actuators' forces are the motors' torques (..., J).
 
-        Args:
-            xp: numpy or jax.numpy.
-            ctrl: control (..., J), rad or N m.
-            position: joint angles (..., J), rad.
-            velocity: joint velocities (..., J), rad/s.
-            gain: of the actuators (..., J): force = gain x ctrl + bias.
-            bias: constant, position and velocity coefficients (..., J, 3).
-
-        Returns:
-            control under which the actuators' forces are the motors' torques (..., J), equal to `ctrl` where the motors
-            can give what is asked, and armature (..., J), kg m^2.
+        It is `ctrl` where the motors can give what is asked. The second result is the armature (..., J), kg m^2. The
+        arguments are control, rad or N m, joint angles and velocities (..., J), and of the actuators, whose force is
+        gain x ctrl + bias, the gain (..., J) and the constant, position and velocity coefficients (..., J, 3).
         """
         pace = xp.abs(velocity)
         below = self.speed - pace
@@ -109,10 +94,8 @@ class Motors:
     def idle(self, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> np.ndarray:
         """Returns where `limit`, for the same numpy arrays, surely returns `ctrl` itself and no armature (...,) bool.
 
-        This takes less time than `limit`. The torques' magnitudes must be at most L and S (1 - |v| / V), which the
-        bounds of `limit` allow in either direction, and speeds below those at which armature begins, by a margin for
-        rounding. Braking with more than S (1 - |v| / V) has no effect in `limit` either, but fails here. So do numbers
-        that are not finite.
+        It takes less time. The torques' magnitudes must be at most L and S (1 - |v| / V), and speeds below those at
+        which armature begins, by a margin for rounding. Some braking and numbers that are not finite fail too.
         """
         pace = np.abs(velocity)
         effort = np.abs(_force(ctrl, position, velocity, gain, bias))
@@ -135,14 +118,7 @@ class Motors:
         return total.reshape(effort.shape)
 
     def _armature(self, xp: Any, pace: Any, effort: Any, against: Any) -> Any:
-        """Returns the armature (..., J), kg m^2.
-
-        Args:
-            xp: numpy or jax.numpy.
-            pace: magnitudes of the speeds (..., J), rad/s.
-            effort: magnitudes of the torques (..., J), N m.
-            against: whether a torque is against its speed (..., J).
-        """
+        """Returns the armature (..., J), kg m^2, from magnitudes of speeds and torques, and which are opposed."""
         size = len(self.response)
         fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
         near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)

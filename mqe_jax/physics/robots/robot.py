@@ -8,6 +8,7 @@ is described, the front left; the others are its mirror images.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections import Counter
 from collections.abc import Sequence
 from typing import Literal
@@ -94,38 +95,17 @@ class Primitive:
     """A primitive in a link frame; on the right legs y is negated."""
 
     kind: Literal["sphere", "capsule", "cylinder", "box", "ellipsoid"]
-    """Kind: sphere, capsule, cylinder, box or ellipsoid."""
-    size: tuple[float, ...]
-    """Radius (1,) of a sphere, capsule or cylinder; half-lengths (3,) of a box or ellipsoid, m."""
+    size: float | Vector
+    """Radius of a sphere, capsule or cylinder; half-lengths (3,) of a box or ellipsoid, m."""
     position: Vector = (0.0, 0.0, 0.0)
     """Centre, or first end of a capsule's or cylinder's axis, m."""
     end: Vector | None = None
     """Second end of the axis, m; None for the other kinds."""
 
 
-def sphere(radius: float, position: Vector = (0.0, 0.0, 0.0)) -> Primitive:
-    """Returns a sphere, m."""
-    return Primitive("sphere", (radius,), position)
-
-
-def capsule(radius: float, start: Vector, end: Vector) -> Primitive:
-    """Returns a capsule around the segment from `start` to `end`, m."""
-    return Primitive("capsule", (radius,), start, end)
-
-
-def cylinder(radius: float, start: Vector, end: Vector) -> Primitive:
-    """Returns a cylinder around the segment from `start` to `end`, m."""
-    return Primitive("cylinder", (radius,), start, end)
-
-
-def box(half_size: Vector, position: Vector = (0.0, 0.0, 0.0)) -> Primitive:
-    """Returns a box along the link's axes, m."""
-    return Primitive("box", half_size, position)
-
-
-def ellipsoid(half_size: Vector, position: Vector = (0.0, 0.0, 0.0)) -> Primitive:
-    """Returns an ellipsoid along the link's axes, m."""
-    return Primitive("ellipsoid", half_size, position)
+sphere, capsule = functools.partial(Primitive, "sphere"), functools.partial(Primitive, "capsule")
+cylinder, box = functools.partial(Primitive, "cylinder"), functools.partial(Primitive, "box")
+ellipsoid = functools.partial(Primitive, "ellipsoid")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +127,7 @@ class CollisionShape:
 
     @property
     def link(self) -> str:
-        """Link of the shape; a foot belongs to the calf."""
+        """Link of the shape: the calf of a foot."""
         return "calf" if self.part == "foot" else self.part
 
     @property
@@ -196,20 +176,6 @@ class WalkSettings:
     """Minimum height of the trunk origin, m; below it the robot has fallen."""
 
 
-_JOINT_FIELDS = (
-    "default_joints",
-    "joint_lower",
-    "joint_upper",
-    "joint_speed_limit",
-    "torque_limit",
-    "stall_torque",
-    "action_scale",
-    "rotor_inertia",
-    "joint_damping",
-    "friction_loss",
-)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Robot:
     """A quadruped; make a variant with `dataclasses.replace`. Arrays (12,) are in the order of `JOINT_NAMES`."""
@@ -219,13 +185,12 @@ class Robot:
     title: str
     """Full name."""
     trunk: Link
-    """Inertial parameters of the trunk."""
     hip: Link
-    """Inertial parameters of the front left hip; y is mirrored for the right legs, x for the rear ones."""
+    """The front left hip; y is mirrored for the right legs, x for the rear ones."""
     thigh: Link
-    """Inertial parameters of the front left thigh; y is mirrored for the right legs."""
+    """The front left thigh; y is mirrored for the right legs."""
     calf: Link
-    """Inertial parameters of the front left calf with its foot; y is mirrored for the right legs."""
+    """The front left calf with its foot; y is mirrored for the right legs."""
     leg_root: tuple[float, float]
     """Hip joint of the front left leg in the trunk frame (x, y), m."""
     hip_length: float
@@ -264,18 +229,13 @@ class Robot:
     action_scale: np.ndarray
     """Scale of joint actions (12,), rad: joint target = default + scale x action."""
     stand_height: float
-    """Height of the trunk origin when standing at the default angles, m; the walk policy's target at a zero height
-    command.
-    """
+    """Height of the trunk origin at the default angles, m; the walk policy's target at a zero height command."""
     collision: tuple[CollisionShape, ...]
-    """Collision shapes."""
     visuals: tuple[VisualShape, ...]
-    """Visual shapes."""
     walk: WalkSettings
-    """Walk-policy settings."""
 
     def __post_init__(self) -> None:
-        for name in _JOINT_FIELDS:
+        for name in (field.name for field in dataclasses.fields(self) if field.type == "np.ndarray"):
             array = np.array(getattr(self, name), float)
             if array.shape != (NUM_JOINTS,):
                 raise InputError(f"Robot.{name}: shape {array.shape}; expected ({NUM_JOINTS},)")

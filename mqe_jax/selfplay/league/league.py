@@ -37,20 +37,13 @@ _SWING = 30.0  # Elo points per update, at most; one per game beyond what was ex
 class LeagueState(NamedTuple):
     """The league's part of the learner state; K blocks of environments."""
 
-    pool: Pool
-    """Earlier policies."""
-    member: jax.Array
-    """Member that each block plays (K,) int32; without meaning for blocks that play no member."""
-    played: jax.Array
-    """Episodes of each block against it (K,) int32."""
-    rating: jax.Array
-    """The learner's rating (), Elo points; the scripted policy has 0."""
-    snapshot: jax.Array
-    """Update of the last snapshot () int32."""
-    recent: jax.Array
-    """Recent wins, draws and losses of each block (K, 3)."""
-    key: jax.Array
-    """Random key."""
+    pool: Pool  # earlier policies
+    member: jax.Array  # member that each block plays (K,) int32; without meaning for blocks that play no member
+    played: jax.Array  # episodes of each block against it (K,) int32
+    rating: jax.Array  # the learner's rating (), Elo points; the scripted policy has 0
+    snapshot: jax.Array  # update of the last snapshot () int32
+    recent: jax.Array  # recent wins, draws and losses of each block (K, 3)
+    key: jax.Array  # random key
 
 
 class Roster:
@@ -71,9 +64,6 @@ class Roster:
 
 class League:
     """Matches against fixed opponents, the newest policy and members of a pool; a `Matchmaker`."""
-
-    env: Versus
-    """The matches as environments of team 0."""
 
     @single
     def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig) -> None:
@@ -140,7 +130,6 @@ class League:
         return PolicyArrays(self._network.policy_params(state.params), state.obs_normalizer.obs, scale)
 
     def _record(self, league: LeagueState, opponents: Sequence[Any]) -> LeagueState:
-        """Adds the outcomes since the last update."""
         counts = devices.total(jnp.stack([opponent.outcomes for opponent in opponents])).astype(jnp.float32)
         games, score = jnp.sum(counts, axis=1), counts[:, 0] + 0.5 * counts[:, 1]
         plays_member, reference = self._roster.members, self._roster.reference
@@ -157,7 +146,6 @@ class League:
         )
 
     def _snapshot(self, league: LeagueState, own: PolicyArrays, updates: jax.Array) -> LeagueState:
-        """Makes the policy a member when it is due."""
         settings = self._config.league
         every = -(-settings.snapshot_steps // self._config.steps_per_update)
         since = updates - league.snapshot

@@ -16,16 +16,11 @@ _PRIOR = 4.0  # games, drawn, that a member starts with
 class Pool(NamedTuple):
     """M places for members; B stands for blocks of environments."""
 
-    arrays: PyTree
-    """The members' arrays, leading axis M."""
-    born: jax.Array
-    """Update after which each became a member (M,) int32; -1 where the place is free."""
-    score: jax.Array
-    """The learner's wins, and half of its draws, against each (M,)."""
-    games: jax.Array
-    """Games against each (M,)."""
-    rating: jax.Array
-    """Rating of each when it became a member (M,), Elo points."""
+    arrays: PyTree  # the members' arrays, leading axis M
+    born: jax.Array  # update after which each became a member (M,) int32; -1 where the place is free
+    score: jax.Array  # the learner's wins, and half of its draws, against each (M,)
+    games: jax.Array  # games against each (M,)
+    rating: jax.Array  # rating of each when it became a member (M,), Elo points
 
 
 def new_pool(arrays: PyTree, members: int) -> Pool:

@@ -13,12 +13,10 @@ from mqe_jax.envs.wrappers import Wrapper
 
 
 class BothSides(Wrapper):
-    """Matches, in the second half of which team 0 is the task's team 1.
+    """Matches, in the second half of which team 0 is the task's team 1; outcomes and rewards are the new teams'.
 
-    The privileged observation has one more number: 1 where the teams have changed places, else 0. Outcomes, rewards and
-    their terms among the metrics are those of the new teams.
-
-    It makes a difference where a match is symmetric under a reflection: robots walk not quite as their mirror images.
+    The privileged observation has one more number: 1 where the teams have changed places, else 0. It makes a difference
+    where a match is symmetric under a reflection: robots walk not quite as their mirror images.
     """
 
     def __init__(self, inner: Any) -> None:
