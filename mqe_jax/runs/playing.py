@@ -18,6 +18,7 @@ from mqe_jax.core.limits import Candidates, ClipLength, Environments, Episodes, 
 from mqe_jax.core.settings import PathText, check, checked, fail, joined
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.runs import build
 from mqe_jax.runs.build import Player, parameters_of
@@ -115,9 +116,9 @@ def tournament(
     Raises:
         InputError: as `evaluate`, and for a task of one team.
     """
-    params = joined(parameters_of(task), env or {})
-    if isinstance(task, str):
-        params = joined(parameters_for(task, *policies), params)
+    task = task_id(task) if isinstance(task, str) else task
+    needed = parameters_for(task, *policies) if isinstance(task, str) else parameters_of(task)
+    params = joined(needed, env or {})
     match, _ = build.make_env(task, impl, params, 1)
     if len(match.teams) < 2:
         fail("task", match.name, "a match: it has one team")
