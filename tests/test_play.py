@@ -268,6 +268,8 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         tab.keyboard.down("w")
         tab.wait_for_function("document.querySelector('#drive').value === '0'")
         assert "drive=0" in tab.url and "seed=3" in tab.url and "team0=shipped" in tab.url
+        values = "import('./controls.js').then((own) => new own.Controls([], () => {}).values(['vx', 'skill']))"
+        assert tab.evaluate(values) == [0, 1]  # of several skills, keys choose the last one
         photograph(tab, "driven")
         tab.keyboard.press("r")
         tab.keyboard.press("Space")
