@@ -24,6 +24,7 @@ from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Rate, evaluate_batch
 from mqe_jax.train.runner import Training
+from mqe_jax.train.stages import Stages
 from tests.training import assert_same
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
@@ -115,6 +116,24 @@ def test_an_interrupt_returns_the_run_so_far(monkeypatch: Any, capfd: Any) -> No
         mqe_jax.learn("fake", FEW | {"ppo.clip": 0.1}, run_dir="run", resume=True)
     assert capfd.readouterr().err == ""  # not even that it compiles
     assert len(mqe_jax.learn("fake", FEW, run_dir="run", resume=True).metrics["success"]) == 2
+
+
+class Still(Stages):
+    """An algorithm that learns nothing."""
+
+    def update(self, carry: Any, batch: Any, now: Any, key: Any) -> Any:
+        return carry, super().update(carry, batch, now, key)[1]
+
+
+def test_an_own_algorithm_is_trained_and_resumed() -> None:
+    halfway = mqe_jax.learn("fake", FEW | {"total_steps": 32}, run_dir="run", stages=Still)
+    with pytest.raises(InputError, match=r"stages: .Stages. is not allowed; .* .Still., the algorithm of"):
+        mqe_jax.learn("fake", FEW, run_dir="run", resume=True)
+    done = mqe_jax.learn("fake", FEW, run_dir="run", resume=True, stages=Still)
+    assert done.finished
+    assert_same(done.policy.params, halfway.policy.params)
+    with pytest.raises(InputError, match=r"stages: .* must be a subclass of"):
+        mqe_jax.learn("fake", FEW, stages=object)  # type: ignore
 
 
 def test_seeds_are_trained_in_one_program_into_their_folders() -> None:

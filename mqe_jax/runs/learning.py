@@ -25,6 +25,7 @@ from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
 from mqe_jax.train.monitor import read_evaluations, write_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import Training, open_training
+from mqe_jax.train.stages import Stages
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,6 +128,7 @@ def learn(
     run_dir: str | Path | None = None,
     resume: bool = False,
     dump_diverged: str | Path | None = None,
+    stages: type[Stages] = Stages,
 ) -> Run:
     """Trains a policy on one device, as `mqe train` with the same settings does.
 
@@ -149,13 +151,14 @@ def learn(
         run_dir: run folder. Default: nothing is written.
         resume: whether to continue the run in the folder from its newest checkpoint, if there is one.
         dump_diverged: folder for recordings of environments whose physics diverges (see `mqe replay`).
+        stages: the algorithm; a subclass has other advantages, another loss or another update (examples/happo.py).
 
     Raises:
         InputError: for a task, settings or parameters that are not allowed, or a run folder that cannot be used.
         NonFiniteError: after the first update with a loss or weight that is not finite.
     """
     configs, cast = prepare(task, config, env, impl=impl, seeds=None if seed is None else [seed])
-    return _train(configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged)[0]
+    return _train(configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged, stages)[0]
 
 
 @checked(seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
@@ -169,6 +172,7 @@ def learn_seeds(
     run_dir: str | Path | None = None,
     resume: bool = False,
     dump_diverged: str | Path | None = None,
+    stages: type[Stages] = Stages,
 ) -> list[Run]:
     """Trains several seeds in one program, each equivalent to a `learn` up to rounding; its arguments and errors.
 
@@ -179,14 +183,14 @@ def learn_seeds(
         ```
 
     Args:
-        task: as `learn`, and so are config, env, impl, resume and dump_diverged.
+        task: as `learn`, and so are config, env, impl, resume, dump_diverged and stages.
         seeds: random seeds.
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
     numbers = check("seeds", seeds, Annotated[tuple[Seed, ...], MinLen(1), MaxLen(int(limits.bounds(Seeds)[1]))])
     configs, cast = prepare(task, config, env, impl=impl, seeds=numbers)
     folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
-    return _train(configs, cast, folders, resume, dump_diverged)
+    return _train(configs, cast, folders, resume, dump_diverged, stages)
 
 
 @checked(resume=bool, dump_diverged=PathText | None)
@@ -196,11 +200,14 @@ def _train(
     folders: Sequence[Path | None],
     resume: bool,
     dump_diverged: str | Path | None,
+    stages: type[Stages],
 ) -> list[Run]:
     """Trains into the folders of the seeds, or writes nothing where they are None."""
     with (
         guard(cast.env, dump_diverged) as env,
-        open_training(configs=configs, run_dirs=folders, resume=resume, **cast._replace(env=env)._asdict()) as training,
+        open_training(
+            configs=configs, run_dirs=folders, resume=resume, stages=stages, **cast._replace(env=env)._asdict()
+        ) as training,
     ):
         if resume and not training.resumed:
             where = ", ".join(map(str, folders))

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from mqe_jax.core import devices
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import checked, fail
 from mqe_jax.core.types import (
     AnyBatch,
     Batch,
@@ -87,6 +87,8 @@ def make_learner(
     """
     check_environment(env, config, processes)
     check_teacher(config, teacher)
+    if not (isinstance(stages, type) and issubclass(stages, Stages)):
+        fail("stages", stages, "a subclass of mqe_jax.train.stages.Stages")
     dims = needs_of(env, config).dims
     network = config.network.build(dims)
     check_divisible(config, network, processes)

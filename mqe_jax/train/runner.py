@@ -27,6 +27,7 @@ from mqe_jax.train.logs import LOGGERS, CsvLog, MetricsLog, ProgressLog, check_l
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import Seeds, without_shared
+from mqe_jax.train.stages import Stages
 from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
@@ -85,6 +86,7 @@ def open_training(
     eval_env: VectorEnv | None = None,
     league: Matchmaker | None = None,
     teacher: Any = None,
+    stages: type[Stages] = Stages,
 ) -> Iterator[Training]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
     check("env", env, AnyBatch)
@@ -103,14 +105,14 @@ def open_training(
         check_loggers(configs[0].loggers)
     elif resume:
         fail("resume", True, "false without a run_dir")
-    learner, processes = own_learner(env, configs[0], league, teacher)
+    learner, processes = own_learner(env, configs[0], league, teacher, stages)
     with connected(), open_folders(folders, resume) if processes.leads else contextlib.nullcontext():
         processes.gather([0])  # the others wait for these checks
         checkpoints = common_checkpoints(folders) or [None] * len(configs)
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
         total = configs[0].num_updates * configs[0].steps_per_update
         with ProgressLog(configs[0].task or env.name, total, shown=processes.leads) as progress:
-            yield Training(env, learner, processes, configs, folders, checkpoints, eval_env, league, progress)
+            yield Training(env, learner, processes, configs, folders, checkpoints, eval_env, league, progress, stages)
 
 
 class Training:
@@ -127,12 +129,13 @@ class Training:
         eval_env: VectorEnv | None,
         league: Matchmaker | None,
         progress: ProgressLog,
+        stages: type[Stages],
     ) -> None:
-        self._env, self._configs, self._folders = env, configs, folders
+        self._env, self._configs, self._folders, self._stages = env, configs, folders, stages
         self._config, self._processes, self._progress = configs[0], processes, progress
         self._seeds = seeds = Seeds(learner.init, len(configs))
         first = [
-            first_state(env, learner, processes, own, path, seeds.shared, league, progress.doing)
+            first_state(env, learner, processes, own, path, seeds.shared, league, progress.doing, stages)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stacked(seeds.shared)
@@ -244,7 +247,7 @@ class Training:
         kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
         for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
             metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
-            metadata["generator"] = generator()
+            metadata |= {"generator": generator(), "stages": self._stages.__name__}
             metadata["environments"] = config.checkpoint.environments
             if config.checkpoint.environments:
                 tree = self._processes.join(without_shared(state, self._seeds.shared))

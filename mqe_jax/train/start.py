@@ -22,6 +22,7 @@ from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import NAMED, TrainedPolicy, check_policy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
+from mqe_jax.train.stages import Stages
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 _MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
@@ -34,16 +35,20 @@ def initial_key(config: TrainConfig) -> jax.Array:
 
 
 def own_learner(
-    env: VectorEnv, config: TrainConfig, league: Matchmaker | None = None, teacher: Any = None
+    env: VectorEnv,
+    config: TrainConfig,
+    league: Matchmaker | None = None,
+    teacher: Any = None,
+    stages: type[Stages] = Stages,
 ) -> tuple[Learner, Processes]:
     """Returns the learner of this process, which has its share of the environments, and all processes."""
     count = jax.process_count()
-    whole = own = make_learner(env, config, league=league, teacher=teacher)
+    whole = own = make_learner(env, config, league=league, teacher=teacher, stages=stages)
     if count > 1:
         share: Any = getattr(env, "share", None)
         if share is None:
             raise InputError(f"env: {env.name} cannot be split over {count} processes: it has no `share`")
-        own = make_learner(share(count), config, league=league, teacher=teacher, processes=count)
+        own = make_learner(share(count), config, league=league, teacher=teacher, processes=count, stages=stages)
     return own, Processes(*(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole)))
 
 
@@ -56,6 +61,7 @@ def first_state(
     shared: PyTree,
     league: Matchmaker | None = None,
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
+    stages: type[Stages] = Stages,
 ) -> tuple[TrainState, float]:
     """Returns this process's initial or restored state and the seconds already spent; `shared` as in `Seeds`."""
     start = processes.compile(learner.init, start=True)
@@ -80,6 +86,8 @@ def first_state(
         fail(
             "jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {checkpoint.parent.parent}"
         )
+    if (algorithm := metadata.get("stages", Stages.__name__)) != stages.__name__:
+        fail("stages", stages.__name__, f"{algorithm!r}, the algorithm of the run in {checkpoint.parent.parent}")
     before, seconds = metadata.get("config", {}), metadata.get("seconds", 0.0)
     if not isinstance(before, dict) or not isinstance(seconds, int | float) or not 0 <= seconds < math.inf:
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
