@@ -123,16 +123,27 @@ def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
     for goal_x, away, color in ((x[0], -1, ROBOT_COLORS[0]), (x[1], 1, ROBOT_COLORS[2])):
         box = (goal_x - away * 1.7, goal_x)
         shapes += outline((min(box), max(box)), (-1.2 * mouth, 1.2 * mouth), width=0.07)
-        shapes += _goal(goal_x, mouth / 2, height, color)
+        shapes += _goal(goal_x, away * depth, mouth / 2, height, color)
         points += [(goal_x, side * mouth / 2, height) for side in (-1.0, 1.0)]
     return Ground((0.36, 0.52, 0.32, 1.0), tuple(shapes), tuple(points))
 
 
-def _goal(x: float, half: float, height: float, color: Color) -> list[Shape]:
-    """Returns the frame of a goal at `x`."""
-    inner = half - _POST
+def _goal(x: float, depth: float, half: float, height: float, color: Color) -> list[Shape]:
+    """Returns the frame and the net of a goal, whose back is at `x + depth`."""
+    inner, back = half - _POST, x + 0.96 * depth
     posts = [rod((x, side * inner, 0.0), (x, side * inner, height), _POST, color) for side in (-1, 1)]
-    return [*posts, rod((x, -inner, height), (x, inner, height), _POST, color)]
+    frame: list[Shape] = [*posts, rod((x, -inner, height), (x, inner, height), _POST, color)]
+    thread, net = 0.008, (0.93, 0.93, 0.93, 1.0)
+    for y in np.linspace(-inner, inner, 10).tolist():
+        frame += [
+            rod((back, y, 0.0), (back, y, height), thread, net),
+            rod((x, y, height), (back, y, height), thread, net),
+        ]
+    for part in (0.25, 0.5, 0.75, 1.0):
+        z, along = part * height, x + part * (back - x)
+        frame += [rod((back, -inner, z), (back, inner, z), thread, net)]
+        frame += [rod((along, -inner, height), (along, inner, height), thread, net)]
+    return frame
 
 
 def climb(length: float, width: float, top: tuple[float, float, float], size: tuple[float, float, float]) -> Ground:
