@@ -16,7 +16,7 @@ from fake_env import SMALL, FakeEnv, FakeVectorEnv
 import mqe_jax
 from mqe_jax import cli
 from mqe_jax.cli.train import parse_train
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.core.types import Outcome
 from mqe_jax.runs import build, playing
@@ -201,12 +201,18 @@ def test_what_cannot_be_evaluated_is_named(task: Any, arguments: dict[str, Any],
 
 
 def test_a_run_of_other_parts_is_named(run: mqe_jax.Run) -> None:
-    tables: list[Any] = [{"a": np.zeros((2, 2))}, {"a": np.zeros(2), "b": np.zeros(3)}]
-    wrong = {"policy": [{}], "metrics": [[], *tables], "evaluations": [{}, [3]], "absolute": [[]]}
+    tables: list[Any] = [{"a": np.zeros((2, 2))}, {"a": np.zeros(2), "b": np.zeros(3)}, {"a": np.array(["x"])}]
+    point = {"env_steps": 1, "sampled": {}, "deterministic": {}}
+    points: list[Any] = [{}, {**point, "env_steps": -1}, {**point, "x": np.zeros(2)}]
+    wrong = {"policy": [{}], "metrics": [[], *tables], "absolute": [[], *points], "evaluations": [{}, [3], points[1:]]}
     for name, values in wrong.items():
         for value in (*values, 3, "idle"):
             with pytest.raises(InputError, match=f"^{name}.*: "):
                 dataclasses.replace(run, **{name: value})
+    weights = jax.tree.map(lambda x: x * np.nan, run.policy.params)
+    with pytest.raises(NonFiniteError, match="params"):
+        dataclasses.replace(run, policy=dataclasses.replace(run.policy, params=weights)).save("broken")
+    assert list(Path.cwd().iterdir()) == []
 
 
 def test_an_environment_keeps_its_parameters() -> None:
@@ -233,7 +239,7 @@ def test_intervals_are_wilsons(wins: int, episodes: int, low: float, high: float
 
 def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     result = mqe_jax.evaluate("fake", "forward", episodes=4)
-    wrong: Any = ((None, 4), ("x", 4), (0.5, 0), (0.5, 1.5))
+    wrong: Any = ((None, 4), (-1, 4), (1.5, 4), (0.5, 0), (0.5, 1.5))
     for value, episodes in wrong:
         with pytest.raises(InputError, match=r"^(value|episodes): "):
             Rate.of(value, episodes)

@@ -212,7 +212,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("rewards", lambda x, v: make("go1gate", rewards=v), (3, "x", [], {"x": 1})),
     ("randomization: ", lambda x, v: make("go1gate", randomization=v), (3, "x", [])),
     ("action: ", lambda x, v: x["task"].step(x["state"], v), (np.zeros((1, 2, 12)), 3, [])),
-    ("unknown name", lambda x, v: build(TrainConfig, {v: 1}), ("", 3, b"a", "a" * 100, "\0")),
+    ("unknown name", lambda x, v: build(TrainConfig, {v: 1}), ("", 3, b"a", "a" * 5000, "\0")),
     ("ppo: ", lambda x, v: override(TrainConfig(), {"ppo": v}), (3, "x", [], None)),
     ("unknown name", lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}), ("self", "__dataclass_self__", "init")),
     ("path: ", lambda x, v: v[0](v[1]), tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0")))),

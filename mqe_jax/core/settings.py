@@ -36,7 +36,7 @@ from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from mqe_jax.core import limits
-from mqe_jax.core.errors import InputError, nearest, shown
+from mqe_jax.core.errors import InputError, brief, nearest, shown
 from mqe_jax.core.files import read_yaml
 from mqe_jax.core.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for those who declare records)
 
@@ -366,7 +366,7 @@ def _record_in(hint: Any) -> Any:
 def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     """Returns the first error of a validation: path, value, and what is allowed."""
     first = error.errors(include_url=False)[0]
-    places = [str(part) for part in first["loc"]]
+    places = [brief(str(part)) for part in first["loc"]]
     value, context = first["input"], first.get("ctx", {})
     if isinstance(raised := context.get("error"), InputError):
         return InputError(".".join([*places, str(raised)]))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import numpy as np
+import pydantic
 from annotated_types import MaxLen, MinLen
 
 from mqe_jax.core import interrupts, limits
@@ -22,7 +23,7 @@ from mqe_jax.runs.divergence import guard
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_run, write_config
 from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
-from mqe_jax.train.monitor import read_evaluations, write_evaluations
+from mqe_jax.train.monitor import Evaluation, read_evaluations, write_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import Training, open_training
 from mqe_jax.train.stages import Stages
@@ -46,11 +47,11 @@ class Run:
 
     def __post_init__(self) -> None:
         check("policy", self.policy, TrainedPolicy)
-        shapes = {np.shape(column) for column in check("metrics", self.metrics, dict[str, np.ndarray]).values()}
-        if len(shapes) > 1 or any(len(shape) != 1 for shape in shapes):
-            fail("metrics", self.metrics, "columns of one length")
-        check("evaluations", self.evaluations, list[dict[str, Any]])
-        check("absolute", self.absolute, dict[str, Any] | None)
+        columns = check("metrics", self.metrics, Mapping[str, np.ndarray]).values()
+        if len({x.shape for x in columns}) > 1 or any(x.ndim != 1 or x.dtype.kind not in "fiu" for x in columns):
+            fail("metrics", self.metrics, "columns of numbers, of one length")
+        for name, kind in {"evaluations": list[Evaluation], "absolute": Evaluation | None}.items():
+            check(name, check(name, getattr(self, name), pydantic.JsonValue), kind)
 
     @property
     def config(self) -> TrainConfig:
@@ -88,6 +89,7 @@ class Run:
         path = Path(check("folder", folder, PathText))
         check_folder(path, "folder")
         check_run(path)
+        save_policy(path, self.policy)  # first: it refuses weights that are not finite
         write_config(path, self.config)
         log = CsvLog(path, 0)
         for values in zip(*self.metrics.values(), strict=True):
@@ -95,7 +97,6 @@ class Run:
         if self.evaluations:
             ended = {} if self.absolute is None else {"ended_at": self.env_steps}
             write_evaluations(path, {"evaluations": self.evaluations, "absolute": self.absolute, **ended})
-        save_policy(path, self.policy)
 
 
 @checked(folder=PathText)

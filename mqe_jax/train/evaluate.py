@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import Episodes, Horizon, PositiveInt
+from mqe_jax.core.limits import Episodes, Fraction, Horizon, PositiveInt
 from mqe_jax.core.literal import line, to_html
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, checked, fail
@@ -53,7 +53,7 @@ class Rate(NamedTuple):
         return f"{100 * self.value:.1f}% ({100 * self.low:.1f} to {100 * self.high:.1f}%)"
 
     @classmethod
-    @checked(value=float, episodes=PositiveInt)
+    @checked(value=Fraction, episodes=PositiveInt)
     def of(cls, value: float, episodes: int) -> Rate:
         """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is conservative."""
         spread = _NORMAL**2 / episodes

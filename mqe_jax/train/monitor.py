@@ -36,7 +36,9 @@ ABSOLUTE_FACTOR = 10
 _SAMPLED, _DETERMINISTIC = 0, 1
 
 
-class _Evaluation(TypedDict):
+class Evaluation(TypedDict):
+    """An evaluation as JSON has it; further entries are allowed."""
+
     __pydantic_config__ = pydantic.ConfigDict(extra="allow", strict=True, allow_inf_nan=False)  # type: ignore[misc]
     env_steps: Annotated[int, Ge(0)]
     sampled: dict[str, float | None]
@@ -44,8 +46,8 @@ class _Evaluation(TypedDict):
 
 
 class _Evaluations(TypedDict):
-    evaluations: list[_Evaluation]
-    absolute: _Evaluation | None
+    evaluations: list[Evaluation]
+    absolute: Evaluation | None
     ended_at: NotRequired[int]
 
 
