@@ -113,6 +113,7 @@ def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:
     env = versus(door, ["random", "random"])
     step, action = jax.jit(env.step), jnp.zeros((4, 1, 12))
     state = env.reset(KEY)
+    assert np.any(state.match.key != door.reset(state.key).key)
 
     def drawn(state: Any) -> np.ndarray:
         return np.asarray(step(state, action).action[:, 1])
