@@ -70,9 +70,6 @@ SHIPPED = {
 }
 """The package's tasks by id, with default parameters."""
 
-# Further scripted policies, such as opponents: id of the task, name, MODULE:FUNCTION of mqe_jax.policies.scripted.
-_NAMED: list[tuple[str, str, str]] = []
-
 # Alternative ids, from the released system.
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
@@ -93,21 +90,23 @@ PLANNERS: dict[str, Planner | str] = {name: task.planner for name, task in SHIPP
 """Scripted policies by task id; shipped ones as MODULE:FUNCTION, since this package does not import `planners`."""
 
 
-NAMED_PLANNERS: dict[str, dict[str, Planner | str]] = {}
-"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`), as those of `PLANNERS`."""
+NAMED_PLANNERS: dict[str, dict[str, Planner]] = {}
+"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`)."""
 
 
-@checked(task=str, name=str, planner=Callable | str)
-def register_planner(task: str, name: str, planner: Planner | str) -> None:
+@checked(task=str, name=str, planner=Callable)
+def register_planner(task: str, name: str, planner: Planner) -> None:
     """Registers a further scripted policy of a task under a name that no other one has."""
+    if not name:
+        fail("name", name, "a text that is not empty")
     if task not in TASKS:
         raise InputError(f"planner {name!r}: unknown task {task!r}; allowed: {', '.join(TASKS)}")
     if NAMED_PLANNERS.setdefault(task, {}).setdefault(name, planner) is not planner:
         raise InputError(f"planner: the name {name!r} is already registered for {task}")
 
 
-@checked(planner=Callable | str | None)
-def register_task(task: type[QuadrupedEnv], planner: Planner | str | None = None) -> type[QuadrupedEnv]:
+@checked(planner=Callable | None)
+def register_task(task: type[QuadrupedEnv], planner: Planner | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
     A class decorator too. InputError if it is no class of tasks, has no name, or another class has that name.
@@ -139,7 +138,3 @@ def load(package: str, path: str) -> Any:
     """Imports and returns the object MODULE:NAME of a package."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(f"{package}.{module}"), name)
-
-
-for _id, _name, _path in _NAMED:
-    register_planner(_id, _name, _path)
