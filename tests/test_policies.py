@@ -111,6 +111,12 @@ def test_parameters_are_those_that_policies_need_beyond_the_defaults(task: str, 
     assert parameters_for(task, "forward", "nobody", *policies) == expected
 
 
+def test_a_batch_evaluates_only_policies_that_fit() -> None:
+    batch = VectorEnv(make("go1gate", impl="c", num_envs=1, skill="agile"), 1)
+    with pytest.raises(InputError, match="policy: policy needs skill 'walk'; the environment has 'agile'"):
+        evaluate_batch(batch, zoo.load("go1gate"), 1, jax.random.PRNGKey(0))
+
+
 def test_commands_apply_what_a_shipped_policy_needs(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     zoo.ship(load_policy(AGILE / "go1tug-seed1.safetensors"), zoo.card("go1tug"), tmp_path)
     monkeypatch.setattr(zoo, "FOLDER", tmp_path)

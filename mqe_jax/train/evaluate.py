@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,10 +31,8 @@ from mqe_jax.core.types import (
     teams_of,
     where_rows,
 )
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 from mqe_jax.train.rollout import active_of, mean_of_team
-
-if TYPE_CHECKING:
-    from mqe_jax.train.policy import Policy
 
 Act = Callable[[Any, Memory, jax.Array], tuple[jax.Array, Memory]]
 """`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
@@ -155,6 +153,8 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
     if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
         allowed = f"one of all {env.num_agents}; `mqe_jax.versus` shows one team of a match"
         fail("policy", f"one of {agents} agents", allowed)
+    if isinstance(either, TrainedPolicy):
+        check_policy(either, env)
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
     function = either.act if hasattr(either, "groups") else functools.partial(_given, either.act)
