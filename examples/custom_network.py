@@ -14,7 +14,7 @@ from mqe_jax.core.settings import PositiveInt
 from mqe_jax.core.types import NetworkMemory
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, Network, NetworkSettings, register_network
+from mqe_jax.train.networks import ChunkResult, EnvDims, Network, NetworkSettings, register_network
 
 
 @register_network("mean_field")
@@ -54,7 +54,7 @@ class MeanField(NetworkSettings):
             mean = nn.mlp(params["actor"], encode(params, obs, active))
             spread = jnp.broadcast_to(params["log_std"], mean.shape)
             values, _ = value(params, (), is_first, obs, privileged, active)
-            return Evaluation(log_prob(action, mean, spread), entropy(spread), values)
+            return ChunkResult(log_prob(action, mean, spread), entropy(spread), values)
 
         def policy_params(params):
             return {name: params[name] for name in ("encoder", "actor", "log_std")}

@@ -32,7 +32,7 @@ def flock(
     Source: paper, section III, with the constants of the released system.
     """
     half = friction * GRAVITY * step / 2
-    velocity = slowed(velocity, half)
+    velocity = slow_down(velocity, half)
     velocity += 2 * restlessness * jax.random.normal(key, position.shape)
     if len(position) > 1:
         inward = jnp.mean(position, axis=0) - position
@@ -40,10 +40,10 @@ def flock(
     away = position[:, None] - robots[None]
     nearness = jnp.maximum(_length(jnp.square(away)), 1e-3)
     velocity += jnp.sum(jnp.where(nearness > 9.0, 0.0, 0.2 * away / nearness**1.4), axis=1)
-    return slowed(jnp.clip(velocity, -top_speed, top_speed), half)
+    return slow_down(jnp.clip(velocity, -top_speed, top_speed), half)
 
 
-def slowed(velocity: jax.Array, loss: float) -> jax.Array:
+def slow_down(velocity: jax.Array, loss: float) -> jax.Array:
     """Reduces each speed by `loss` m/s, clamped at zero: velocities (..., 2) -> (..., 2)."""
     speed = jnp.maximum(_length(velocity), 1e-9)
     return velocity * jnp.maximum(1.0 - loss / speed, 0.0)

@@ -162,17 +162,17 @@ class WalkPolicy(Skill):
         self, params: Params, memory: WalkMemory, command: jax.Array, proprioception: Proprioception
     ) -> tuple[jax.Array, WalkMemory]:
         observation = observe(self.robot, memory, command, proprioception)
-        history = self._extended(memory.history, observation)
+        history = self._append(memory.history, observation)
         action = infer(params, history.reshape(-1), precision=PRECISION)[0]
         action = jnp.clip(action, -ACTION_CLIP, ACTION_CLIP)
         gait = advance_gait(memory.gait, command)
         return self.robot.joint_targets(action), WalkMemory(history, action, memory.action, gait)
 
-    def _extended(self, history: jax.Array, observation: jax.Array) -> jax.Array:
+    def _append(self, history: jax.Array, observation: jax.Array) -> jax.Array:
         """Returns the history with the newest observation and without the oldest."""
         return jnp.concatenate([history[1:], observation[None]])
 
-    def restricted(self, varied: Sequence[str], gait: str | None) -> WalkPolicy:
+    def restrict(self, varied: Sequence[str], gait: str | None) -> WalkPolicy:
         return RestrictedWalkPolicy(self.robot, varied, gait)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
@@ -215,15 +215,15 @@ class RestrictedWalkPolicy(WalkPolicy):
     def init_memory(self) -> WalkMemory:
         return dataclasses.replace(super().init_memory(), history=jnp.zeros(self._size))
 
-    def _extended(self, history: jax.Array, observation: jax.Array) -> jax.Array:
+    def _append(self, history: jax.Array, observation: jax.Array) -> jax.Array:
         extended = jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
         # Written once, not for each of its readers; on a CPU that is slower.
         return jax.lax.platform_dependent(extended, cpu=lambda x: x, default=jax.lax.optimization_barrier)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
-        return self.folded(super().load_params(path))
+        return self.fold_history(super().load_params(path))
 
-    def folded(self, params: Params) -> Params:
+    def fold_history(self, params: Params) -> Params:
         """Returns weights that compute from histories of rows what `params` compute from 30 observations.
 
         In the first layers, the weights of both occurrences of an action are added, those of constant commands,

@@ -86,17 +86,17 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @functools.cache
 def _kept_programs() -> tuple[dict[Any, Any], Any, Any]:
-    """Learners by what they are made from, and `Seeds` with its `map`, kept until the process ends."""
-    from mqe_jax.train.seeds import Seeds
+    """Learners by what they are made from, and `SeedBatch` with its `map`, kept until the process ends."""
+    from mqe_jax.train.seeds import SeedBatch
 
-    return {}, functools.cache(Seeds), functools.cache(Seeds.map)
+    return {}, functools.cache(SeedBatch), functools.cache(SeedBatch.map)
 
 
 @pytest.fixture(scope="module")
 def shared_programs() -> Iterator[None]:
     """Trainings of one environment share their learner and its programs, where settings of the learner are the same."""
     from mqe_jax.train import runner, start
-    from mqe_jax.train.seeds import Seeds
+    from mqe_jax.train.seeds import SeedBatch
 
     learners, seeds, seeds_map = _kept_programs()
     make_learner = start.make_learner
@@ -110,8 +110,8 @@ def shared_programs() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(start, "make_learner", shared_learner)
-        patch.setattr(Seeds, "map", seeds_map)
-        patch.setattr(runner, "Seeds", seeds)
+        patch.setattr(SeedBatch, "map", seeds_map)
+        patch.setattr(runner, "SeedBatch", seeds)
         yield
 
 

@@ -79,7 +79,7 @@ def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
         velocity = jnp.array([1.0, 0.5, -2.0]) * (side if mirror else 1.0)
         return jnp.concatenate([*rows, agile.now(jnp.float32(0.7 if mirror else 0.2), velocity)])
 
-    np.testing.assert_allclose(AGILE_FORM.mirrored(inputs(False)), inputs(True), atol=1e-5)
+    np.testing.assert_allclose(AGILE_FORM.reflect(inputs(False)), inputs(True), atol=1e-5)
     flipped = trainee.foot_phases(jnp.float32(0.7), jnp.array([1.0, 0.0, 0.0]))
     straight = trainee.foot_phases(jnp.float32(0.2), jnp.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(flipped, straight[jnp.array([1, 0, 3, 2])], atol=1e-6)
@@ -114,7 +114,7 @@ def test_commands_fill_the_ranges_that_the_assistance_leaves(assistance: float, 
     keys = jax.random.split(jax.random.PRNGKey(0), 4000)
     spec = jax.vmap(lambda key: sample_spec(key, AGILE_TASK, trainee, assistance))(keys)
     velocity = np.asarray(spec.commands[:, :3])
-    for i, (low, high) in enumerate(SKILL.trained(("vx", "vy", "yaw_rate"))):
+    for i, (low, high) in enumerate(SKILL.trained_ranges(("vx", "vy", "yaw_rate"))):
         assert share * low <= velocity[:, i].min() < 0.95 * share * low
         assert share * high >= velocity[:, i].max() > 0.95 * share * high
     assert np.abs(velocity[:, 0] * velocity[:, 2]).max() <= 3.0 + 1e-4

@@ -106,7 +106,7 @@ def test_each_skill_gets_commands_that_it_is_trained_for(match: Any) -> None:
         given[part.name] = np.asarray(own)[part.index(names)]
     np.testing.assert_allclose(given["walk"], [1.2, -0.7, 1.2], rtol=1e-6)
     np.testing.assert_allclose(given["agile"], [2.5, -1.0, 1.2], rtol=1e-6)  # |vx x yaw rate| is at most 3
-    assert list(match.params.commanded()) == [*names, "skill"] and match.action_size == 4
+    assert list(match.params.action_ranges()) == [*names, "skill"] and match.action_size == 4
 
 
 @pytest.mark.parametrize("name", BOTH)

@@ -82,7 +82,7 @@ def test_the_ranges_shown_are_those_of_actions(parameters: Any) -> None:
     env = make("go1plane", impl="c", num_envs=1, **parameters)
     names, columns = env.params.commands, env.controller.skill.index(env.params.commands)
     ends = [env.controller.skill_commands(jnp.full((1, len(names)), end))[0, columns] for end in (-1.0, 1.0)]
-    shown = env.params.commanded()
+    shown = env.params.action_ranges()
     assert tuple(shown) == names
     np.testing.assert_allclose(np.stack(ends, axis=-1), list(shown.values()), rtol=1e-5)
 

@@ -29,7 +29,7 @@ pytest.importorskip("jax2onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 
 from mqe_jax.export import translate  # noqa: E402
-from mqe_jax.export.check import errors, record  # noqa: E402
+from mqe_jax.export.check import errors, record_actions  # noqa: E402
 from mqe_jax.export.policy import input_shapes, policy_step, shapes, to_onnx  # noqa: E402
 
 GATE = zoo.file_of("go1gate")
@@ -151,7 +151,7 @@ def test_agents_of_mat_act_one_after_another() -> None:
 def test_every_shipped_policy_agrees_on_a_thousand_steps(run: Path) -> None:
     policy = load_policy(run)
     env = make(str(policy.config.task), impl="c", num_envs=1, **policy.config.env)
-    found = errors(to_onnx(policy, env), *record(policy, env, 1000))
+    found = errors(to_onnx(policy, env), *record_actions(policy, env, 1000))
     assert max(found.values()) < 3e-5, found
 
 
@@ -159,7 +159,7 @@ def test_the_graph_of_a_match_is_that_of_one_team() -> None:
     env = make("go1revolvingdoor", impl="c", num_envs=1)
     policy = new_policy(env, recurrent=False)
     assert input_shapes(policy, env)["obs"] == (1, 12)
-    found = errors(to_onnx(policy, env), *record(policy, env, 5))
+    found = errors(to_onnx(policy, env), *record_actions(policy, env, 5))
     assert max(found.values()) < 1e-4
 
 

@@ -79,7 +79,7 @@ def _evaluate(x: Any, episodes: Any = 2, key: Any = KEY, **options: Any) -> Any:
 
 
 def _record(x: Any, key: Any = KEY, **options: Any) -> Any:
-    return recording.record(x["fake"], options.pop("act", x["act"]), key, **options)
+    return recording.record_episodes(x["fake"], options.pop("act", x["act"]), key, **options)
 
 
 def _render(x: Any, **options: Any) -> Any:
@@ -169,7 +169,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("key: ", lambda x, v: TeamEnv(x["match"], "idle").reset(v), (None, 3)),
     ("assistance: ", lambda x, v: TeamEnv(x["match"], "idle").reset(KEY, v), LEVELS),
     ("state: ", lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))), (None, "state")),
-    ("env: ", lambda x, v: recording.record(x.get(v, v), x["act"], KEY), (None, 3, "matches")),
+    ("env: ", lambda x, v: recording.record_episodes(x.get(v, v), x["act"], KEY), (None, 3, "matches")),
     ("episode: ", lambda x, v: _render(x, episode=v), (None, 3, [])),
     ("env: ", lambda x, v: scene_xml(x.get(v, v)), (None, "go1gate", "matches")),
     ("demonstrator: ", lambda x, v: Demonstrated(x["task"], 2, v), (None, 3, TrainedPolicy)),

@@ -238,7 +238,7 @@ SETTINGS = run_settings(normalization__observations=True, ppo__epochs=1, ppo__mi
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained_ranges(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a short run."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     train(PROBE, SETTINGS, folder)

@@ -114,7 +114,7 @@ def test_a_long_computation_in_c_delays_nothing(number: signal.Signals, tmp_path
 
 
 SAVING = """
-with interrupts.deferred() as signalled:
+with interrupts.defer() as signalled:
     (folder / "ready").touch()
     while not signalled():
         time.sleep(0.01)
@@ -143,7 +143,7 @@ def test_a_later_signal_does_not_wait_for_the_saving(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("sigint")
 def test_without_the_command_line_only_sigint_is_deferred() -> None:
     """As in a notebook, where a later one raises KeyboardInterrupt; an ignored one stays ignored."""
-    with interrupts.deferred() as signalled:
+    with interrupts.defer() as signalled:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         assert signalled() == signal.SIGINT
@@ -152,7 +152,7 @@ def test_without_the_command_line_only_sigint_is_deferred() -> None:
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with interrupts.deferred() as signalled:
+    with interrupts.defer() as signalled:
         signal.raise_signal(signal.SIGINT)
     assert signalled() == 0
 

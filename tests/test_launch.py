@@ -321,11 +321,11 @@ def test_what_jax_raises_where_another_process_has_ended(monkeypatch: pytest.Mon
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     lost = "INTERNAL: NCCL operation async_err failed: remote process exited or there was a network error"
     for error in (jax.errors.JaxRuntimeError(text), ValueError(text), jax.errors.JaxRuntimeError(lost)):
-        with pytest.raises(ConnectionError, match=devices.PEER_ENDED), devices.connected():
+        with pytest.raises(ConnectionError, match=devices.PEER_ENDED), devices.translate_errors():
             raise error
     memory = "NCCL operation ncclCommInitRank() failed: unhandled cuda error. Last NCCL warning: 'out of memory'."
     for other in (ValueError("shapes"), InputError("run_dir: Gloo"), jax.errors.JaxRuntimeError(memory)):
-        with pytest.raises(type(other), match=re.escape(str(other))), devices.connected():
+        with pytest.raises(type(other), match=re.escape(str(other))), devices.translate_errors():
             raise other
 
 

@@ -26,7 +26,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.policy import policy_of, save_policy
-from mqe_jax.train.seeds import Seeds
+from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content
@@ -92,7 +92,7 @@ def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainSt
     league = League(matches(num_envs=8), SOURCES, config)
     save_policy(tmp_path, policy_of(state, league.env, config, env_steps=0))
     learner, processes = own_learner(league.env, config, league)
-    begun, _ = first_state(league.env, learner, processes, config, None, Seeds(learner.init, 1).shared, league)
+    begun, _ = first_state(league.env, learner, processes, config, None, SeedBatch(learner.init, 1).shared, league)
     mine = league._own(begun)
     jax.tree.map(np.testing.assert_array_equal, mine.params, league._own(state).params)
     for arrays in (
@@ -108,7 +108,7 @@ def test_a_league_resumed_without_environments_plays_its_members(history: list[T
     metadata = {"task": league.env.name, "config": to_mapping(config), "environments": False}
     file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
     learner, processes = own_learner(league.env, config, league)
-    resumed, _ = first_state(league.env, learner, processes, config, file, Seeds(learner.init, 1).shared, league)
+    resumed, _ = first_state(league.env, learner, processes, config, file, SeedBatch(learner.init, 1).shared, league)
     seats = zip(resumed.rollout.env_state.opponents, state.rollout.env_state.opponents, strict=True)
     for now, before in seats:
         jax.tree.map(np.testing.assert_array_equal, now.arrays, before.arrays)

@@ -106,7 +106,7 @@ def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
     np.testing.assert_allclose(state.action[:, 1, 0], [0.0, 0.25, 0.0, 0.25])
     np.testing.assert_array_equal(state.obs, state.match.obs[:, :1])
     np.testing.assert_array_equal(state.reward, state.match.reward[:, :1])
-    assert {"team0/win", "team0/loss", "success"} <= set(state.outcome.named()) and state.outcome.win.shape == (4, 1)
+    assert {"team0/win", "team0/loss", "success"} <= set(state.outcome.by_name()) and state.outcome.win.shape == (4, 1)
 
 
 def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:

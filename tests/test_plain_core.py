@@ -274,7 +274,7 @@ def test_an_ended_episode_is_replaced_whole_and_another_one_left_alone() -> None
     for ended in (True, False):
         now = dataclasses.replace(state, truncated=jnp.array(ended), step=jnp.int32(7))
         after = autoreset(env, now, lambda key, assistance: fresh)
-        seen = env.observed(after)  # what is left is observed
+        seen = env.with_observations(after)  # what is left is observed
         for field in dataclasses.fields(after):
             source = seen if field.name in SEEN else fresh if ended and field.name not in KEPT else now
             expected = getattr(source, field.name)

@@ -14,7 +14,7 @@ from mqe_jax.core.settings import build
 from mqe_jax.envs import TASKS, Randomization
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.reward import crowding
-from mqe_jax.npc import defend, flock, slowed
+from mqe_jax.npc import defend, flock, slow_down
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.selfplay.league import league, pool
 from mqe_jax.terrain import Gate, Track
@@ -115,7 +115,7 @@ def test_a_league_without_games_has_metrics_and_no_change() -> None:
 def test_points_that_coincide_give_finite_numbers() -> None:
     place, still = jnp.array([[1.0, 1.0], [1.0, 1.0]]), jnp.zeros((2, 2))
     law = lambda robots: flock(KEY, place, still, robots, restlessness=0.1, step=0.02)  # noqa: E731
-    assert np.all(np.isfinite(law(jnp.ones((1, 2))))) and np.all(np.isfinite(slowed(still, 0.1)))
+    assert np.all(np.isfinite(law(jnp.ones((1, 2))))) and np.all(np.isfinite(slow_down(still, 0.1)))
     # Nearer than 0.032 m a robot repels as there.
     push = flock(KEY, place[:1], still[:1], jnp.array([[0.99, 1.0]]), restlessness=0.0, step=0.02, friction=0.0)
     np.testing.assert_allclose(push, [[2.0, 0.0]])

@@ -12,7 +12,7 @@ import pytest
 from mqe_jax.core.types import RESULTS, NetworkMemory, Outcome
 from mqe_jax.policies import BothTeams, load_policy
 from mqe_jax.selfplay.league import league, pool
-from mqe_jax.selfplay.opponents import Mirror, Opponent, exchange
+from mqe_jax.selfplay.opponents import Mirror, OpponentState, exchange
 from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics
@@ -123,7 +123,7 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
                 for name, x in now.metrics.items():
                     rows.setdefault(name, []).append(float(x[n]))
                 if first[n]:
-                    for name, x in now.outcome.named().items():
+                    for name, x in now.outcome.by_name().items():
                         ends.setdefault(name, []).append(float(x[n]))
                     ends.setdefault("episode_length", []).append(episodes[n].steps)
                     ends.setdefault("episode_return", []).append(episodes[n].total)
@@ -160,7 +160,7 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
             now, memory = step(now, jnp.asarray(action, jnp.float32)), memory + 0.5
             done = np.asarray(now.terminated | now.truncated)
             for n in np.flatnonzero(left):
-                rows.append({name: float(x[n]) for name, x in (now.metrics | now.outcome.named()).items()})
+                rows.append({name: float(x[n]) for name, x in (now.metrics | now.outcome.by_name()).items()})
                 rewards.append(float(now.reward[n, 1]))
                 if done[n]:
                     ends.append(rows[-1])
@@ -289,7 +289,7 @@ def test_blocks_draw_the_members_that_their_source_says() -> None:
 
 def test_a_second_change_replaces_only_the_opponent_that_is_waited_for() -> None:
     waiting = jnp.array([True, False])
-    one = Opponent(jnp.float32(1.0), jnp.float32(0.0), waiting, (), jnp.zeros(3, jnp.int32))
+    one = OpponentState(jnp.float32(1.0), jnp.float32(0.0), waiting, (), jnp.zeros(3, jnp.int32))
     two = exchange(one, jnp.float32(2.0))
     assert (float(two.arrays), float(two.before), two.waiting.tolist()) == (2.0, 0.0, [True, False])
     free = exchange(dataclasses.replace(two, waiting=~jnp.ones(2, bool)), jnp.float32(3.0))
@@ -307,7 +307,7 @@ def test_both_teams_of_a_mirrored_match_get_what_is_theirs() -> None:
     rows |= {"privileged_obs": state.privileged_obs + 3, "final_privileged_obs": state.final_privileged_obs + 4}
     flags = {"terminated": jnp.array([True, False, False]), "truncated": jnp.array([False, True, False])}
     more = {"step": jnp.array([3, 1, 2], jnp.int32), "assistance": numbers / 4, "metrics": metrics}
-    seen = env._seen(dataclasses.replace(state, **rows, **flags, **more), jnp.zeros((3, 2, 12)))
+    seen = env._team_state(dataclasses.replace(state, **rows, **flags, **more), jnp.zeros((3, 2, 12)))
     for i in range(6):
         match, team = divmod(i, 2)
         for name in ("obs", "final_obs", "reward"):

@@ -22,7 +22,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import policy_of
-from mqe_jax.train.seeds import Seeds
+from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests import training as probes
 from tests.training import Probe
@@ -78,7 +78,7 @@ def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp
     values: dict[str, Any] = {"num_envs": N, "rollout_steps": 4, "checkpoint": {"environments": False}}
     config = build(TrainConfig, {**values, "network": {"recurrent": False}})
     learner, processes = own_learner(env, config)
-    shared = Seeds(learner.init, 1).shared
+    shared = SeedBatch(learner.init, 1).shared
     start, _ = first_state(env, learner, processes, config, None, shared)
     keys = [start.rollout.env_state.key.tolist()]
     metadata = {"task": "probe", "config": to_mapping(config), "seconds": 1.0, "environments": False}

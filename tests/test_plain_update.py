@@ -140,7 +140,7 @@ class Plain:
         self.network: Any = config.network
         self.progress = float(state.updates) / config.num_updates
 
-    def seen(self, statistics: RunningStatistics, x: Any) -> Any:
+    def view(self, statistics: RunningStatistics, x: Any) -> Any:
         if not self.config.normalization.observations:
             return jnp.asarray(x)
         deviation = np.maximum(np.sqrt(np.asarray(statistics.variance)), 0.01)
@@ -178,9 +178,9 @@ class Plain:
     def prepare(self) -> None:
         """Observations as seen, old values, advantages, targets and the new statistics."""
         config, state, data = self.config, self.state, self.data
-        self.obs, self.final = (self.seen(state.obs_normalizer.obs, x) for x in (data.obs, data.final_obs))
+        self.obs, self.final = (self.view(state.obs_normalizer.obs, x) for x in (data.obs, data.final_obs))
         own, last = (
-            self.seen(state.obs_normalizer.privileged, x) for x in (data.privileged_obs, data.final_privileged_obs)
+            self.view(state.obs_normalizer.privileged, x) for x in (data.privileged_obs, data.final_privileged_obs)
         )
         self.privileged = own
         joint = config.ppo.value == "joint"
@@ -363,7 +363,7 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
 def test_the_learning_rate_follows_the_kl_divergence_within_its_bounds() -> None:
     rows = ((0.0201, 1e-3, 1e-3 / 1.5), (0.0199, 1e-3, 1e-3), (0.0051, 1e-3, 1e-3), (0.0049, 1e-3, 1.5e-3))
     for kl, before, after in (*rows, (1.0, 1.2e-5, 1e-5), (0.0, 9e-3, 1e-2)):
-        rate = stages._adapted(jnp.float32(before), jnp.float32(kl), 0.01)
+        rate = stages._adapt(jnp.float32(before), jnp.float32(kl), 0.01)
         assert float(rate) == pytest.approx(after), (kl, before)
 
 

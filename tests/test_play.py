@@ -99,7 +99,7 @@ def check_graphs(built: SimpleNamespace, steps: int) -> set[str]:
     kept = np.delete(np.arange(steps), steps - 2)  # without the state in which the robot is turned over
     wanted = [seen["states"][1 + row] for row in kept]
     verdict = {name: x[kept] for name, x in verdict.items()}
-    metrics = [[state.outcome.named()[name] for name in settings["outcomes"]] for state in wanted]
+    metrics = [[state.outcome.by_name()[name] for name in settings["outcomes"]] for state in wanted]
     np.testing.assert_allclose(verdict["outcome"], metrics, atol=1e-5)
     obs = np.stack([state.obs for state in wanted])
     turns = 2 * np.pi * np.round((verdict["obs"] - obs) / (2 * np.pi))  # yaw at +-pi
@@ -131,7 +131,7 @@ def test_a_driven_robot_gets_the_readers_action_in_its_own_frame(built: SimpleNa
     expected = built.env.controller.skill_commands(jnp.stack([action[0], drive[1]]))
     np.testing.assert_allclose(command, expected)
     assert built.settings["commands"] == ["vx", "vy", "yaw_rate", "skill"]
-    assert built.env.params.commanded()["vx"] == (-1.5, 2.5)
+    assert built.env.params.action_ranges()["vx"] == (-1.5, 2.5)
 
 
 def test_initial_states_are_restored_from_the_columns_that_vary(built: SimpleNamespace) -> None:

@@ -91,8 +91,8 @@ def test_a_task_without_a_shipped_policy_has_no_card() -> None:
 @pytest.mark.parametrize("file", sorted(AGILE.glob("*.safetensors")), ids=lambda file: file.stem)
 def test_a_policy_brings_the_parameters_that_it_needs(file: Path) -> None:
     env: Any = players(file.stem.rpartition("-")[0], file, impl="c").env
-    assert env.params.skill == "agile" and set(env.params.commanded()) == {"vx", "vy", "yaw_rate"}
-    assert env.params.commanded()["vx"] == (-1.5, 2.5)
+    assert env.params.skill == "agile" and set(env.params.action_ranges()) == {"vx", "vy", "yaw_rate"}
+    assert env.params.action_ranges()["vx"] == (-1.5, 2.5)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_commands_apply_what_a_shipped_policy_needs(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(zoo, "FOLDER", tmp_path)
     for chosen in ((), ("go1tug",), ("scripted", "go1tug")):
         env = players("go1tug", *chosen, impl="c", env={"episode_length": 5.0} if chosen else {}).env
-        assert (env.params.skill, env.params.commanded()["vx"]) == ("agile", (-1.5, 2.5))
+        assert (env.params.skill, env.params.action_ranges()["vx"]) == ("agile", (-1.5, 2.5))
     words = ["--impl", "c", "--set", "skill=walk"]
     for command in (["eval", "go1tug", "--policy", "go1tug"], ["tournament", "go1tug", "go1tug"]):
         assert cli.main([*command, *words]) == 2

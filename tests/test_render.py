@@ -24,7 +24,7 @@ env = pytest.fixture(scope="module")(lambda: FakeEnv())
 @pytest.fixture(scope="module")
 def episode(env: Any) -> recording.Episode:
     policy = load_policy("forward", env)
-    return recording.record(env, policy, jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
+    return recording.record_episodes(env, policy, jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
 
 
 def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: Any, episode: recording.Episode) -> None:
@@ -139,7 +139,7 @@ def in_frame(model: mujoco.MjModel, episode: Episode, views: list[Camera]) -> np
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     for index, camera in enumerate(views):
         geometry.pose(model, data, episode, index)
-        points = np.concatenate([geometry.posed(data, bodies, boxes).mean(axis=1), goals])
+        points = np.concatenate([geometry.pose_boxes(data, bodies, boxes).mean(axis=1), goals])
         forward, right, up = camera.axes
         offset = points - np.array(camera.lookat)
         depth = np.maximum(camera.distance + offset @ forward, 1e-6) * tangent

@@ -17,7 +17,7 @@ from mqe_jax import cli
 from mqe_jax.cli import programs
 from mqe_jax.core import files
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import locked, replacing, write_atomically
+from mqe_jax.core.files import lock, replacing, write_atomically
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -67,7 +67,7 @@ def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> N
 def test_a_folder_that_is_lost_while_a_file_is_written_gets_none(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
-    with locked(folder):
+    with lock(folder):
         with pytest.raises(InputError, match="run_dir"), replacing(folder / "file"):
             replace(folder)
         with pytest.raises(InputError, match="run_dir"):

@@ -19,8 +19,8 @@ from mqe_jax.core.settings import (
     Range,
     build,
     fail,
-    joined,
     load_yaml,
+    merge,
     override,
     record,
     to_mapping,
@@ -161,7 +161,7 @@ def test_records_can_be_hashed_and_copied(kind: type[Any], values: dict[str, Any
 )
 def test_the_second_of_two_mappings_replaces_only_what_it_names(first: Any, second: Any, expected: Any) -> None:
     before = repr((first, second))
-    assert joined(first, second) == expected
+    assert merge(first, second) == expected
     assert override(Outer(free=first), {"free": second}).free == expected
     assert repr((first, second)) == before
 

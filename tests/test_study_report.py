@@ -191,5 +191,5 @@ def test_bad_scores_are_refused(scores: np.ndarray) -> None:
 
 def test_normalized_scores_are_fractions_of_a_tasks_range() -> None:
     scores = {"a": np.array([[1.0, 5.0]]), "b": np.array([[3.0, 5.0]])}
-    result = statistics.normalized(scores, np.array([1.0, 5.0]), np.array([5.0, 5.0]))
+    result = statistics.normalize(scores, np.array([1.0, 5.0]), np.array([5.0, 5.0]))
     np.testing.assert_allclose(result["b"], [[0.5, 0.0]])

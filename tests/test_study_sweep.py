@@ -11,7 +11,7 @@ import pytest
 
 from mqe_jax import cli
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import locked
+from mqe_jax.core.files import lock
 from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast
 from mqe_jax.policies import zoo
@@ -68,7 +68,7 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
         return Cast(PROBE, PROBE)
 
     jobs[0].folders[1].mkdir(parents=True)
-    with locked(jobs[0].folders[1]):
+    with lock(jobs[0].folders[1]):
         assert sweeps.run(jobs, environments) == (jobs[:1], [])
     assert trained == ["joint"]
     assert sweeps.run(jobs, environments) == ([], [])

@@ -20,7 +20,7 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import adam, begun_anew
-from mqe_jax.train.schedules import scheduled
+from mqe_jax.train.schedules import current_values
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
@@ -50,7 +50,7 @@ def test_schedules_by_hand() -> None:
         9: (0.0, 0.0, 0.001, 0.0, 1.0, 0.0, 0.5),
     }
     for updates, values in expected.items():
-        np.testing.assert_allclose(jnp.stack(scheduled(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(jnp.stack(current_values(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
 
 
 def test_running_statistics_merge_as_one_batch() -> None:
@@ -91,7 +91,7 @@ def test_value_statistics_at_their_limits() -> None:
 
 def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() -> None:
     config = build(TrainConfig, {"num_envs": 2, "rollout_steps": 1, "total_steps": 20, "ppo": {"critic_warmup": 0.3}})
-    begins = [bool(scheduled(config, jnp.int32(i)).actor_begins) for i in range(10)]
+    begins = [bool(current_values(config, jnp.int32(i)).actor_begins) for i in range(10)]
     assert begins == [i == 3 for i in range(10)]
     optimizer, params = adam(eps=1e-8), {"a": jnp.zeros(())}
     state = optimizer.init(params)
@@ -129,9 +129,9 @@ def test_a_bounded_parameter_comes_back_from_beyond_its_bounds() -> None:
     x = jnp.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 
     def slope(direction: float) -> jax.Array:
-        return jax.grad(lambda x: jnp.sum(direction * nn.bounded(x, -1.5, 1.5)))(x)
+        return jax.grad(lambda x: jnp.sum(direction * nn.clip_parameter(x, -1.5, 1.5)))(x)
 
-    np.testing.assert_allclose(nn.bounded(x, -1.5, 1.5), [-1.5, -1.0, 0.0, 1.0, 1.5])
+    np.testing.assert_allclose(nn.clip_parameter(x, -1.5, 1.5), [-1.5, -1.0, 0.0, 1.0, 1.5])
     np.testing.assert_allclose(slope(1.0), [0, 1, 1, 1, 1])  # descent lowers x: back from above, never farther down
     np.testing.assert_allclose(slope(-1.0), [-1, -1, -1, -1, 0])
 

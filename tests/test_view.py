@@ -130,7 +130,7 @@ def test_contact_forces_carry_the_robots() -> None:
 
 def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Path) -> None:
     from mqe_jax.train.folder import CONFIG_FILE
-    from mqe_jax.view.menu import Choice, Menu, find_runs
+    from mqe_jax.view.menu import Entry, Menu, find_runs
 
     for name, task in (("b", "go1gate"), ("a", "go1tug"), ("no task", None)):
         (tmp_path / name).mkdir()
@@ -142,7 +142,7 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
     (tmp_path / "unfinished").mkdir()
     runs = find_runs([tmp_path, tmp_path])
     assert {Path(run).name: task for run, task in runs.items()} == {"a": "go1tug", "b": "go1gate"}
-    menu = Menu(lambda choice: session(FakeEnv()), Choice("go1gate", "given.safetensors"), runs)
+    menu = Menu(lambda choice: session(FakeEnv()), Entry("go1gate", "given.safetensors"), runs)
     common = ("random", "idle", "forward")
     gate, tug = (next(run for run, its in runs.items() if its == task) for task in ("go1gate", "go1tug"))
     assert menu.policies("go1gate") == ("default", "go1gate", "scripted", *common, gate, "given.safetensors")
@@ -153,23 +153,23 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
 
 def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
     pytest.importorskip("mjviser")
-    from mqe_jax.view.menu import Choice, Menu
+    from mqe_jax.view.menu import Entry, Menu
     from mqe_jax.view.viewer import Viewer
 
-    def open_choice(choice: Choice) -> Any:
+    def open_choice(choice: Entry) -> Any:
         if choice.policy == "bad":
             raise InputError("policy: bad")
         return session(Driven(), num_envs=3)
 
-    viewer = Viewer(port=free_port(), menu=Menu(open_choice, Choice("go1gate"), {}))
+    viewer = Viewer(port=free_port(), menu=Menu(open_choice, Entry("go1gate"), {}))
     viewer.show(session(Driven()))
     first, panel, gui = viewer.session, viewer._panel, viewer.server.gui
     widgets, commands = len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)
-    assert not viewer._exchanged()
-    panel._wanted = Choice("go1gate", "bad")
-    assert not viewer._exchanged() and viewer.session is first and first.paused
-    panel._wanted = Choice("go1gate", "idle")
-    assert viewer._exchanged() and viewer.session is not first and viewer.session.num_envs == 3
+    assert not viewer._open_chosen()
+    panel._wanted = Entry("go1gate", "bad")
+    assert not viewer._open_chosen() and viewer.session is first and first.paused
+    panel._wanted = Entry("go1gate", "idle")
+    assert viewer._open_chosen() and viewer.session is not first and viewer.session.num_envs == 3
     assert (len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)) == (widgets, commands)
     assert viewer._panel is not panel and viewer._panel.take_choice() is None
     viewer._panel.shapes = viewer._panel.contacts = True

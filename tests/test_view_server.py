@@ -208,7 +208,7 @@ EVIL = "<iframe srcdoc=\"<script>top.ran = 'iframe'</script>\"></iframe><img src
 def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> None:
     """Names of the task, robots, rewards and observations, choices, outcomes, and errors that hold paths."""
     pytest.importorskip("mjviser")
-    from mqe_jax.view.menu import Choice, Menu
+    from mqe_jax.view.menu import Entry, Menu
     from mqe_jax.view.viewer import Viewer
 
     def fail(choice: object) -> Any:
@@ -220,7 +220,7 @@ def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> N
     run = session(env)
     monkeypatch.setattr("mqe_jax.view.viewer.start_frame", lambda *_: run.moment().frame)
     with open_page(640, 480) as page:
-        viewer = Viewer(port=free_port(), menu=Menu(fail, Choice("go1gate", EVIL), {EVIL: "go1gate"}))
+        viewer = Viewer(port=free_port(), menu=Menu(fail, Entry("go1gate", EVIL), {EVIL: "go1gate"}))
         viewer.announce(env, 2)
         page.goto(viewer.url)
         page.get_by_text("is being compiled").wait_for()
@@ -232,8 +232,8 @@ def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> N
         page.get_by_text("x real time").wait_for()
         page.get_by_text("Observation of the driven robot").click()
         assert page.evaluate("window.ran") is None and page.locator("body").inner_text().count(EVIL) >= 6
-        viewer._panel._wanted = Choice("go1gate", EVIL)
-        assert not viewer._exchanged()
+        viewer._panel._wanted = Entry("go1gate", EVIL)
+        assert not viewer._open_chosen()
         page.get_by_text("not loaded: runs/<iframe").wait_for()
         assert page.evaluate("window.ran") is None and page.locator("iframe").count() == 0
         viewer.server.stop()

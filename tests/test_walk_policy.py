@@ -210,8 +210,8 @@ def test_phases_are_warped_by_the_duration() -> None:
 )
 def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, ...], size: int) -> None:
     params, command = walk_policy.init_params(jax.random.PRNGKey(0)), np.array(SKILL.default_commands("pace"))
-    short: Any = SKILL.restricted(varied, "pace")
-    policies = {SKILL: params, short: short.folded(params)}
+    short: Any = SKILL.restrict(varied, "pace")
+    policies = {SKILL: params, short: short.fold_history(params)}
     act = {policy: jax.jit(policy.targets) for policy in policies}
     memories = {policy: policy.init_memory() for policy in policies}
     assert memories[short].history.shape == (size,)

@@ -167,7 +167,7 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
         other[Y_AND_ROTATIONS] *= -1.0
         left = observation(joints, gravity, commands, 0.15)
         right = observation(mirrored, gravity * [1, -1, 1], other, 0.65)
-        np.testing.assert_allclose(WALK_FORM.mirrored(jnp.tile(left, 30))[:70], right, atol=1e-5)
+        np.testing.assert_allclose(WALK_FORM.reflect(jnp.tile(left, 30))[:70], right, atol=1e-5)
 
 
 def test_descending_the_loss_makes_a_policy_symmetric() -> None:

@@ -19,7 +19,7 @@ from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import write_clip
 from mqe_jax.viz.framing import legend
 from mqe_jax.viz.geometry import rendering_model
-from mqe_jax.viz.recording import record, typical
+from mqe_jax.viz.recording import record_episodes, typical
 from mqe_jax.viz.render import render_frames
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -31,7 +31,7 @@ def write(task: str) -> None:
     """Writes a task's clip, from a fixed camera."""
     env = make(task, impl="c", num_envs=EPISODES)
     policy = all_agents(env, load_policy(task, env), load_policy("scripted", env) if len(env.teams) > 1 else None)
-    episode = typical(record(env, policy, jax.random.PRNGKey(0), episodes=EPISODES))
+    episode = typical(record_episodes(env, policy, jax.random.PRNGKey(0), episodes=EPISODES))
     end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
     shown = episode.cut(slice(max(0, end - round(SECONDS / episode.dt)), end, round(1 / (FPS * episode.dt))))
     views = cameras(rendering_model(env.mj_model, shown), shown, "near", SIZE[0] / SIZE[1])

@@ -164,7 +164,7 @@ def task_page(task: Any) -> str:
         f"mqe train {name}": "train a policy",
     }
     units = {command.name: command.unit for command in env.controller.skill.commands}
-    ranges = [f"`{name}` {low:g} to {high:g} {units[name]}" for name, (low, high) in env.params.commanded().items()]
+    ranges = [f"`{name}` {low:g} to {high:g} {units[name]}" for name, (low, high) in env.params.action_ranges().items()]
     width = max(map(len, commands))
     lines = "\n".join(f"{command:{width}}  # {text}" for command, text in commands.items())
     facts = [

@@ -23,7 +23,7 @@ from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked
+from mqe_jax.core.settings import check, check_arguments
 from mqe_jax.core.types import RandomKeys
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
@@ -110,7 +110,7 @@ class AutoReset(Wrapper):
     """
 
     @single
-    @checked(rng=RandomKeys)
+    @check_arguments(rng=RandomKeys)
     def reset(self, rng: jax.Array) -> State:
         return self.env.reset(rng)
 
@@ -136,7 +136,7 @@ class AutoReset(Wrapper):
         return after.replace(pipeline_state=own, obs=obs)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@checked(episode_length=PositiveInt, action_repeat=PositiveInt)
+@check_arguments(episode_length=PositiveInt, action_repeat=PositiveInt)
 def wrap(
     env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable[..., Any] | None = None
 ) -> Wrapper:

@@ -23,7 +23,7 @@ from mqe_jax.adapters import task_env, team_reward
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, Seed
-from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.envs import QuadrupedEnv
 
 
@@ -66,7 +66,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = self.env.observation_space
         self._host = HostEnvs(self.env, 1, render_mode, render_size)
 
-    @checked(seed=Seed | None, options=Mapping | None)
+    @check_arguments(seed=Seed | None, options=Mapping | None)
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -127,7 +127,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._host = HostEnvs(self.env, num_envs, render_mode, render_size)
         self._ended = np.zeros(num_envs, bool)  # environments that the next step resets
 
-    @checked(options=Mapping | None)
+    @check_arguments(options=Mapping | None)
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -156,15 +156,15 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ended = out.terminated | out.truncated
         metrics = {**out.info, "agent_rewards": out.reward}
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            infos = _masked(metrics, ~ended)
+            infos = _mask_infos(metrics, ~ended)
             if ended.any():
                 final = np.full(self.num_envs, None, object)
                 for i in np.flatnonzero(ended):
                     final[i] = out.final_obs[i]
                 infos |= {"final_obs": final, "_final_obs": ended.copy()}
-                infos |= {"final_info": _masked(metrics, ended), "_final_info": ended.copy()}
+                infos |= {"final_info": _mask_infos(metrics, ended), "_final_info": ended.copy()}
         else:
-            infos = _masked(metrics, ~self._ended)
+            infos = _mask_infos(metrics, ~self._ended)
         self._ended = ended.copy()
         return out.obs, team_reward(self.env, out.reward.astype(float)), out.terminated, out.truncated, infos
 
@@ -174,7 +174,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(image for image in images if image is not None) or None
 
 
-def _masked(values: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
+def _mask_infos(values: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
     """Returns infos in Gymnasium's form: arrays, zero outside of the mask, and the mask under `_name`."""
     if not mask.any():
         return {}

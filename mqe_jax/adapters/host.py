@@ -129,7 +129,7 @@ class HostEnvs:
 
 def info_of(state: State) -> dict[str, jax.Array]:
     """Returns the metrics of a step and the outcome of the episode by name () each."""
-    return {**state.metrics, **state.outcome.named()}
+    return {**state.metrics, **state.outcome.by_name()}
 
 
 @functools.lru_cache(maxsize=16)

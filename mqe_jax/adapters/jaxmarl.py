@@ -19,9 +19,9 @@ from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, select, task_env
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
-from mqe_jax.core.errors import InputError, shown
+from mqe_jax.core.errors import InputError, short_repr
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
@@ -62,7 +62,7 @@ class Env(MultiAgentEnv):
     are true on termination and on truncation.
     """
 
-    @checked(discrete=bool)
+    @check_arguments(discrete=bool)
     def __init__(self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any) -> None:
         """Creates the environment of a task's id, or adapts a given one; `overrides` are those of `task_env`.
 
@@ -85,7 +85,7 @@ class Env(MultiAgentEnv):
     def name(self) -> str:
         return self.env.name
 
-    @checked(key=RandomKey)
+    @check_arguments(key=RandomKey)
     @functools.partial(jax.jit, static_argnums=0)
     @single
     def reset(  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -94,7 +94,7 @@ class Env(MultiAgentEnv):
         state = self.env.reset(key)
         return self.get_obs(state), state
 
-    @checked(key=RandomKey, actions=Mapping)
+    @check_arguments(key=RandomKey, actions=Mapping)
     def step(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None = None
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
@@ -119,7 +119,7 @@ class Env(MultiAgentEnv):
         return self.get_obs(after), after, rewards, dones, infos
 
     @single
-    @checked(key=RandomKey, state=State, actions=Mapping)
+    @check_arguments(key=RandomKey, state=State, actions=Mapping)
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
@@ -137,7 +137,7 @@ class Env(MultiAgentEnv):
         self.env.check_state(state)
         return {agent: state.obs[i] for i, agent in enumerate(self.agents)}
 
-    @checked(state=State)
+    @check_arguments(state=State)
     @functools.partial(jax.jit, static_argnums=0)
     def get_avail_actions(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, state: State
@@ -165,7 +165,9 @@ class Env(MultiAgentEnv):
     def _checked(self, actions: Mapping[str, Any]) -> dict[str, Any]:
         """Returns the agents' actions in their order; InputError if one is missing or of another kind."""
         if not set(self.agents) <= set(actions):
-            raise InputError(f"actions: for {shown(list(actions))}; expected one for each of {', '.join(self.agents)}")
+            raise InputError(
+                f"actions: for {short_repr(list(actions))}; expected one for each of {', '.join(self.agents)}"
+            )
         count, size = len(self.action_table) if self.action_table is not None else 0, self.env.action_size
         shapes, kind = ([(), (1,)], jnp.integer) if count else ([(size,)], jnp.number)
         arrays = {}

@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked
+from mqe_jax.core.settings import check, check_arguments
 from mqe_jax.core.types import AnySingle, Level, Memory, RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.observation import box
@@ -26,7 +26,7 @@ from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class TeamState(State):
+class TeamEnvState(State):
     """State of a match as seen by team 0, with T agents; observations, rewards and metrics are those of team 0."""
 
     rival_obs: jax.Array  # observations of the opponent's agents (T, O)
@@ -39,7 +39,7 @@ class TeamEnv:
     It has what the adapters use of `QuadrupedEnv`: sizes and spaces are those of team 0, everything else the match's.
     """
 
-    @checked(match=AnySingle)
+    @check_arguments(match=AnySingle)
     def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
         """Creates the environment; `opponent` is a policy, which samples if it does, or what `load_policy` accepts."""
         if len(match.teams) != 2:
@@ -95,39 +95,39 @@ class TeamEnv:
         return larger
 
     @single
-    @checked(key=RandomKey, assistance=Level)
-    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamState:
+    @check_arguments(key=RandomKey, assistance=Level)
+    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamEnvState:
         """Returns a randomised initial state; see `QuadrupedEnv.reset`."""
-        return with_final(self.observed(self.begin(key, assistance)))
+        return with_final(self.with_observations(self.begin(key, assistance)))
 
-    def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamState:
+    def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamEnvState:
         """Returns the state of `reset` without observations."""
         rival = {
             "rival_obs": jnp.zeros((self.num_agents, self.match.observation_size)),
             "rival_memory": self.opponent.initial_memory(1),
         }
-        return self._of_team(TeamState(**vars(self.match.begin(key, assistance)), **rival))
+        return self._of_team(TeamEnvState(**vars(self.match.begin(key, assistance)), **rival))
 
     @single
-    def step(self, state: State, action: jax.Array) -> TeamState:
+    def step(self, state: State, action: jax.Array) -> TeamEnvState:
         """Advances by one environment step with the actions of team 0 (T, action_size)."""
-        check("state", state, TeamState)
+        check("state", state, TeamEnvState)
         shape = (self.num_agents, self.match.action_size)
         if jnp.shape(action) != shape:
             raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (agents, action size)")
-        own: Any = state  # a `TeamState`; the match's step keeps its further fields
+        own: Any = state  # a `TeamEnvState`; the match's step keeps its further fields
         key = jax.random.fold_in(own.key, 1)
         rival, memory = self.opponent.act(own.rival_obs[None], own.rival_memory, key)
         both = jnp.concatenate([jnp.asarray(action, jnp.float32), jnp.asarray(rival[0], jnp.float32)])
         after: Any = self.match.advance(own, both)
-        return with_final(self.observed(self._of_team(dataclasses.replace(after, rival_memory=memory))))
+        return with_final(self.with_observations(self._of_team(dataclasses.replace(after, rival_memory=memory))))
 
-    def observed(self, state: TeamState, groups: Sequence[str] = ()) -> TeamState:
+    def with_observations(self, state: TeamEnvState, groups: Sequence[str] = ()) -> TeamEnvState:
         """Returns the state with the observations of both teams that belong to it."""
-        seen: Any = self.match.observed(state, groups)
+        seen: Any = self.match.with_observations(state, groups)
         return dataclasses.replace(seen, obs=seen.obs[: self.num_agents], rival_obs=seen.obs[self.num_agents :])
 
-    def _of_team(self, state: TeamState) -> TeamState:
+    def _of_team(self, state: TeamEnvState) -> TeamEnvState:
         """Reduces rewards, outcome and metrics of all agents to those of team 0."""
         return dataclasses.replace(
             state,

@@ -16,8 +16,8 @@ from gymnasium.utils import EzPickle
 from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
-from mqe_jax.core.errors import InputError, shown
-from mqe_jax.core.settings import check, checked
+from mqe_jax.core.errors import InputError, short_repr
+from mqe_jax.core.settings import check, check_arguments
 from mqe_jax.envs import QuadrupedEnv
 
 try:
@@ -99,7 +99,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         """Returns the space of an agent's action (action_size,), in [-1, 1]."""
         return self._action_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
-    @checked(options=Mapping | None)
+    @check_arguments(options=Mapping | None)
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
@@ -113,7 +113,9 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         if not self.agents:
             return {}, {}, {}, {}, {}
         if set(check("actions", actions, Mapping)) != set(self.agents):
-            raise InputError(f"actions: for {shown(list(actions))}; expected one for each of {', '.join(self.agents)}")
+            raise InputError(
+                f"actions: for {short_repr(list(actions))}; expected one for each of {', '.join(self.agents)}"
+            )
         out = self._host.step([[actions[agent] for agent in self.agents]])
         terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
         metrics = {name: float(value[0]) for name, value in out.info.items()}

@@ -46,7 +46,7 @@ COMMANDS: dict[str, Any] = {
     "skill train": "Train a skill's weights, from scratch or from other weights (GPU): mqe skill train agile.",
     "skill eval": skill.SkillEval,
     "skill convert": skill.SkillConvert,
-    "sweep": study.Sweep,
+    "sweep": study.SweepCommand,
     "report": study.Report,
     "tournament": study.Tournament,
 }
@@ -63,7 +63,7 @@ def overview(group: str = "") -> str:
     return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
 
 
-def unaliased(arguments: Sequence[str]) -> list[str]:
+def resolve_alias(arguments: Sequence[str]) -> list[str]:
     """Returns the arguments with `walk COMMAND ...`, where they begin so, as `skill COMMAND walk ...`."""
     if list(arguments[:1]) != ["walk"]:
         return list(arguments)
@@ -89,7 +89,7 @@ def parse(arguments: Sequence[str]) -> Any:
         SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
     """
     _check_words(arguments)
-    given, arguments = arguments, unaliased(arguments)
+    given, arguments = arguments, resolve_alias(arguments)
     words = 2 if " ".join(arguments[:2]) in COMMANDS else 1
     name, rest = " ".join(arguments[:words]), list(arguments[words:])
     if {"-h", "--help"}.intersection(arguments[:2]) and name not in COMMANDS:
@@ -126,7 +126,7 @@ def _parse_launch(arguments: Sequence[str]) -> Any:
     start = next((i for i, word in enumerate(arguments) if word in names), len(arguments))
     launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]), config=(tyro.conf.FlagCreatePairsOff,))
     command = tuple(arguments[start:])
-    if command[:1] not in (("train",), ("sweep",)) and tuple(unaliased(command))[:2] != ("skill", "train"):
+    if command[:1] not in (("train",), ("sweep",)) and tuple(resolve_alias(command))[:2] != ("skill", "train"):
         fail("command", " ".join(command[:2]), "train, skill train or sweep: mqe launch --processes 2 train go1gate")
     parse(command)
     return dataclasses.replace(launch, command=command)

@@ -113,7 +113,7 @@ class Launch:
         index, visible = int(os.environ.get(names[1], "0")), os.environ.get(_DEVICES)
         if visible in _NO_DEVICES:
             return {MEMBER: ALONE}
-        devices = _listed(visible) or [str(index)]
+        devices = _split(visible) or [str(index)]
         return {_DEVICES: devices[index % len(devices)], MEMBER: ALONE}
 
     def _own_devices(self, count: int) -> list[dict[str, str]]:
@@ -124,7 +124,7 @@ class Launch:
         gpus = _gpus()
         if visible is None and not self.devices and 0 < gpus < count:
             fail("processes", count, f"at most the number of this host's GPUs, {gpus}")
-        devices = list(map(str, self.devices)) or _listed(visible) or list(map(str, range(count)))
+        devices = list(map(str, self.devices)) or _split(visible) or list(map(str, range(count)))
         if len(devices) < count or (self.devices and len(devices) > count):
             fail("devices", ", ".join(devices), f"as many as processes, {count}")
         if gpus and not all(0 <= device < gpus for device in self.devices):
@@ -141,7 +141,7 @@ def _gpus() -> int:
     return len(list(Path("/dev").glob("nvidia[0-9]*")))
 
 
-def _listed(visible: str | None) -> list[str]:
+def _split(visible: str | None) -> list[str]:
     return [word for word in (visible or "").split(",") if word]
 
 
@@ -276,7 +276,7 @@ def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, 
     """Runs the processes of this host, which end when one fails if they are `together`; returns the exit code."""
     processes: list[_Process] = []
 
-    with interrupts.deferred() as signalled:
+    with interrupts.defer() as signalled:
 
         def pause() -> None:
             if number := signalled():

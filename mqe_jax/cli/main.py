@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mqe_jax.core import interrupts
-from mqe_jax.core.errors import InputError, NonFiniteError, one_line, shown
+from mqe_jax.core.errors import InputError, NonFiniteError, one_line, short_repr
 from mqe_jax.core.literal import line
 
 
@@ -79,7 +79,7 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         return 1, one_line(error)
     except ValueError as error:
         if variable := _jax_variable(error):
-            return 2, f"{variable}: {shown(os.environ[variable])} is not allowed; JAX says: {one_line(error)}"
+            return 2, f"{variable}: {short_repr(os.environ[variable])} is not allowed; JAX says: {one_line(error)}"
         raise
     return 0, ""
 

@@ -13,10 +13,10 @@ from typing import Annotated, Any, TextIO
 import tyro
 
 from mqe_jax.core import settings
-from mqe_jax.core.errors import InputError, shown
+from mqe_jax.core.errors import InputError, short_repr
 from mqe_jax.core.files import parse_yaml
 from mqe_jax.core.literal import line
-from mqe_jax.core.settings import joined, record
+from mqe_jax.core.settings import merge, record
 
 Repeated = tyro.conf.UseAppendAction
 Impl = Annotated[
@@ -94,9 +94,9 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not equals or not name.strip():
-            raise InputError(f"set: {shown(pair)} is not allowed; it must be KEY=VALUE, such as gate_width=0.7")
-        value = parse_yaml(text, f"set: the value of {shown(pair)}")
-        values = joined(values, {name.strip().replace("-", "_"): value})
+            raise InputError(f"set: {short_repr(pair)} is not allowed; it must be KEY=VALUE, such as gate_width=0.7")
+        value = parse_yaml(text, f"set: the value of {short_repr(pair)}")
+        values = merge(values, {name.strip().replace("-", "_"): value})
     return values
 
 

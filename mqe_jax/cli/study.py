@@ -18,7 +18,7 @@ from mqe_jax.core.settings import record
 
 
 @record
-class Sweep:
+class SweepCommand:
     """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes interrupted runs."""
 
     file: tyro.conf.Positional[Path]

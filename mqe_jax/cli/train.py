@@ -15,7 +15,7 @@ import tyro
 from mqe_jax.cli.options import DumpDiverged, TaskOptions
 from mqe_jax.core import interrupts
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import Seeds
+from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import override, record
 from mqe_jax.runs.presets import base_config
@@ -63,7 +63,7 @@ class Train(TaskOptions):
     """Run folder. Default: runs/TASK."""
     resume: bool = False
     """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
-    num_seeds: Seeds = 1
+    num_seeds: SeedCount = 1
     """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
     --run-dir."""
     dump_diverged: DumpDiverged = None

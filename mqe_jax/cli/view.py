@@ -38,11 +38,11 @@ class View(PolicyOptions):
         _check_address(self.host, self.port)
         from mqe_jax.envs import ALIASES
         from mqe_jax.runs.build import players
-        from mqe_jax.view.menu import DEFAULT, Choice, Menu, find_runs
+        from mqe_jax.view.menu import DEFAULT, Entry, Menu, find_runs
         from mqe_jax.view.session import Session
         from mqe_jax.view.viewer import Viewer
 
-        def open_choice(choice: Choice) -> Session:
+        def open_choice(choice: Entry) -> Session:
             """Creates another session, with the task's default parameters; a run has its own ones."""
             names = [None if name == DEFAULT else name for name in (choice.policy, choice.opponent)]
             target = choice.policy if choice.policy in runs else choice.task
@@ -52,7 +52,7 @@ class View(PolicyOptions):
         env, vector_env, policy, _ = players(**self.playing, num_envs=self.num_envs)
         runs = find_runs([Path("runs"), Path(self.target).parent])
         own = self.policy or (DEFAULT if self.target in (env.name, *ALIASES) else self.target)
-        menu = Menu(open_choice, Choice(env.name, own, self.opponent or DEFAULT), runs)
+        menu = Menu(open_choice, Entry(env.name, own, self.opponent or DEFAULT), runs)
         viewer = Viewer(self.host, self.port, menu)
         viewer.announce(env, self.num_envs)
         if self.host not in _LOCAL:

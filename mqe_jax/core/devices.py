@@ -111,7 +111,7 @@ def alone() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def connected() -> Iterator[None]:
+def translate_errors() -> Iterator[None]:
     """Turns JAX's error of a collective, where another process has ended, into a ConnectionError of one line."""
     try:
         yield
@@ -154,8 +154,8 @@ class Processes:
         self._mesh = Mesh(np.array(jax.devices()[: self.count]), (AXIS,))
         self._specs = jax.tree.map(self._spec, own, whole)
 
-    def stacked(self, shared: PyTree) -> Processes:
-        """Returns those of several states, with a leading axis on all leaves but the shared ones (`Seeds`)."""
+    def stack(self, shared: PyTree) -> Processes:
+        """Returns those of several states, with a leading axis on all leaves but the shared ones (`SeedBatch`)."""
         other = object.__new__(Processes)
         vars(other).update(vars(self))
         stack = lambda once, spec: spec if once else PartitionSpec(None, *spec)  # noqa: E731

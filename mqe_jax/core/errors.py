@@ -50,7 +50,7 @@ def one_line(error: BaseException) -> str:
     return line(error)
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """Returns a value as it is shown in a message: its `repr`, shortened, on one line."""
     try:
         text = _REPR.repr(value)
@@ -68,6 +68,6 @@ def nearest(word: object, known: Iterable[object]) -> str:
     """Returns ' (did you mean ...?)' for the closest known word, or an empty string."""
     import difflib  # 10 ms, which a program needs for a message only
 
-    text = word[:SHOWN] if isinstance(word, str) else shown(word)
+    text = word[:SHOWN] if isinstance(word, str) else short_repr(word)
     match = difflib.get_close_matches(text, [str(name) for name in known], 1, 0.5)
     return f" (did you mean {match[0]!r}?)" if match else ""

@@ -292,7 +292,7 @@ def check_output(path: Path, field: str = "output") -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def lock(folder: Path) -> Iterator[None]:
     """Creates a folder and holds a lock on it, which ends with the process; InUseError if it is locked already.
 
     Below it, nothing is written once its path leads to another folder or to none. Folders made and left empty go again.

@@ -57,13 +57,13 @@ def install() -> None:
     _installed = True
 
 
-def installed() -> bool:
+def is_installed() -> bool:
     """Returns whether `install` was called: in the command line, not in a notebook."""
     return _installed
 
 
 @contextlib.contextmanager
-def deferred() -> Iterator[Callable[[], int]]:
+def defer() -> Iterator[Callable[[], int]]:
     """Yields a function that returns the signal that came since, or 0; a later one ends the process at once.
 
     Without `install`, as in a notebook, only SIGINT is deferred, and a later one raises KeyboardInterrupt.

@@ -1,7 +1,7 @@
 """What input may hold and cost: the one list of bounds. Whatever is outside of them is refused with an `InputError`.
 
-Kinds of numbers are types of fields of records (`settings.record`) and of arguments (`settings.checked`); a plain `int`
-or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
+Kinds of numbers are types of fields of records (`settings.record`) and of arguments (`settings.check_arguments`).
+A plain `int` or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Episodes = Annotated[int, Gt(0), Le(2 * 10**6)]
 Candidates = Annotated[int, Gt(0), Le(1024)]  # episodes recorded, or played by each pair, at once
 Horizon = Annotated[int, Gt(0), Le(10**4)]  # environment steps in one program
 Few = Annotated[int, Gt(0), Le(16)]  # robots, rows of sheep
-Seeds = Annotated[int, Gt(0), Le(64)]  # trained in one program
+SeedCount = Annotated[int, Gt(0), Le(64)]  # trained in one program
 Lag = Annotated[int, Ge(0), Le(50)]  # environment steps
 Members = Annotated[int, Gt(0), Le(256)]  # of a league's pool
 Epochs = Annotated[int, Gt(0), Le(1000)]

@@ -36,7 +36,7 @@ from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from mqe_jax.core import limits
-from mqe_jax.core.errors import InputError, brief, nearest, shown
+from mqe_jax.core.errors import InputError, brief, nearest, short_repr
 from mqe_jax.core.files import read_yaml
 from mqe_jax.core.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for those who declare records)
 
@@ -70,14 +70,14 @@ class FrozenMapping(Mapping[str, Any]):
 _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+def _check_order(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
         raise ValueError("two numbers (lowest, highest), in this order")
     return value
 
 
-Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_ordered)]
-Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ordered)]
+Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
+Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_check_order)]
 
 
 def _parameters(value: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -99,7 +99,7 @@ def record(cls: type[T]) -> type[T]:
     of nested records are prefixed with their path. A subclass of a record must be decorated too.
     """
     hints = typing.get_type_hints(cls, include_extras=True)
-    cls.__annotations__ = {name: _lenient(hints[name]) for name in inspect.get_annotations(cls)}
+    cls.__annotations__ = {name: _accept_yaml(hints[name]) for name in inspect.get_annotations(cls)}
     made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
 
     @functools.wraps(made.__init__)
@@ -118,10 +118,10 @@ def _path(value: Any) -> Any:
         raise ValueError(f"a path, or a text that is not empty, {TEXT}")
     if any(len(os.fsencode(part)) > limits.FILE_NAME for part in Path(value).parts):
         raise ValueError(f"a path whose parts have at most {limits.FILE_NAME} bytes")
-    return _expanded(value)
+    return _expand_home(value)
 
 
-def _expanded(value: Any) -> Any:
+def _expand_home(value: Any) -> Any:
     """Returns a text or path with the home folder in place of a `~` at its beginning."""
     if not isinstance(value, str | Path) or not str(value).startswith("~"):
         return value
@@ -146,7 +146,7 @@ def is_text(value: str) -> bool:
     return len(value) <= limits.TEXT and not any(ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value)
 
 
-def checked(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def check_arguments(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Makes a function check some of its arguments, each against a type, as a record checks its fields."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -178,7 +178,7 @@ def check(name: str, value: Any, kind: Any) -> Any:
 
 @functools.cache
 def _adapter(kind: Any) -> pydantic.TypeAdapter[Any]:
-    return pydantic.TypeAdapter(_lenient(kind), config=_CONFIG)
+    return pydantic.TypeAdapter(_accept_yaml(kind), config=_CONFIG)
 
 
 def is_record(kind: object) -> bool:
@@ -190,7 +190,7 @@ def is_record(kind: object) -> bool:
 
 def fail(name: str, value: object, allowed: str) -> NoReturn:
     """Raises the `InputError` of a value that is not allowed: `name: value is not allowed; it must be ...`."""
-    raise InputError(f"{name}: {shown(value)} is not allowed; it must be {allowed}")
+    raise InputError(f"{name}: {short_repr(value)} is not allowed; it must be {allowed}")
 
 
 def build(kind: type[T], values: Mapping[str, Any]) -> T:
@@ -213,11 +213,11 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
 def _joined(kind: Any, first: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(changes, Mapping):
         fail(kind.__name__, changes, "a mapping of names to values")
-    made = joined({}, changes)  # which refuses what is nested too deep
+    made = merge({}, changes)  # which refuses what is nested too deep
     for name, following in itertools.pairwise(sorted(_names(changes))):
         if name == following:
             raise InputError(f"{name}: is given twice")
-    return joined(first, made)
+    return merge(first, made)
 
 
 def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
@@ -238,7 +238,7 @@ def differences(settings: Any, default: Any) -> dict[str, Any]:
     return found
 
 
-def joined(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
+def merge(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
     """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
 
     A record with a `name`, a choice among several records, is replaced as a whole by another one. InputError for
@@ -253,7 +253,7 @@ def joined(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = lim
                 fail(name, value, f"nested at most {limits.DEPTH} deep")
             now = _fields(both.get(name))
             other = is_record(both.get(name)) and value.get("name", now.get("name")) != now.get("name")
-            value = joined({} if other else now, value, depth - 1)
+            value = merge({} if other else now, value, depth - 1)
         both[name] = value
     return both
 
@@ -290,29 +290,29 @@ def hints_of(kind: Any) -> dict[str, Any]:
 # -- conversion before pydantic's own validation ---------------------------------------------------------------------
 
 
-def _lenient(hint: Any) -> Any:
+def _accept_yaml(hint: Any) -> Any:
     """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as numbers."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated and parts[0] in (int, float):
-        return _bounded(hint)
+        return _add_bounds(hint)
     if origin is Annotated:  # pydantic applies the last validators of an annotation first
-        kind, *conversions = typing.get_args(Annotated[_lenient(parts[0]), None])[:-1]
+        kind, *conversions = typing.get_args(Annotated[_accept_yaml(parts[0]), None])[:-1]
         return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
     if origin in (typing.Union, types.UnionType):
-        union = typing.Union[tuple(_lenient(part) for part in parts)]  # noqa: UP007
+        union = typing.Union[tuple(_accept_yaml(part) for part in parts)]  # noqa: UP007
         return Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
     if origin is tuple:
-        return tuple[tuple(part if part is Ellipsis else _lenient(part) for part in parts)]  # type: ignore[misc]
+        return tuple[tuple(part if part is Ellipsis else _accept_yaml(part) for part in parts)]  # type: ignore[misc]
     if origin in (Mapping, Sequence, list):
-        made = origin[tuple(map(_lenient, parts))]  # type: ignore[index]
+        made = origin[tuple(map(_accept_yaml, parts))]  # type: ignore[index]
         return Annotated[made, pydantic.AfterValidator(FrozenMapping)] if origin is Mapping else made
     if hint in (int, float):
-        return _bounded(Annotated[hint, None])
+        return _add_bounds(Annotated[hint, None])
     before = {bool: _boolean, str: _text, Path: _text}.get(hint)
     return hint if before is None else Annotated[hint, pydantic.BeforeValidator(before)]
 
 
-def _bounded(hint: Any) -> Any:
+def _add_bounds(hint: Any) -> Any:
     """Returns an annotated number with the default bound on a side where it has none."""
     kind, *parts = typing.get_args(hint)
     low, high = limits.bounds(hint)
@@ -337,7 +337,7 @@ def _number(kind: type, value: Any) -> Any:
 def _text(value: Any) -> Any:
     if isinstance(value, bytes | bytearray) or (isinstance(value, str | Path) and not is_text(str(value))):
         raise ValueError(f"a text, {TEXT}")
-    return _expanded(value)
+    return _expand_home(value)
 
 
 def _boolean(value: Any) -> bool:
@@ -375,7 +375,7 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
             kind = _record_in(hints_of(kind)[part])
         known = list(hints_of(kind))
         hint = f"{nearest(places[-1], known)}; allowed: {', '.join(known)}"
-        return InputError(f"{'.'.join(places)}: unknown name (value {shown(value)}){hint}")
+        return InputError(f"{'.'.join(places)}: unknown name (value {short_repr(value)}){hint}")
     if first["type"] == "missing":
         return InputError(f"{'.'.join(places)}: is missing")
     allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")
@@ -383,4 +383,4 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     if first["type"].startswith("dataclass"):
         allowed = "it must be a mapping of names to values"
     choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", "")) if word]
-    return InputError(f"{'.'.join(places)}: {shown(value)} is not allowed; {allowed}{nearest(value, choices)}")
+    return InputError(f"{'.'.join(places)}: {short_repr(value)} is not allowed; {allowed}{nearest(value, choices)}")

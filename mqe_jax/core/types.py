@@ -76,7 +76,7 @@ def _having(names: str, allowed: str, *, lacks: str = "", callables: bool = Fals
     return pydantic.AfterValidator(validate)
 
 
-# Kinds of arguments (`mqe_jax.core.settings.checked`).
+# Kinds of arguments (`mqe_jax.core.settings.check_arguments`).
 _ENV, _POLICY = "name num_agents action_size reset step", "a policy, such as that of mqe_jax.load_policy"
 _ACT = f"{_POLICY}, or a function act(obs, memory, key)"
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
@@ -222,7 +222,7 @@ class Outcome:
         teams = {name: change(x) for name, x in teams.items() if x is not None}
         return dataclasses.replace(self, **teams, further={name: change(x) for name, x in self.further.items()})
 
-    def named(self) -> dict[str, jax.Array]:
+    def by_name(self) -> dict[str, jax.Array]:
         """Returns the values by the names under which they are logged: `success`, `team0/win`, `ending/fall`, ..."""
         values = {} if self.success is None else {"success": self.success[..., 0]}
         if self.win is None:

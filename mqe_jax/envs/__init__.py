@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mqe_jax.core.limits import Environments
-from mqe_jax.core.settings import checked, override
+from mqe_jax.core.settings import check_arguments, override
 from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task, task_id
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def tasks() -> tuple[str, ...]:
     return tuple(TASKS)
 
 
-@checked(task=str, impl=str, control=str, num_envs=Environments)
+@check_arguments(task=str, impl=str, control=str, num_envs=Environments)
 def make(
     task: str, *, impl: str = "auto", control: str = "command", num_envs: int = 4096, **overrides: Any
 ) -> QuadrupedEnv:

@@ -16,7 +16,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, PositiveInt
 from mqe_jax.core.memory import bytes_of, check_memory
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
@@ -53,10 +53,10 @@ def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None, group
             if field.name not in ("data", "key", *SEEN, *KEPT)
         }
         data = env.physics.merge(done, fresh.data, state.data)
-    return env.observed(dataclasses.replace(state, data=data, key=key, **merged), groups)
+    return env.with_observations(dataclasses.replace(state, data=data, key=key, **merged), groups)
 
 
-class Batch:
+class EnvBatch:
     """What all batches of environments of tasks have."""
 
     env: QuadrupedEnv
@@ -85,7 +85,7 @@ class Batch:
             raise InputError(f"action: shape {given}; expected {shape} (environments, agents, action size)")
 
 
-class VectorEnv(Batch):
+class VectorEnv(EnvBatch):
     """A batch of environments with automatic reset, as used for training and evaluation."""
 
     groups: tuple[str, ...] = ()
@@ -126,7 +126,7 @@ class VectorEnv(Batch):
                 fail("group", name, f"one of {self.name}: {', '.join(self.group_sizes)}")
         return other
 
-    @checked(key=RandomKey)
+    @check_arguments(key=RandomKey)
     def reset(self, key: jax.Array) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
         return jax.vmap(self._reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
@@ -145,7 +145,7 @@ class VectorEnv(Batch):
 
     @single
     def _reset(self, key: jax.Array) -> State:
-        return self._with_final(self.env.observed(self.env.begin(key), self.groups))
+        return self._with_final(self.env.with_observations(self.env.begin(key), self.groups))
 
     def _with_final(self, state: State) -> State:
         """Returns a state whose observations, as far as `final` names them, are also those at the end of its step."""
@@ -156,5 +156,5 @@ class VectorEnv(Batch):
         """Advances one environment, and resets it to `start` if its episode ended; see `autoreset`."""
         state = self.env.advance(state, action)
         if self.final:
-            state = self._with_final(self.env.observed(state, self.groups))
+            state = self._with_final(self.env.with_observations(state, self.groups))
         return autoreset(self.env, state, start, self.groups)

@@ -21,19 +21,19 @@ from mqe_jax import skills
 from mqe_jax.core.errors import InputError, warn
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked, differences, fail
+from mqe_jax.core.settings import check, check_arguments, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.observation import ObservationLayout, box
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
-from mqe_jax.envs.returned import alike, results, shaped, weights_of
+from mqe_jax.envs.returned import alike, check_shape, results, weights_of
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
 from mqe_jax.physics import engines, robots
 from mqe_jax.physics.actuators import NetworkActuators, load_actuator_network
 from mqe_jax.physics.kinematics import poses
-from mqe_jax.physics.robots.index import RobotState, placed, read_robots
+from mqe_jax.physics.robots.index import RobotState, read_robots, scatter
 from mqe_jax.physics.rotation import euler_to_quaternion
 from mqe_jax.physics.scene import build_model, compile_scene
 from mqe_jax.skills.control import Controller, check_mode
@@ -100,15 +100,15 @@ class QuadrupedEnv(Task[S, P]):
         npc, npcs = None, scene.num_robots > self.num_agents
         if npcs and self.npc_skill != skill.name:
             other, npcs = skills.make(self.npc_skill, self.robot), False
-            other = other.restricted(self.npc_varied, None) if self.npc_varied else other
+            other = other.restrict(self.npc_varied, None) if self.npc_varied else other
             other.check_period(scene.timestep, self.physics.num_substeps)
             npc = other, other.load_params()
         if not npcs or self.npc_varied:
-            skill = skill.restricted((*self.params.commands, *(self.npc_varied if npcs else ())), self.params.gait)
+            skill = skill.restrict((*self.params.commands, *(self.npc_varied if npcs else ())), self.params.gait)
         uses_skill = control == "command" or npcs
         if uses_skill:
             skill.check_period(scene.timestep, self.physics.num_substeps)
-        if uses_skill and (beyond := skill.untrained(self.params.command_ranges)):
+        if uses_skill and (beyond := skill.untrained_commands(self.params.command_ranges)):
             warn(f"command_ranges: the skill {self.params.skill!r} was not trained for {', '.join(beyond)}")
         self.controller = Controller(
             mode=control,
@@ -177,7 +177,7 @@ class QuadrupedEnv(Task[S, P]):
         """Environment steps until the time limit."""
         return round(self.params.episode_length / self.dt)
 
-    @checked(num_envs=Environments)
+    @check_arguments(num_envs=Environments)
     def with_num_envs(self, num_envs: int) -> QuadrupedEnv[S, P]:
         """Returns an environment whose engine holds `num_envs` environments: itself, or one with larger buffers."""
         if self.physics.holds(num_envs):
@@ -185,10 +185,10 @@ class QuadrupedEnv(Task[S, P]):
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
 
     @single
-    @checked(key=RandomKey, assistance=Level)
+    @check_arguments(key=RandomKey, assistance=Level)
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns a randomised initial state; the task is unmodified at `assistance` 0, a curriculum level up to 1."""
-        return with_final(self.observed(self.begin(key, assistance)))
+        return with_final(self.with_observations(self.begin(key, assistance)))
 
     def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns the state of `reset` without observations."""
@@ -241,13 +241,13 @@ class QuadrupedEnv(Task[S, P]):
         or of a batch, and for an action of another shape or dtype, or that is not finite; in compiled code the latter
         ends the episode as diverged.
         """
-        return with_final(self.observed(self.advance(state, action)))
+        return with_final(self.with_observations(self.advance(state, action)))
 
     @jax.named_scope("task")
     def advance(self, state: State[S], action: jax.Array) -> State[S]:
         """Returns the state of `step` with the observations from before it."""
         self.check_state(state)
-        action = self.controller.checked(action)
+        action = self.controller.check_action(action)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
         still = (state.step < state.frozen_steps) | ~state.active
@@ -278,7 +278,7 @@ class QuadrupedEnv(Task[S, P]):
         return dataclasses.replace(state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)})
 
     @jax.named_scope("task")
-    def observed(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
+    def with_observations(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
         """Returns the state with the observations that belong to it, and those of further groups."""
         robots, noise, seen = self.read(state.data, state.active), self.params.randomization.observation_noise, {}
         for number, (name, layout) in enumerate({"policy": self.observation_layout, **self.groups}.items()):
@@ -289,9 +289,9 @@ class QuadrupedEnv(Task[S, P]):
             if noise:
                 key = jax.random.fold_in(state.key, _NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
-            seen[name] = jnp.where(state.active[:, None], _bounded(obs), 0.0)
+            seen[name] = jnp.where(state.active[:, None], _clip(obs), 0.0)
         privileged = self.observe_privileged(state, robots)
-        return dataclasses.replace(state, obs=seen.pop("policy"), privileged_obs=_bounded(privileged), groups=seen)
+        return dataclasses.replace(state, obs=seen.pop("policy"), privileged_obs=_clip(privileged), groups=seen)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
         """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""
@@ -302,7 +302,7 @@ class QuadrupedEnv(Task[S, P]):
         reward, logged = self.score(before, Moment(state, robot_state), collision)
         fall, crash = jnp.any(self.fallen(robot_state)), collision & self.params.end_on_collision
         failed = diverged | fall | crash
-        decided = shaped("ending", self.ending(state, robot_state), (), dtype=bool)
+        decided = check_shape("ending", self.ending(state, robot_state), (), dtype=bool)
         terminated, late = failed | decided, state.step >= self.max_steps
         clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
         outcome = self.result(state, robot_state, failed)
@@ -348,7 +348,7 @@ class QuadrupedEnv(Task[S, P]):
 
     def _ctrl(self, targets: jax.Array) -> jax.Array:
         """Returns the engine's control (nu,) from targets of all robots (R, 12)."""
-        return placed(np.zeros(self.compiled.model.nu), self.index.actuator, targets)
+        return scatter(np.zeros(self.compiled.model.nu), self.index.actuator, targets)
 
     def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
         params, model, index = self.params, self.compiled.model, self.index
@@ -362,8 +362,8 @@ class QuadrupedEnv(Task[S, P]):
         level = jnp.zeros(len(pose))
         turn = euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
         robots = np.concatenate([index.base_qpos, index.joint_qpos], axis=-1)
-        qpos = placed(model.qpos0, robots, jnp.concatenate([pose[:, :3], turn, joints], axis=-1))
-        return qpos, placed(np.zeros(model.nv), index.base_qvel, velocity)
+        qpos = scatter(model.qpos0, robots, jnp.concatenate([pose[:, :3], turn, joints], axis=-1))
+        return qpos, scatter(np.zeros(model.nv), index.base_qvel, velocity)
 
     def _sample_frozen_steps(self, key: jax.Array, assistance: jax.Array) -> jax.Array:
         agent_key, time_key = jax.random.split(key)
@@ -392,5 +392,5 @@ class QuadrupedEnv(Task[S, P]):
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
 
 
-def _bounded(x: jax.Array) -> jax.Array:
+def _clip(x: jax.Array) -> jax.Array:
     return jnp.clip(jnp.nan_to_num(x), -1e4, 1e4)

@@ -115,16 +115,16 @@ class Football(QuadrupedEnv[S, F]):
         position = jnp.array([*self.ball_spot, params.ball.radius]).at[:2].add(noise)
         qpos = qpos.at[self.objects["ball"].qpos[:3]].set(position)
         if params.head_start:
-            goal, attackers = self.attack(jax.random.fold_in(start_key, 1))
+            goal, attackers = self.sample_attack(jax.random.fold_in(start_key, 1))
             start = params.head_start * assistance * jax.random.uniform(start_key)
             way = start * (goal - position[:2])
             forward = jnp.where(attackers, way[0], 0.0)
             qpos = qpos.at[self.objects["ball"].qpos[:2]].add(way).at[self.index.base_qpos[:, 0]].add(forward)
         return qpos, qvel
 
-    def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Returns the midpoint of a goal line (2,), m, of a head start, and which robots attack that goal (R,) bool."""
-        raise NotImplementedError(f"{type(self).__name__}: attack() is not defined")
+        raise NotImplementedError(f"{type(self).__name__}: sample_attack() is not defined")
 
     def touches(self, before: Moment, after: Moment) -> jax.Array:
         """Returns which robot touched the ball in a step (R,) bool: the nearest one, if the ball's velocity changed.
@@ -231,7 +231,7 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
         """The centre of the field, m."""
         return float(GOALS[:, 0].mean()), 0.0
 
-    def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         side = jax.random.randint(key, (), 0, 2)
         return jnp.asarray(GOALS)[side], jnp.asarray(self.team_of) == side
 

@@ -93,7 +93,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         play = jax.tree.map(lambda old, new: jnp.where(was.scored, old, new), was.play, play)
         return DefenderState(was.scored | self.in_goal(after.state.data)[0], play)
 
-    def attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.asarray(GOALS[0]), jnp.array([True, True, False])
 
     def distances(self, now: Moment[DefenderState]) -> tuple[jax.Array, jax.Array]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.settings import fail
-from mqe_jax.envs.returned import named, shaped
+from mqe_jax.envs.returned import check_names, check_shape
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
@@ -85,9 +85,11 @@ class ObservationLayout:
 
     def pack(self, values: Mapping[str, jax.Array], agents: int | None = None) -> jax.Array:
         """Concatenates named blocks (A, width) into observations (A, size); ValueError for other names or widths."""
-        named("observe", values, self.names)
+        check_names("observe", values, self.names)
         rows = (agents or len(values[self.names[0]]),)
-        parts = [shaped(f"observe: {block.name}", values[block.name], (*rows, block.width)) for block in self.blocks]
+        parts = [
+            check_shape(f"observe: {block.name}", values[block.name], (*rows, block.width)) for block in self.blocks
+        ]
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 
     def entities(self, observation: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:

@@ -126,7 +126,7 @@ class TaskParams:
         commands = (*self.commands, *skill.selector)
         return Commander(skill, commands, skill.default_commands(self.gait), self.command_ranges)
 
-    def commanded(self) -> dict[str, tuple[float, float]]:
+    def action_ranges(self) -> dict[str, tuple[float, float]]:
         """Returns the lowest and the highest value of each command that the action sets, in the command's unit."""
         commander = self.commander
         limits = np.round(np.asarray(commander.limits, float), 6)
@@ -136,14 +136,14 @@ class TaskParams:
         """Returns what an agent's actions mean in a control mode, by names of parameters."""
         meaning: dict[str, Any] = {"robot": self.robot, "control": control}
         if control == "command":
-            gait, ranges = self.gait or next(iter(self.commander.skill.gaits), None), self.commanded()
+            gait, ranges = self.gait or next(iter(self.commander.skill.gaits), None), self.action_ranges()
             meaning |= {"skill": self.skill, "gait": gait, "commands": self.commands}
             meaning["command_ranges"] = {name: ranges[name] for name in self.commands}
         return meaning | ({"position_scale": self.position_scale} if control == "position" else {})
 
     def commanded_text(self) -> str:
         """Returns the skill and these ranges, such as `walk: vx -1 to 1`."""
-        ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in self.commanded().items())
+        ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in self.action_ranges().items())
         names = " or ".join([self.skill] if isinstance(self.skill, str) else self.skill)
         return f"{names}: {', '.join(ranges)}"
 

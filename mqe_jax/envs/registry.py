@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.core.settings import checked, fail
+from mqe_jax.core.settings import check_arguments, fail
 
 if TYPE_CHECKING:
     import jax
@@ -94,7 +94,7 @@ NAMED_PLANNERS: dict[str, dict[str, Planner]] = {}
 """Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`)."""
 
 
-@checked(task=str, name=str, planner=Callable)
+@check_arguments(task=str, name=str, planner=Callable)
 def register_planner(task: str, name: str, planner: Planner) -> None:
     """Registers a further scripted policy of a task under a name that no other one has."""
     if not name:
@@ -105,7 +105,7 @@ def register_planner(task: str, name: str, planner: Planner) -> None:
         raise InputError(f"planner: the name {name!r} is already registered for {task}")
 
 
-@checked(planner=Callable | None)
+@check_arguments(planner=Callable | None)
 def register_task(task: type[QuadrupedEnv], planner: Planner | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 

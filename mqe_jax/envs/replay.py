@@ -15,7 +15,7 @@ import numpy as np
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import archive, parse_json, write_atomically
-from mqe_jax.core.settings import Parameters, PathText, check, checked, fail, to_mapping
+from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, fail, to_mapping
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.physics.engines import STATE_FIELDS
@@ -67,7 +67,7 @@ def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, a
     write_atomically(pathlib.Path(file), buffer.getvalue())
 
 
-@checked(file=PathText)
+@check_arguments(file=PathText)
 def load_recording(file: str | pathlib.Path) -> Recording:
     """Reads a recording; InputError if the file is missing, damaged or not a recording."""
     path = pathlib.Path(file)
@@ -89,7 +89,7 @@ def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
     actions = (env.num_agents, env.action_size)
     if recording.actions.shape[1:] != actions or not np.isfinite(recording.actions[:-1]).all():  # the last may diverge
         raise InputError(f"recording of {recording.task}: its actions are not finite, or not {actions}")
-    start = _restored(env, recording)
+    start = _restore(env, recording)
 
     def advance(state: State, action: jax.Array) -> tuple[State, State]:
         state = env.step(state, action)
@@ -110,7 +110,7 @@ def _flat(state: State) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
-def _restored(env: QuadrupedEnv, recording: Recording) -> State:
+def _restore(env: QuadrupedEnv, recording: Recording) -> State:
     """Returns the recording's first state on the engine of `env`."""
     blank = env.reset(jax.random.PRNGKey(0))
     fields = content(blank)

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.core.errors import shown
+from mqe_jax.core.errors import short_repr
 
 
 def weights_of(params: Any) -> Any:
@@ -18,13 +18,13 @@ def weights_of(params: Any) -> Any:
     return params.rewards
 
 
-def named(method: str, values: Any, names: Iterable[str]) -> None:
+def check_names(method: str, values: Any, names: Iterable[str]) -> None:
     """Checks that values are a mapping of these names."""
     if not isinstance(values, Mapping) or set(values) != set(names):
         _fail(method, sorted(values) if isinstance(values, Mapping) else _kind(values), f"by name: {sorted(names)}")
 
 
-def shaped(method: str, value: Any, *shapes: tuple[int, ...], dtype: Any = None) -> jax.Array:
+def check_shape(method: str, value: Any, *shapes: tuple[int, ...], dtype: Any = None) -> jax.Array:
     """Returns an array of one of these shapes, and of a dtype if one is given."""
     if value is None or jnp.shape(value) not in shapes or dtype not in (None, getattr(value, "dtype", type(value))):
         _fail(method, _kind(value), " or ".join(map(str, shapes)) + ("" if dtype is None else f" {dtype.__name__}"))
@@ -35,7 +35,7 @@ def numbers(method: str, values: Any) -> dict[str, jax.Array]:
     """Returns numbers () by name."""
     if not isinstance(values, Mapping):
         _fail(method, _kind(values), "numbers by name")
-    return {name: shaped(f"{method}: {name}", value, ()) for name, value in values.items()}
+    return {name: check_shape(f"{method}: {name}", value, ()) for name, value in values.items()}
 
 
 def results(method: str, values: Any) -> dict[str, jax.Array]:
@@ -58,7 +58,7 @@ def _kind(value: Any) -> str:
     """Returns the shape and dtype of an array, or what else a value is."""
     if isinstance(value, bool | int | float) or hasattr(value, "dtype"):
         return f"{jnp.shape(value)} {jnp.result_type(value)}"
-    return shown(value)
+    return short_repr(value)
 
 
 def _fail(method: str, found: object, expected: str) -> NoReturn:

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs.returned import named, shaped
+from mqe_jax.envs.returned import check_names, check_shape
 
 
 def weigh(
@@ -22,9 +22,9 @@ def weigh(
     prefix `team1/`. The reward of an agent that is not `active` (A,) is 0. ValueError if names or shapes differ.
     """
     names, agents = [field.name for field in dataclasses.fields(weights)], sum(map(len, teams))
-    named("rewards", terms, names)
+    check_names("rewards", terms, names)
     shapes = ((), (agents,))
-    given = {name: shaped(f"rewards: {name}", terms[name], *shapes).astype(jnp.float32) for name in names}
+    given = {name: check_shape(f"rewards: {name}", terms[name], *shapes).astype(jnp.float32) for name in names}
     weighted = {name: getattr(weights, name) * term for name, term in given.items()}
     total = sum((jnp.broadcast_to(value, (agents,)) for value in weighted.values()), jnp.zeros(agents))
     values = {**{f"reward/{name}": value for name, value in weighted.items()}, "average_step_reward": total}
@@ -45,7 +45,7 @@ def _first(value: jax.Array, agents: Sequence[int], active: jax.Array) -> jax.Ar
     return result
 
 
-def faded(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float) -> dict[str, jax.Array]:
+def fade(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float) -> dict[str, jax.Array]:
     """Returns the terms, those of weight 0 in the record `weights` times a factor ()."""
     as_float = lambda term: jnp.asarray(term, jnp.float32)  # noqa: E731
     return {name: term if getattr(weights, name) else factor * as_float(term) for name, term in terms.items()}

@@ -12,7 +12,7 @@ import numpy as np
 from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout
 from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.returned import weights_of
-from mqe_jax.envs.reward import faded, weigh
+from mqe_jax.envs.reward import fade, weigh
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.physics.robots.index import RobotIndex, RobotState
 from mqe_jax.physics.robots.robot import Robot
@@ -161,7 +161,7 @@ class Task(Generic[S, P]):
         """Returns the reward (A,) of a step and what is logged of it, as `weigh`; arguments as of `rewards`."""
         terms = self.rewards(before, after, collision)
         if (floor := self.params.shaping_floor) < 1.0:
-            terms = faded(terms, weights_of(self.Params()), floor + (1.0 - floor) * after.state.assistance)
+            terms = fade(terms, weights_of(self.Params()), floor + (1.0 - floor) * after.state.assistance)
         return weigh(terms, self.weights, self.teams, after.state.active)
 
     def ending(self, state: State[S], robot_state: RobotState) -> jax.Array:

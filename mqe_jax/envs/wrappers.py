@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from mqe_jax.core import devices
 from mqe_jax.core.precision import single
-from mqe_jax.envs.autoreset import Batch
+from mqe_jax.envs.autoreset import EnvBatch
 from mqe_jax.envs.state import EnvironmentState
 
 
@@ -24,7 +24,7 @@ class WrappedState(EnvironmentState):
     action: jax.Array  # actions that the wrapped batch received in the last step (N, A, D)
 
 
-class Outer(Batch):
+class Outer(EnvBatch):
     """A batch of environments around another, `inner`, whose attributes it has by default."""
 
     def __init__(self, inner: Any) -> None:
@@ -55,21 +55,21 @@ class Wrapper(Outer):
     def step(self, state: WrappedState, action: jax.Array) -> WrappedState:
         """Advances all environments by one step with actions (N, A, action_size); errors as of `VectorEnv`."""
         self.check_step(state, action, WrappedState)
-        action = self.passed(action)
+        action = self.pass_on(action)
         inner = dataclasses.replace(state.inner, step=state.step, assistance=state.assistance)
         return self._state(self.inner.step(inner, action), action, state.step + 1)
 
-    def passed(self, action: jax.Array) -> jax.Array:
+    def pass_on(self, action: jax.Array) -> jax.Array:
         """Returns the actions that the wrapped batch receives (N, A, action_size)."""
         return action
 
-    def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
+    def view(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
         """Returns the fields that differ from the wrapped states'; `reached` (N,) are the steps before any reset."""
         return {}
 
     def _state(self, inner: Any, action: jax.Array, reached: jax.Array) -> WrappedState:
         fields = {field.name: getattr(inner, field.name) for field in dataclasses.fields(EnvironmentState)}
-        return WrappedState(**{**fields, **self.seen(inner, reached)}, inner=inner, action=action)
+        return WrappedState(**{**fields, **self.view(inner, reached)}, inner=inner, action=action)
 
 
 class Deadline(Wrapper):
@@ -82,7 +82,7 @@ class Deadline(Wrapper):
         super().__init__(inner)
         self.privileged_observation_size += 1
 
-    def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
+    def view(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
         def add_time(privileged: jax.Array, step: jax.Array) -> jax.Array:
             return jnp.concatenate([privileged, 1.0 - step[:, None] / self.max_episode_steps], axis=1)
 

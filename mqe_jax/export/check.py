@@ -31,10 +31,10 @@ Arrays = dict[str, np.ndarray]
 def checked_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above `LARGEST_ERROR`."""
     model = to_onnx(policy, env)
-    return model, _largest(errors(model, *record(policy, env, STEPS)), f"{STEPS} steps of {env.name}")
+    return model, _largest(errors(model, *record_actions(policy, env, STEPS)), f"{STEPS} steps of {env.name}")
 
 
-def checked(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays) -> onnx.ModelProto:
+def verify(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays) -> onnx.ModelProto:
     """Returns the graph of a function after comparing both for inputs with leading axis N; errors as `checked_onnx`."""
     model = translate(function, shapes, name)
     expected = jax.device_get(jax.jit(jax.vmap(function))(inputs))
@@ -53,7 +53,7 @@ def _largest(errors: Mapping[str, float], where: str) -> float:
     return error
 
 
-def record(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
+def record_actions(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
     """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and idle opponents."""
     shapes = input_shapes(policy, env)
 

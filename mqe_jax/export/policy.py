@@ -28,7 +28,7 @@ import onnx
 import mqe_jax
 from mqe_jax import skills
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import check_arguments
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
@@ -40,7 +40,7 @@ SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JO
 """Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
 
 
-@checked(policy=TrainedPolicy, env=QuadrupedEnv)
+@check_arguments(policy=TrainedPolicy, env=QuadrupedEnv)
 def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of a policy with its mean actions; its task defines control mode, robot and walk policy.
 
@@ -59,15 +59,15 @@ def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[in
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
         skill, _ = skill_of(env)
-        robots |= SENSED | {name: x.shape for name, x in named(skill.name, skill.init_memory()).items()}
+        robots |= SENSED | {name: x.shape for name, x in name_arrays(skill.name, skill.init_memory()).items()}
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
-    return shapes | {name: x.shape for name, x in named("memory", policy.initial_memory()).items()}
+    return shapes | {name: x.shape for name, x in name_arrays("memory", policy.initial_memory()).items()}
 
 
 def policy_step(policy: TrainedPolicy, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Returns the outputs of one step of one environment by name, the function that the graph maps over N."""
-    action, memory = policy.act(inputs["obs"], filled("memory", policy.initial_memory(), inputs))
-    outputs = {"action": action} | named("next_memory", memory)
+    action, memory = policy.act(inputs["obs"], fill_arrays("memory", policy.initial_memory(), inputs))
+    outputs = {"action": action} | name_arrays("next_memory", memory)
     if env.control == "torque":
         return outputs | {"torque": action * env.robot.torque_limit}
     if env.control == "position":
@@ -76,8 +76,8 @@ def policy_step(policy: TrainedPolicy, env: QuadrupedEnv, inputs: Mapping[str, j
     commands = env.controller.skill_commands(action)
     sensed = Proprioception(*(inputs[name] for name in SENSED))
     act = jax.vmap(functools.partial(skill.targets, params))
-    target, memory = act(filled(skill.name, skill.init_memory(), inputs), commands, sensed)
-    return outputs | {"commands": commands, "joint_target": target} | named(f"next_{skill.name}", memory)
+    target, memory = act(fill_arrays(skill.name, skill.init_memory(), inputs), commands, sensed)
+    return outputs | {"commands": commands, "joint_target": target} | name_arrays(f"next_{skill.name}", memory)
 
 
 def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
@@ -86,15 +86,15 @@ def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
     return skill, skill.load_params(env.params.skill_weights)
 
 
-def named(prefix: str, memory: Any) -> dict[str, Any]:
+def name_arrays(prefix: str, memory: Any) -> dict[str, Any]:
     """Returns the arrays of a recurrent state by name."""
     leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
     return {"_".join([prefix, *(jax.tree_util.keystr((k,), simple=True) for k in path)]): x for path, x in leaves}
 
 
-def filled(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
+def fill_arrays(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
     """Returns a recurrent state of the structure of `memory` with the arrays of the inputs."""
-    return jax.tree.unflatten(jax.tree.structure(memory), [inputs[name] for name in named(prefix, memory)])
+    return jax.tree.unflatten(jax.tree.structure(memory), [inputs[name] for name in name_arrays(prefix, memory)])
 
 
 def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:

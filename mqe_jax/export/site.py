@@ -24,7 +24,7 @@ from mqe_jax.core.files import write_atomically
 from mqe_jax.core.settings import fail, override
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, make
 from mqe_jax.envs.randomization import Randomization
-from mqe_jax.export.check import checked
+from mqe_jax.export.check import verify
 from mqe_jax.export.libraries import add_libraries
 from mqe_jax.export.policy import shapes
 from mqe_jax.export.scene import scene_settings, scene_xml
@@ -67,7 +67,7 @@ class Entry:
             rows.append({"name": name, "file": f"policy-{len(rows)}.onnx", **shapes(graph)})
         for name, graph in files.items():
             write_atomically(own / name, graph.SerializeToString())
-        values, layout = packed(starts)
+        values, layout = pack(starts)
         write_atomically(own / "starts.bin", values.tobytes())
         write_atomically(own / "scene.xml", scene_xml(env).encode())
         settings = {
@@ -146,7 +146,7 @@ def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
     known = [command.name for command in AgileSkill.commands]
     if plain.skill not in ("walk", "agile") or plain.skill_weights or not {*plain.commands} <= {*known}:
         return params
-    ranges = dict(zip(known, AgileSkill(robots.get(plain.robot)).trained(known).tolist(), strict=True))
+    ranges = dict(zip(known, AgileSkill(robots.get(plain.robot)).trained_ranges(known).tolist(), strict=True))
     each = [plain.actions("command"), *({"skill": name, "command_ranges": ranges} for name in ("walk", "agile"))]
     return {**params, **together(each)}
 
@@ -176,7 +176,7 @@ def start_states(env: QuadrupedEnv) -> dict[str, np.ndarray]:
     return {name: np.asarray(x, np.float32) for name, x in states.items()}
 
 
-def packed(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
+def pack(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
     """Returns the columns of states that vary (N, K), and what restores them.
 
     `fields` are name and size of each array in a row, `constant` is the first row, `varying` the columns' positions.
@@ -211,4 +211,4 @@ def _graph(
         return known[key][:, : shape[0]] if shape else known[key]  # of `obs` the rows of one team
 
     given = {key: values(key, shape) for key, shape in inputs.items()}
-    return checked(function, inputs, name.replace("-", "_"), given)
+    return verify(function, inputs, name.replace("-", "_"), given)

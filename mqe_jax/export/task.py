@@ -30,7 +30,7 @@ import jax.numpy as jnp
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.export.policy import SENSED, filled, named, skill_of
+from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, skill_of
 from mqe_jax.export.translate import Function
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.train.policy import Policy
@@ -61,7 +61,7 @@ class TaskFunctions:
         self.env = env
         self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
         robots = env.read(self._start.data)
-        self.outcomes: list[str] = list(env.result(self._start, robots, jnp.zeros((), bool)).named())
+        self.outcomes: list[str] = list(env.result(self._start, robots, jnp.zeros((), bool)).by_name())
         self._noise = _noise_size(lambda: env.step_npcs(self._start.data, robots, self._start.key))
 
     @property
@@ -112,12 +112,12 @@ class TaskFunctions:
         obs = env.observation_layout.pack(env.observe(state, robots))
         outputs = {
             "obs": jnp.clip(jnp.nan_to_num(obs), -1e4, 1e4),
-            "outcome": jnp.stack([state.outcome.named()[name] for name in self.outcomes]),
+            "outcome": jnp.stack([state.outcome.by_name()[name] for name in self.outcomes]),
             "terminated": state.terminated,
             "truncated": state.truncated,
             "fell": state.outcome.ending["fall"],
             "collided": state.outcome.ending["collision"],
-            **named("next_task", state.task),
+            **name_arrays("next_task", state.task),
         }
         return {name: x.astype(jnp.float32) for name, x in outputs.items()}
 
@@ -125,7 +125,7 @@ class TaskFunctions:
         """Returns the environment's state with the arrays of the inputs."""
         start, task = self._start, self._start.task
         data = start.data.replace(**{name: inputs[name] for name in PHYSICS})
-        task = jax.tree.map(lambda x, like: x.astype(like.dtype), filled("task", task, inputs), task)
+        task = jax.tree.map(lambda x, like: x.astype(like.dtype), fill_arrays("task", task, inputs), task)
         anchors, step = inputs.get("anchors", start.anchors), inputs["step"].astype(jnp.int32)
         return dataclasses.replace(start, data=data, anchors=anchors, task=task, step=step)
 
@@ -137,21 +137,21 @@ class TaskFunctions:
 def state_arrays(state: State) -> dict[str, jax.Array]:
     """Returns the arrays of a state by name, float32; the inverse of `TaskFunctions.state`."""
     physics = {name: getattr(state.data, name) for name in PHYSICS}
-    arrays = {**physics, "anchors": state.anchors, "step": state.step, **named("task", state.task)}
+    arrays = {**physics, "anchors": state.anchors, "step": state.step, **name_arrays("task", state.task)}
     return {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items() if x.size}
 
 
 def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     """Returns the skill of a task's robots as a function of one robot, and the shapes of its inputs."""
     skill, params = skill_of(env)
-    memory = named(skill.name, skill.init_memory())
+    memory = name_arrays(skill.name, skill.init_memory())
     shapes = {"command": (len(skill.commands),), **SENSED, **{name: x.shape for name, x in memory.items()}}
 
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         sensed = Proprioception(*(inputs[name] for name in SENSED))
-        state = filled(skill.name, skill.init_memory(), inputs)
+        state = fill_arrays(skill.name, skill.init_memory(), inputs)
         target, state = skill.targets(params, state, inputs["command"], sensed)
-        return {"joint_target": target} | named(f"next_{skill.name}", state)
+        return {"joint_target": target} | name_arrays(f"next_{skill.name}", state)
 
     return act, shapes
 
@@ -160,12 +160,12 @@ def policy_function(policy: Policy, observation_size: int) -> tuple[Function, Sh
     """Returns a policy as a function of one team, and the shapes of its inputs; it samples where `policy` does."""
     memory = jax.tree.map(lambda x: x[0], policy.initial_memory(1))
     key = jax.random.PRNGKey(0)
-    shapes = {"obs": (policy.agents, observation_size)} | {n: x.shape for n, x in named("memory", memory).items()}
+    shapes = {"obs": (policy.agents, observation_size)} | {n: x.shape for n, x in name_arrays("memory", memory).items()}
 
     def act(inputs: Arrays) -> dict[str, jax.Array]:
-        state = jax.tree.map(lambda x: x[None], filled("memory", memory, inputs))
+        state = jax.tree.map(lambda x: x[None], fill_arrays("memory", memory, inputs))
         action, state = policy.act(inputs["obs"][None], state, key)
-        return {"action": action[0]} | {name: x[0] for name, x in named("next_memory", state).items()}
+        return {"action": action[0]} | {name: x[0] for name, x in name_arrays("next_memory", state).items()}
 
     def act_with_noise(inputs: Arrays) -> dict[str, jax.Array]:
         with normal_numbers(inputs["noise"]):

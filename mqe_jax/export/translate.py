@@ -41,7 +41,7 @@ REPLACED: dict[str, Callable[..., jax.Array]] = {
 def translate(
     function: Function, inputs: Mapping[str, Sequence[int]], name: str, properties: Mapping[str, str] | None = None
 ) -> onnx.ModelProto:
-    """Returns the graph of a function of float32 arrays, mapped over a leading axis N.
+    """Returns the graph of a function of float32 arrays, evaluate_batch over a leading axis N.
 
     Arrays that the function closes over become constants; `inputs` are the shapes of its inputs by name, without N, and
     `properties` the metadata of the model. InputError for an operation that jax2onnx cannot translate.
@@ -53,7 +53,7 @@ def translate(
     with jax.disable_jit():  # also unrolls scans, in which jax2onnx loses N
         closed, outputs = copied(specs)
 
-    def mapped(*values: jax.Array) -> tuple[jax.Array, ...]:
+    def evaluate_batch(*values: jax.Array) -> tuple[jax.Array, ...]:
         leaves = jax.tree.leaves(dict(zip(specs, values, strict=True)))
         return tuple(jax.vmap(lambda *x: _evaluate(closed.jaxpr, closed.consts, x))(*leaves))
 
@@ -61,7 +61,7 @@ def translate(
     names = {"input_names": list(specs), "output_names": sorted(outputs)}
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     try:
-        model = jax2onnx.to_onnx(mapped, arguments, model_name=name, opset=OPSET, **names)
+        model = jax2onnx.to_onnx(evaluate_batch, arguments, model_name=name, opset=OPSET, **names)
     except Exception as error:  # jax2onnx has no exception of its own
         raise InputError(f"onnx: jax2onnx cannot translate {name} ({one_line(error)})") from error
     _halve(model.graph)

@@ -15,7 +15,7 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import linear_layers, read_tensors
 from mqe_jax.physics.engines import Engine
-from mqe_jax.physics.robots.index import RobotIndex, placed
+from mqe_jax.physics.robots.index import RobotIndex, scatter
 from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class NetworkActuators:
             velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
             limit = self.robot.torque_limit
             torque = jnp.clip(actuator_torque(self.params, errors, velocities), -limit, limit)
-            ctrl = placed(np.zeros(self.physics.model.nu), self.index.actuator, torque)
+            ctrl = scatter(np.zeros(self.physics.model.nu), self.index.actuator, torque)
             data, overflow = self.physics.step(data, ctrl, fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
             return (data, (errors[:2], velocities[:2])), overflow
 

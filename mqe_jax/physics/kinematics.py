@@ -35,14 +35,14 @@ def poses(model: mujoco.MjModel, data: mjx.Data, bodies: Sequence[int] | np.ndar
 
     def place(body: int) -> tuple[Any, Any]:
         if body not in found:
-            found[body] = _placed(model, data, body, *place(int(model.body_parentid[body])))
+            found[body] = _place(model, data, body, *place(int(model.body_parentid[body])))
         return found[body]
 
     positions, quaternions = zip(*(place(int(body)) for body in bodies), strict=True)
     return Poses(jnp.stack(positions), jnp.stack(quaternions))
 
 
-def _placed(model: mujoco.MjModel, data: mjx.Data, body: int, position: Any, quaternion: Any) -> tuple[Any, Any]:
+def _place(model: mujoco.MjModel, data: mjx.Data, body: int, position: Any, quaternion: Any) -> tuple[Any, Any]:
     """Returns the pose of a body in the pose of its parent."""
     if (number := int(model.body_mocapid[body])) >= 0:
         return data.mocap_pos[number], data.mocap_quat[number]

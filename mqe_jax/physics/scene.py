@@ -150,13 +150,13 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
 def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> None:
     """Adds an object, which may bring bodies, geoms, joints, sensors, tendons and equality constraints."""
 
-    def fixed() -> dict[str, float]:
+    def counts() -> dict[str, float]:
         mocap = sum(body.mocap for body in spec.bodies)
         return {"actuators": len(spec.actuators), "mocap bodies": mocap, "timestep": spec.option.timestep}
 
-    what, before = f"objects: {name}: {type(item).__name__}.add()", fixed()
+    what, before = f"objects: {name}: {type(item).__name__}.add()", counts()
     item.add(spec, f"object/{name}", visual)
-    for key, value in fixed().items():
+    for key, value in counts().items():
         if value != before[key]:
             raise InputError(f"{what} changes the scene's {key} from {before[key]:g} to {value:g}; it must not")
     if spec.body(f"object/{name}") is None:

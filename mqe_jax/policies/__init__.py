@@ -17,7 +17,7 @@ from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, check, checked, fail
+from mqe_jax.core.settings import PathText, check, check_arguments, fail
 from mqe_jax.core.types import AnyEnvironment, Memory, Observations, PolicyOrAct, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS, TASKS
@@ -48,7 +48,7 @@ class SimplePolicy:
     name: str = ""
     """The name by which `load_policy` knows it; empty for another one."""
 
-    @checked(num_envs=PositiveInt | None)
+    @check_arguments(num_envs=PositiveInt | None)
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns an empty recurrent state."""
         return ()
@@ -105,7 +105,7 @@ class BothTeams:
 def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> TrainedPolicy: ...
 @overload
 def load_policy(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy: ...
-@checked(source=PathText, env=AnyEnvironment | None, deterministic=bool)
+@check_arguments(source=PathText, env=AnyEnvironment | None, deterministic=bool)
 def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False) -> Policy:
     """Returns the policy of a name, a run folder or a policy file.
 
@@ -218,7 +218,7 @@ def _constant(shape: tuple[int, ...], first: float, obs: jax.Array, key: jax.Arr
     return jnp.zeros((len(obs), *shape)).at[..., 0].set(first)
 
 
-def _planned(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) -> jax.Array:
+def _act_scripted(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) -> jax.Array:
     part = env.controller.skill.parts[0]
     own = Commander(part, env.params.commands, part.default_commands(), {})
     return env.controller.translated(jax.vmap(scripted_policy(env, name))(obs), own)
@@ -233,4 +233,4 @@ def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], 
         )
     if tuple(env.params.commands) != TaskParams.commands:
         raise InputError(f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}")
-    return functools.partial(_planned, env, name)
+    return functools.partial(_act_scripted, env, name)

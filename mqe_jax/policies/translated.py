@@ -62,7 +62,7 @@ def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
         params = dataclasses.replace(env.params, skill=needs.skill, gait=gait, command_ranges=needs.command_ranges)
         own, here = params.commander, env.params.commander
         if here.admits(own):
-            if beyond := own.skill.untrained(params.commanded()):
+            if beyond := own.skill.untrained_commands(params.action_ranges()):
                 raise InputError(f"policy: {name} commands beyond what its skill is trained for: {', '.join(beyond)}")
             view = copy.copy(env)  # as the policy was trained
             view.params, view.controller = params, dataclasses.replace(env.controller, commands=own.commands)

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jax
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import Seeds
+from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import Parameters, PathText, check, checked, differences, fail, joined, override
+from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, differences, fail, merge, override
 from mqe_jax.core.types import Cast
 from mqe_jax.core.types import VectorEnv as AnyVectorEnv
 from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
@@ -34,7 +34,7 @@ from mqe_jax.train.policy import POLICY_FILE, Policy, TrainedPolicy, groups_of
 from mqe_jax.train.stages import Stages
 from mqe_jax.train.start import initial_key, policy_to_start
 
-Task = str | QuadrupedEnv | AnyVectorEnv
+TaskLike = str | QuadrupedEnv | AnyVectorEnv
 """A task's id, its environment, or a batch of environments."""
 Config = str | Path | TrainConfig | Mapping[str, Any] | None
 """Settings of a training: a shipped name, a file, settings, or changes of the task's default ones."""
@@ -42,9 +42,9 @@ Player = str | Path | Policy | Act | None
 """A policy, its function `act` without recurrent state, or what `load_policy` accepts."""
 
 
-@checked(env=Mapping[str, Any] | None, impl=str)
+@check_arguments(env=Mapping[str, Any] | None, impl=str)
 def prepare(
-    task: Task,
+    task: TaskLike,
     config: Config = None,
     env: Mapping[str, Any] | None = None,
     *,
@@ -76,9 +76,9 @@ def prepare(
     return configs, Cast(task)
 
 
-@checked(seeds=Seeds)
+@check_arguments(seeds=SeedCount)
 def make_learner(
-    task: Task,
+    task: TaskLike,
     config: Config = None,
     *,
     env: Mapping[str, Any] | None = None,
@@ -250,7 +250,7 @@ class Players(NamedTuple):
     """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
 
 
-@checked(env=Mapping[str, Any] | None, impl=str, deterministic=bool)
+@check_arguments(env=Mapping[str, Any] | None, impl=str, deterministic=bool)
 def players(
     task: str | Path | QuadrupedEnv,
     policy: Player = None,
@@ -269,19 +269,19 @@ def players(
     """
     made, name, params = task, "", dict(env or {})
     if isinstance(made, QuadrupedEnv):
-        name, params = made.name, joined(parameters_of(made), params)
+        name, params = made.name, merge(parameters_of(made), params)
     else:
         given = str(check("task", made, PathText))
         made = name = ALIASES.get(given, given)
         if name not in (*TASKS, *zoo.names()) and (os.sep in name or Path(name).exists()):
             config = run_config(name)
-            made, params, policy = config.task or "", joined(config.env, params), policy or name
+            made, params, policy = config.task or "", merge(config.env, params), policy or name
     shipped = name in zoo.names() and not params and policy is None
     walking = "scripted" if name in PLANNERS else "forward"
     default = walking if params.get("control", "command") == "command" else "random"
     chosen = (name if shipped else default) if policy is None else policy
     if isinstance(made, str):
-        params = joined(joined(params, parameters_for(made, chosen, opponent)), env or {})
+        params = merge(merge(params, parameters_for(made, chosen, opponent)), env or {})
     task_env, batch = make_env(made, impl, params, num_envs)
     own = load_as("policy", chosen, task_env, deterministic=deterministic)
     match = len(task_env.teams) > 1
@@ -324,4 +324,4 @@ def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, An
     name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
     if config.task not in (None, name):
         echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
-    return override(config, {"task": name, "env": joined(parameters_of(task), env or {})})
+    return override(config, {"task": name, "env": merge(parameters_of(task), env or {})})

@@ -14,11 +14,11 @@ from annotated_types import MaxLen, MinLen
 
 from mqe_jax.core import interrupts, limits
 from mqe_jax.core.files import check_folder
-from mqe_jax.core.limits import Seed, Seeds
+from mqe_jax.core.limits import Seed, SeedCount
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, check, checked, fail
+from mqe_jax.core.settings import PathText, check, check_arguments, fail
 from mqe_jax.core.types import Cast
-from mqe_jax.runs.build import Config, Task, prepare
+from mqe_jax.runs.build import Config, TaskLike, prepare
 from mqe_jax.runs.divergence import guard
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_run, write_config
@@ -99,7 +99,7 @@ class Run:
             write_evaluations(path, {"evaluations": self.evaluations, "absolute": self.absolute, **ended})
 
 
-@checked(folder=PathText)
+@check_arguments(folder=PathText)
 def load_run(folder: str | Path) -> Run:
     """Returns the run in a folder that a training or `Run.save` wrote.
 
@@ -118,9 +118,9 @@ def load_run(folder: str | Path) -> Run:
     return Run(policy, metrics, evaluations["evaluations"], evaluations["absolute"])
 
 
-@checked(seed=Seed | None, run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
+@check_arguments(seed=Seed | None, run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
 def learn(
-    task: Task,
+    task: TaskLike,
     config: Config = None,
     *,
     env: Mapping[str, Any] | None = None,
@@ -162,9 +162,9 @@ def learn(
     return _train(configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged, stages)[0]
 
 
-@checked(seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
+@check_arguments(seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
 def learn_seeds(
-    task: Task,
+    task: TaskLike,
     config: Config = None,
     *,
     env: Mapping[str, Any] | None = None,
@@ -188,13 +188,13 @@ def learn_seeds(
         seeds: random seeds.
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
-    numbers = check("seeds", seeds, Annotated[tuple[Seed, ...], MinLen(1), MaxLen(int(limits.bounds(Seeds)[1]))])
+    numbers = check("seeds", seeds, Annotated[tuple[Seed, ...], MinLen(1), MaxLen(int(limits.bounds(SeedCount)[1]))])
     configs, cast = prepare(task, config, env, impl=impl, seeds=numbers)
     folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
     return _train(configs, cast, folders, resume, dump_diverged, stages)
 
 
-@checked(resume=bool, dump_diverged=PathText | None)
+@check_arguments(resume=bool, dump_diverged=PathText | None)
 def _train(
     configs: Sequence[TrainConfig],
     cast: Cast,
@@ -216,7 +216,7 @@ def _train(
         try:
             training.run()
         except KeyboardInterrupt:
-            if not interrupts.installed():
+            if not interrupts.is_installed():
                 echo(f"mqe: interrupted after {training.env_steps:,} environment steps")
         written = [folder for folder in folders if folder is not None]
         if written and jax.process_index() == 0:  # one process writes the files

@@ -15,7 +15,7 @@ import jax
 from annotated_types import MinLen
 
 from mqe_jax.core.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
-from mqe_jax.core.settings import PathText, check, checked, fail, joined
+from mqe_jax.core.settings import PathText, check, check_arguments, fail, merge
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.registry import task_id
@@ -28,10 +28,10 @@ from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.league.tournament import Standings
 from mqe_jax.train.evaluate import Result, evaluate_batch
 
-View = Literal["follow", "near", "scene", "side"]
+Camera = Literal["follow", "near", "scene", "side"]
 
 
-@checked(episodes=Episodes, sides=Literal["both", "first"], num_envs=Environments, seed=Seed)
+@check_arguments(episodes=Episodes, sides=Literal["both", "first"], num_envs=Environments, seed=Seed)
 def evaluate(
     task: str | Path | QuadrupedEnv,
     policy: Player = None,
@@ -88,7 +88,7 @@ def evaluate(
     return dataclasses.replace(result, about={**about, "seed": seed})
 
 
-@checked(policies=Annotated[Sequence[str], MinLen(1)], episodes=Candidates, deterministic=bool, seed=Seed)
+@check_arguments(policies=Annotated[Sequence[str], MinLen(1)], episodes=Candidates, deterministic=bool, seed=Seed)
 def tournament(
     task: str | QuadrupedEnv,
     policies: Sequence[str],
@@ -118,7 +118,7 @@ def tournament(
     """
     task = task_id(task) if isinstance(task, str) else task
     needed = parameters_for(task, *policies) if isinstance(task, str) else parameters_of(task)
-    params = joined(needed, env or {})
+    params = merge(needed, env or {})
     match, _ = build.make_env(task, impl, params, 1)
     if len(match.teams) < 2:
         fail("task", match.name, "a match: it has one team")
@@ -130,11 +130,11 @@ def tournament(
     return league.Standings(match.name, names, results, league.rate(results, names.index(fixed[0])))
 
 
-@checked(
+@check_arguments(
     episodes=Candidates,
     seconds=ClipLength,
     seed=Seed,
-    view=View | None,
+    view=Camera | None,
     width=ImageWidth | None,
     fps=FrameRate | None,
     speed=Speed,
@@ -176,13 +176,13 @@ def render(
     Raises:
         InputError: as `evaluate`.
     """
-    from mqe_jax.viz.recording import record
+    from mqe_jax.viz.recording import record_episodes
     from mqe_jax.viz.render import gl_backend
 
     threading.Thread(target=gl_backend, daemon=True).start()  # while the episode is computed
     playing = build.players(task, policy, opponent, env=env, impl=impl, num_envs=episodes, deterministic=deterministic)
     key = jax.random.PRNGKey(seed)
-    recorded = record(playing.env, playing.policy, key, episodes=episodes, seconds=seconds)
+    recorded = record_episodes(playing.env, playing.policy, key, episodes=episodes, seconds=seconds)
     size = None if width is None else (width, round(width * 9 / 32) * 2)
     look = {"view": view, "size": size, "fps": fps, "speed": speed}
     return Clip(playing.env, recorded, {**playing.about, "seed": seed}, look)
@@ -222,7 +222,7 @@ class Clip:
         episode = self.episodes[self.best]
         return f"<Clip of {self.env.name}: {(len(episode) - 1) * episode.dt:.1f} s, success {episode.success:g}>"
 
-    @checked(file=PathText)
+    @check_arguments(file=PathText)
     def save(self, file: str | Path, *, at: float | None = None) -> str:
         """Writes a .mp4, .webp, .gif or .png file; returns the renderer (`egl`, `osmesa` or `matplotlib`).
 

@@ -12,7 +12,7 @@ from typing import Any
 from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.limits import Positive, Seed
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, checked
+from mqe_jax.core.settings import PathText, check_arguments
 from mqe_jax.envs.registry import task_id
 from mqe_jax.runs import build
 from mqe_jax.runs.presets import base_config
@@ -22,7 +22,7 @@ from mqe_jax.study.sweep import Job, load_sweep
 from mqe_jax.train.config import TrainConfig
 
 
-@checked(
+@check_arguments(
     file=PathText,
     folder=PathText,
     part=str | None,

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.limits import Environments, Horizon, Seed
-from mqe_jax.core.settings import checked, joined
+from mqe_jax.core.settings import check_arguments, merge
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.runs import build
 
@@ -58,7 +58,7 @@ def programs(
     )
 
 
-@checked(num_envs=Environments, steps=Horizon, repeats=Horizon, seed=Seed)
+@check_arguments(num_envs=Environments, steps=Horizon, repeats=Horizon, seed=Seed)
 def bench(
     task: str | QuadrupedEnv,
     *,
@@ -95,7 +95,7 @@ def bench(
     Raises:
         InputError: for a task or parameters that are not allowed.
     """
-    made, batch = build.make_env(task, impl, joined(build.parameters_of(task), env or {}), num_envs)
+    made, batch = build.make_env(task, impl, merge(build.parameters_of(task), env or {}), num_envs)
     whole, bare = programs(made, batch, steps, lambda state: jnp.sum(state.metrics["overflow"]))
     key = jax.random.PRNGKey(seed)
     state = jax.block_until_ready(jax.jit(batch.reset)(key))

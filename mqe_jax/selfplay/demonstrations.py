@@ -15,14 +15,14 @@ import jax.numpy as jnp
 
 from mqe_jax.core import devices
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import checked, fail
+from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.core.types import AnyPolicy, PyTree, observations, where_rows
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.autoreset import KEPT, SEEN
 from mqe_jax.physics.engines import STATE_FIELDS
 from mqe_jax.train.policy import Policy, groups_of
 
-EPISODES = 128
+NUM_ENVS = 128
 """Environments in which the demonstrator acts."""
 MOMENTS = 16
 """States recorded of each, evenly spaced over the time limit."""
@@ -42,7 +42,7 @@ class Demonstrated(VectorEnv):
     Such an episode has the time that was left to the demonstrator. The states are the same in all runs of a task.
     """
 
-    @checked(demonstrator=AnyPolicy)
+    @check_arguments(demonstrator=AnyPolicy)
     def __init__(
         self, env: QuadrupedEnv, num_envs: int, demonstrator: Policy, copies: int = 1, *, final: Sequence[str] = SEEN
     ) -> None:
@@ -54,7 +54,7 @@ class Demonstrated(VectorEnv):
         if self.max_episode_steps < MOMENTS:
             fail("episode_length", env.params.episode_length, f"at least {MOMENTS} steps with a demonstrator")
         self.demonstrator = demonstrator
-        self._guide = VectorEnv(self.env, EPISODES, final=()).with_groups(groups_of(demonstrator))
+        self._guide = VectorEnv(self.env, NUM_ENVS, final=()).with_groups(groups_of(demonstrator))
 
     @single
     def reset(self, key: jax.Array) -> DemonstratedState:
@@ -84,7 +84,7 @@ class Demonstrated(VectorEnv):
 
     def _record(self) -> PyTree:
         guide, policy = self._guide, self.demonstrator
-        first = policy.initial_memory(EPISODES)
+        first = policy.initial_memory(NUM_ENVS)
 
         def advance(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], None]:
             state, memory = carry

@@ -14,7 +14,7 @@ from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import NonNegativeInt, Number
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import (
     AnyBatch,
     AnyPolicy,
@@ -35,7 +35,7 @@ from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Opponent:
+class OpponentState:
     """The opponent of a block of B environments."""
 
     arrays: PyTree  # arrays of the opponent; empty where it cannot change
@@ -55,7 +55,7 @@ class TeamState(EnvironmentState):
 
     match: EnvironmentState  # state of the matches, leading axis N
     action: jax.Array  # actions of all agents in the last step (N, A, D)
-    opponents: tuple[Opponent, ...]  # the opponent of each block of environments
+    opponents: tuple[OpponentState, ...]  # the opponent of each block of environments
 
 
 class OneTeam(Outer):
@@ -68,7 +68,7 @@ class OneTeam(Outer):
         self.num_envs, self.num_agents = num_envs, len(matches.teams[0])
         self.teams = (tuple(range(self.num_agents)),)
 
-    def _stepped(self, state: TeamState, action: jax.Array) -> EnvironmentState:
+    def _step_matches(self, state: TeamState, action: jax.Array) -> EnvironmentState:
         """Advances the matches by a step with the actions of all agents (N, A, D)."""
         every = self.num_envs // self.inner.num_envs
         match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
@@ -92,7 +92,7 @@ class Versus(OneTeam):
     Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
     """
 
-    @checked(matches=AnyBatch, opponents=Sequence[AnyPolicy], draw_reward=Number)
+    @check_arguments(matches=AnyBatch, opponents=Sequence[AnyPolicy], draw_reward=Number)
     def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
         super().__init__(matches, matches.num_envs)
         self.draw_reward = draw_reward
@@ -114,7 +114,7 @@ class Versus(OneTeam):
             fail("opponents", len(self.opponents), f"a divisor of the environments of a process, {num_envs}")
 
     @single
-    @checked(key=RandomKey)
+    @check_arguments(key=RandomKey)
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments, against the opponents given at the start."""
         key, match_key = jax.random.split(key)
@@ -123,9 +123,9 @@ class Versus(OneTeam):
         for policy in self.opponents:
             arrays = _arrays(policy)
             waiting, memory = jnp.zeros((self._size,), bool), policy.initial_memory(self._size)
-            opponents.append(Opponent(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
+            opponents.append(OpponentState(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
         action = jnp.zeros((self.num_envs, self.inner.num_agents, self.action_size))
-        return self._seen(match, action, tuple(opponents), key)
+        return self._team_state(match, action, tuple(opponents), key)
 
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
@@ -142,14 +142,14 @@ class Versus(OneTeam):
             opponents.append(dataclasses.replace(opponent, memory=memory))
         theirs = jnp.stack(others, axis=1).reshape(self.num_envs, *others[0].shape[1:])
         both = jnp.concatenate([jnp.asarray(action, jnp.float32), theirs], axis=1)
-        match = self._stepped(state, both)
+        match = self._step_matches(state, both)
         done = match.terminated | match.truncated
         ended = done[:, None] & (match.outcome.result[:, 0] > 0)
         match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2].astype(jnp.float32))
-        started = tuple(self._restarted(i, opponent, done, ended) for i, opponent in enumerate(opponents))
-        return self._seen(match, both, started, key)
+        started = tuple(self._restart(i, opponent, done, ended) for i, opponent in enumerate(opponents))
+        return self._team_state(match, both, started, key)
 
-    @checked(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
+    @check_arguments(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
         """Returns the state with another opponent in a block, a trained policy of the same architecture.
 
@@ -175,7 +175,7 @@ class Versus(OneTeam):
     def _block(self, index: int) -> slice:
         return slice(index, None, len(self.opponents))
 
-    def _restarted(self, index: int, opponent: Opponent, done: jax.Array, ended: jax.Array) -> Opponent:
+    def _restart(self, index: int, opponent: OpponentState, done: jax.Array, ended: jax.Array) -> OpponentState:
         """Counts the outcomes `ended` (N, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
         done, ended = done[self._block(index)], ended[self._block(index)]
         first = self.opponents[index].initial_memory(self._size)
@@ -183,15 +183,15 @@ class Versus(OneTeam):
         outcomes = opponent.outcomes + jnp.sum(ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32)
         return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes)
 
-    def _seen(
-        self, match: EnvironmentState, action: jax.Array, opponents: tuple[Opponent, ...], key: jax.Array
+    def _team_state(
+        self, match: EnvironmentState, action: jax.Array, opponents: tuple[OpponentState, ...], key: jax.Array
     ) -> TeamState:
         """Returns the state of team 0."""
         cut = lambda x: x[:, : self.num_agents]  # noqa: E731
         return self._state(match, cut, lambda x: x, action=action, opponents=opponents, key=key)
 
 
-@checked(env=AnyBatch, draw_reward=Number)
+@check_arguments(env=AnyBatch, draw_reward=Number)
 def versus(
     env: VectorEnv | Wrapper,
     opponents: Policy | str | Path | Sequence[Policy | str | Path],
@@ -226,16 +226,16 @@ class Mirror(OneTeam):
     def reset(self, key: jax.Array) -> TeamState:
         """Returns the initial states of all environments."""
         action = jnp.zeros((self.inner.num_envs, self.inner.num_agents, self.action_size))
-        return self._seen(self.inner.reset(key), action)
+        return self._team_state(self.inner.reset(key), action)
 
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
         """Advances all environments by one step with actions (2 N, T, D), else an InputError; resets."""
         self.check_step(state, action, TeamState)
         both = action.reshape(self.inner.num_envs, 2 * self.num_agents, self.action_size)
-        return self._seen(self._stepped(state, both), both)
+        return self._team_state(self._step_matches(state, both), both)
 
-    def _seen(self, match: EnvironmentState, action: jax.Array) -> TeamState:
+    def _team_state(self, match: EnvironmentState, action: jax.Array) -> TeamState:
         def teams(x: jax.Array) -> jax.Array:
             return x.reshape(self.num_envs, self.num_agents, *x.shape[2:])
 
@@ -253,7 +253,7 @@ class Mirror(OneTeam):
         return dataclasses.replace(state, metrics=state.metrics | once)
 
 
-def exchange(opponent: Opponent, arrays: PyTree, *, at_once: bool = False) -> Opponent:
+def exchange(opponent: OpponentState, arrays: PyTree, *, at_once: bool = False) -> OpponentState:
     """Returns the opponent of a block with other arrays; see `Versus.change`."""
     if at_once:
         return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=jnp.zeros_like(opponent.waiting))
@@ -268,7 +268,7 @@ def _arrays(policy: Policy) -> PyTree:
     return jax.tree.map(jnp.asarray, policy.arrays) if isinstance(policy, TrainedPolicy) else ()
 
 
-def _act(policy: Policy, opponent: Opponent, obs: Observations, key: jax.Array) -> tuple[jax.Array, Any]:
+def _act(policy: Policy, opponent: OpponentState, obs: Observations, key: jax.Array) -> tuple[jax.Array, Any]:
     """Returns the actions of a block's opponent (B, T, D) and its next recurrent state."""
     if not isinstance(policy, TrainedPolicy):
         return policy.act(obs.to(policy), opponent.memory, key)

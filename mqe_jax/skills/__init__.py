@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.core.settings import checked, fail
+from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
 
@@ -79,7 +79,7 @@ class Skill(abc.ABC):
             raise InputError(f"skill_weights: {str(path)!r} is not allowed; the skill {self.name!r} has no weights")
         return ()
 
-    def restricted(self, varied: Sequence[str], gait: str | None) -> Skill:
+    def restrict(self, varied: Sequence[str], gait: str | None) -> Skill:
         """Returns the skill for commands of which only the `varied` ones ever differ from the defaults of a gait."""
         return self
 
@@ -156,22 +156,22 @@ class Skill(abc.ABC):
             changes[i] = np.array([low, high], np.float32) - default[i]
         return changes
 
-    def trained(self, names: Sequence[str]) -> np.ndarray:
+    def trained_ranges(self, names: Sequence[str]) -> np.ndarray:
         """Returns the lowest and the highest value of the named commands for which the skill is trained (n, 2)."""
         default, commands = self.default_commands(), [self.commands[i] for i in self.index(names)]
         around = zip(commands, default[self.index(names)], strict=True)
         return np.array([x.trained or (at - x.limit, at + x.limit) for x, at in around], float).reshape(-1, 2)
 
-    def untrained(self, ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+    def untrained_commands(self, ranges: Mapping[str, tuple[float, float]]) -> list[str]:
         """Returns the commands whose range exceeds that for which the skill was trained, each with both ranges."""
-        trained = zip(ranges.items(), self.trained(list(ranges)), strict=True)
+        trained = zip(ranges.items(), self.trained_ranges(list(ranges)), strict=True)
         return [
             f"{name} [{low:g}, {high:g}] outside [{least:g}, {most:g}]"
             for (name, (low, high)), (least, most) in trained
             if low < least or high > most
         ]
 
-    def bounded(self, commands: jax.Array) -> jax.Array:
+    def limit_turn(self, commands: jax.Array) -> jax.Array:
         """Returns commands (..., C) with the yaw rate reduced to the bound `turn`."""
         if self.turn is None:
             return commands
@@ -218,7 +218,7 @@ def register(skill: type[S]) -> type[S]:
     return skill
 
 
-@checked(name=str | Sequence[str], robot=Robot)
+@check_arguments(name=str | Sequence[str], robot=Robot)
 def make(name: str | Sequence[str], robot: Robot) -> Skill:
     """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with the nearest one."""
     from mqe_jax.skills.choice import Choice

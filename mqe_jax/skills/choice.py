@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.physics.robots.index import Proprioception, placed
+from mqe_jax.physics.robots.index import Proprioception, scatter
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Command, Skill
 
@@ -73,7 +73,7 @@ class Choice(Skill):
     def with_choice(self, name: str, commands: jax.Array) -> jax.Array:
         default = self.default_commands(skill=self.select(name)[0])
         columns = self._columns[[part.name for part in self.parts].index(name)]
-        return jax.vmap(functools.partial(placed, default, columns))(commands)
+        return jax.vmap(functools.partial(scatter, default, columns))(commands)
 
     def init_memory(self) -> dict[str, Any]:
         own = {"acting": jnp.zeros(()), "wait": jnp.zeros(())}
@@ -89,7 +89,7 @@ class Choice(Skill):
         wait = jnp.where(acting != memory["acting"], HOLD - 1.0, jnp.maximum(memory["wait"] - 1.0, 0.0))
         targets, memories = [], {}
         for part, weights, columns, bounds in zip(self.parts, params, self._columns, self._bounds, strict=True):
-            own = part.bounded(jnp.clip(command[columns], *bounds))
+            own = part.limit_turn(jnp.clip(command[columns], *bounds))
             target, memories[part.name] = part.targets(weights, memory[part.name], own, proprioception)
             targets.append(target)
 
@@ -106,10 +106,10 @@ class Choice(Skill):
             raise InputError(f"skill_weights: {str(path)!r} is not allowed; of several skills the shipped weights act")
         return tuple(part.load_params() for part in self.parts)
 
-    def restricted(self, varied: Sequence[str], gait: str | None) -> Choice:
+    def restrict(self, varied: Sequence[str], gait: str | None) -> Choice:
         def of(part: Skill) -> Skill:
             known = {command.name for command in part.commands}
-            return part.restricted([name for name in varied if name in known], gait if gait in part.gaits else None)
+            return part.restrict([name for name in varied if name in known], gait if gait in part.gaits else None)
 
         return Choice(self.robot, [of(part) for part in self.parts])
 
@@ -118,11 +118,12 @@ class Choice(Skill):
         first = self.parts[0]
         return jnp.append(first.clock(memory[first.name]), memory["acting"])
 
-    def trained(self, names: Sequence[str]) -> np.ndarray:
+    def trained_ranges(self, names: Sequence[str]) -> np.ndarray:
         """Returns the lowest and the highest value of the named commands for which some skill is trained (n, 2)."""
         known = [[part for part in self.parts if name in [c.name for c in part.commands]] for name in names]
         each = [
-            np.concatenate([part.trained([name]) for part in parts]) for name, parts in zip(names, known, strict=True)
+            np.concatenate([part.trained_ranges([name]) for part in parts])
+            for name, parts in zip(names, known, strict=True)
         ]
         return np.array([(x[:, 0].min(), x[:, 1].max()) for x in each]).reshape(-1, 2)
 
@@ -135,4 +136,4 @@ def _bounds(part: Skill) -> np.ndarray:
     """Returns the lowest and the highest value (2, C) of commands that a skill is trained for; none without actions."""
     names = [command.name for command in part.commands]
     free = part.column("gain", names) == 0
-    return np.where(free, np.array([[-np.inf], [np.inf]]), part.trained(names).T).astype(np.float32)
+    return np.where(free, np.array([[-np.inf], [np.inf]]), part.trained_ranges(names).T).astype(np.float32)

@@ -24,7 +24,7 @@ from jax.core import Tracer
 
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.settings import fail
-from mqe_jax.physics.robots.index import Proprioception, placed
+from mqe_jax.physics.robots.index import Proprioception, scatter
 from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.skills import Skill
 
@@ -67,8 +67,8 @@ class Commander:
         """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in [-1, 1]."""
         change = self.change(action)
         default, columns = self.default_commands, self.skill.index(self.commands)
-        commands = jax.vmap(lambda change: placed(default, columns, default[columns] + change))(change)
-        return self.skill.bounded(commands)
+        commands = jax.vmap(lambda change: scatter(default, columns, default[columns] + change))(change)
+        return self.skill.limit_turn(commands)
 
     def action_of(self, change: jax.Array) -> jax.Array:
         """Computes the actions (..., action_size) that change the commands (..., action_size) from the defaults."""
@@ -148,7 +148,7 @@ class Controller(Commander):
             rest[: self.num_agents] = 0.0
         return rest
 
-    def checked(self, action: jax.Array) -> jax.Array:
+    def check_action(self, action: jax.Array) -> jax.Array:
         """Returns actions (A, action_size) as an array; InputError for others, or known ones that are not finite."""
         try:
             action = jnp.asarray(action)

@@ -64,7 +64,7 @@ class Networks:
             params[part][layer] = {"weight": weight, "bias": bias}
         return params
 
-    def nested(self, flat: Mapping[str, np.ndarray], source: str) -> Params:
+    def nest(self, flat: Mapping[str, np.ndarray], source: str) -> Params:
         """Returns flat weights as nested float32 arrays.
 
         Raises:
@@ -92,7 +92,7 @@ class Networks:
             )
         if not file.is_file():
             raise InputError(f"{self.title}: no file {file}; {train}")
-        return self.nested(read_tensors(file, self.title), str(file))
+        return self.nest(read_tensors(file, self.title), str(file))
 
     def save(
         self,

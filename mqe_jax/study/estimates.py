@@ -152,7 +152,7 @@ def score_matrices(cells: Cells, variant: str) -> dict[str, Array]:
         for a in algorithms
     }
     everything = np.concatenate(list(scores.values()))
-    return statistics.normalized(scores, everything.min(axis=0), everything.max(axis=0))
+    return statistics.normalize(scores, everything.min(axis=0), everything.max(axis=0))
 
 
 def aggregate_tables(cells: Cells) -> dict[str, Rows]:

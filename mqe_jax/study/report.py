@@ -64,11 +64,11 @@ def markdown(rows: Rows, names: Mapping[str, str] | None = None) -> str:
     """Returns rows as a Markdown table of the columns `names`, with these headings; an interval joins its value."""
     ends = [name for name in rows[0] if name in ("low", "high") or name.endswith(("_low", "_high"))]
     names = names or {name: name for name in rows[0] if name not in ends}
-    lines = [list(names.values()), ["---"] * len(names), *([_shown(row, name) for name in names] for row in rows)]
+    lines = [list(names.values()), ["---"] * len(names), *([_format_cell(row, name) for name in names] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _shown(row: Mapping[str, Any], name: str) -> str:
+def _format_cell(row: Mapping[str, Any], name: str) -> str:
     """Returns an entry of a table with its interval; success as percentages, nothing for NaN."""
     value = row[name]
     if isinstance(value, str):

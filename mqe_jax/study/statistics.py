@@ -58,7 +58,7 @@ def bootstrap_interval(
     return low, high
 
 
-def normalized(scores: Mapping[str, Array], low: Array, high: Array) -> dict[str, Array]:
+def normalize(scores: Mapping[str, Array], low: Array, high: Array) -> dict[str, Array]:
     """Returns scores of each algorithm, (runs, tasks), as fractions of the range low (tasks,) to high (tasks,)."""
     width = np.where(high > low, high - low, 1.0)
     return {name: (values - low) / width for name, values in scores.items()}

@@ -21,8 +21,8 @@ import yaml
 from annotated_types import MaxLen, MinLen
 
 from mqe_jax.core.errors import InputError, InUseError, NonFiniteError, nearest
-from mqe_jax.core.files import check_folder, locked, write_atomically
-from mqe_jax.core.limits import Seed, Seeds
+from mqe_jax.core.files import check_folder, lock, write_atomically
+from mqe_jax.core.limits import Seed, SeedCount
 from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.core.types import Cast
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
@@ -47,7 +47,7 @@ class Sweep:
     """Names of the algorithms, as `--algorithm` of `mqe train`; `default` has the settings of `mqe train` without."""
     seeds: Annotated[tuple[Seed, ...], MinLen(1), MaxLen(1000)] = (0, 1, 2, 3, 4)
     """Random seeds."""
-    seeds_together: Seeds | None = None
+    seeds_together: SeedCount | None = None
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
     """Settings file or shipped name, in which {task} stands for the task's id; none uses that of `mqe train`."""
@@ -129,8 +129,8 @@ def plan(
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
     jobs = []
     for cell in select(sweep, cells):
-        config = _overridden(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
-        config = _overridden(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
+        config = _override(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
+        config = _override(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
         named = {"start": config.start, "opponents": config.opponents}
         if "{task}" in str(named):
             config = override(config, _for_task(named, cell.task))
@@ -159,7 +159,7 @@ def _for_task(values: Any, task: str) -> Any:
     return values.replace("{task}", task) if isinstance(values, str) else values
 
 
-def _overridden(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
+def _override(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
     """Returns settings with those of the mapping `name` in a sweep file; its errors have this prefix."""
     for key in ("task", "seed"):
         if key in changes:
@@ -256,6 +256,6 @@ def _train(job: Job, environments: MakeEnvironments, stop: Callable[[], bool]) -
         return
     with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
         for run_dir in job.folders:
-            locks.enter_context(locked(run_dir))
+            locks.enter_context(lock(run_dir))
     cast = environments(job.configs[0], len(job.configs))
     train_seeds(configs=job.configs, run_dirs=job.folders, resume=True, stop=stop, **cast._asdict())

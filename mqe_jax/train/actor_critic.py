@@ -15,7 +15,7 @@ from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Memory, NetworkMemory, Params
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import ActorCritic, EnvDims, Evaluation, Network
+from mqe_jax.train.networks import ActorCritic, ChunkResult, EnvDims, Network
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu, "elu": jax.nn.elu, "tanh": jnp.tanh}
 
@@ -160,10 +160,10 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         privileged: jax.Array,
         action: jax.Array,
         active: jax.Array | None = None,
-    ) -> Evaluation:
+    ) -> ChunkResult:
         mean, log_std, _ = distribution(params, memory.actor, is_first, obs)
         values, _ = value(params, memory.critic, is_first, obs, privileged)
-        return Evaluation(log_prob(action, mean, log_std), entropy(log_std), values)
+        return ChunkResult(log_prob(action, mean, log_std), entropy(log_std), values)
 
     chunk_length = settings.chunk_length if settings.recurrent else 1
     return Network(init, policy_params, initial_memory, act, value, evaluate, chunk_length)

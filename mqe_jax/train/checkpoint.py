@@ -17,7 +17,7 @@ from safetensors.numpy import save
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, brief
 from mqe_jax.core.files import check_file, make_folder, parse_json, parsing, write_atomically
-from mqe_jax.core.settings import PathText, checked, fail
+from mqe_jax.core.settings import PathText, check_arguments, fail
 from mqe_jax.core.types import is_typed_key, raw_keys
 
 FORMAT = "mqe_jax.train"
@@ -67,7 +67,7 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
     return str(total)
 
 
-@checked(path=PathText, metadata=Mapping[str, Any], kind=Kind)
+@check_arguments(path=PathText, metadata=Mapping[str, Any], kind=Kind)
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
     """Writes a pytree of arrays with JSON metadata, whose same content gives the same bytes, as a file of a kind."""
     try:
@@ -112,13 +112,13 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     return arrays, metadata
 
 
-@checked(path=PathText, kind=Kind)
+@check_arguments(path=PathText, kind=Kind)
 def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
     """Returns the metadata of a file, after checking the file."""
     return _read(Path(path), kind)[1]
 
 
-@checked(path=PathText, kind=Kind, half=bool, part=str)
+@check_arguments(path=PathText, kind=Kind, half=bool, part=str)
 def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False, part: str = "") -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 

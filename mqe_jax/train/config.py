@@ -23,7 +23,7 @@ from mqe_jax.core.limits import (
     Seed,
     Steps,
 )
-from mqe_jax.core.settings import FileName, FrozenMapping, Parameters, fail, joined, load_yaml, override, record
+from mqe_jax.core.settings import FileName, FrozenMapping, Parameters, fail, load_yaml, merge, override, record
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
@@ -239,7 +239,7 @@ class TrainConfig:
     @property
     def training_env(self) -> dict[str, Any]:
         """Overrides of the task's parameters during training."""
-        return joined(self.env, self.train_env)
+        return merge(self.env, self.train_env)
 
     @property
     def steps_per_update(self) -> int:

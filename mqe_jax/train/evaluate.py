@@ -16,7 +16,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Episodes, Fraction, Horizon, PositiveInt
 from mqe_jax.core.literal import line, to_html
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, checked, fail
+from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import (
     RESULTS,
     AnyBatch,
@@ -51,7 +51,7 @@ class Rate(NamedTuple):
         return f"{100 * self.value:.1f}% ({100 * self.low:.1f} to {100 * self.high:.1f}%)"
 
     @classmethod
-    @checked(value=Fraction, episodes=PositiveInt)
+    @check_arguments(value=Fraction, episodes=PositiveInt)
     def of(cls, value: float, episodes: int) -> Rate:
         """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is conservative."""
         spread = _NORMAL**2 / episodes
@@ -146,8 +146,8 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
     if not hasattr(either, "act"):
         if any(np.shape(leaf)[:1] != (num_envs,) for leaf in jax.tree.leaves(memory)):
             fail("memory", memory, f"arrays with a leading axis of {num_envs}, the environments")
-        function = functools.partial(_given, either)
-        return functools.partial(_acted, function, (num_envs, env.num_agents, env.action_size)), memory
+        function = functools.partial(_call_with_obs, either)
+        return functools.partial(_act, function, (num_envs, env.num_agents, env.action_size)), memory
     if (trained := getattr(either, "task", "")) and trained != env.name:
         fail("policy", f"one of {trained}", f"one of {env.name}; its `act` may be given alone")
     if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
@@ -157,20 +157,20 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
         check_policy(either, env)
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
-    function = either.act if hasattr(either, "groups") else functools.partial(_given, either.act)
-    act = functools.partial(_acted, function, (num_envs, env.num_agents, env.action_size))
+    function = either.act if hasattr(either, "groups") else functools.partial(_call_with_obs, either.act)
+    act = functools.partial(_act, function, (num_envs, env.num_agents, env.action_size))
     return act, either.initial_memory(num_envs)
 
 
-def _acted(act: Act, shape: tuple[int, ...], obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+def _act(act: Act, shape: tuple[int, ...], obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
     return check_act("policy", act(obs, memory, key), shape, memory)
 
 
-def _given(function: Act, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+def _call_with_obs(function: Act, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
     return function(Observations.at(obs).obs, memory, key)
 
 
-@checked(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)
+@check_arguments(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)
 def evaluate_batch(
     env: VectorEnv,
     policy: Policy | Act,

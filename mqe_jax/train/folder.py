@@ -16,7 +16,7 @@ from pathlib import Path
 import yaml
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import check_folder, locked, write_atomically
+from mqe_jax.core.files import check_folder, lock, write_atomically
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.train.checkpoint import checkpoint_step, latest, list_checkpoints
 from mqe_jax.train.config import TrainConfig, load_config
@@ -38,7 +38,7 @@ def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
     with contextlib.ExitStack() as locks:
         check_folders(folders, resume)
         for folder in folders:
-            locks.enter_context(locked(folder))
+            locks.enter_context(lock(folder))
         for folder in folders:
             check_run(folder, resume)
         yield

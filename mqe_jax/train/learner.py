@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from mqe_jax.core import devices
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import checked, fail
+from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.core.types import (
     AnyBatch,
     Batch,
@@ -43,7 +43,7 @@ from mqe_jax.train.normalize import (
 )
 from mqe_jax.train.optim import AdamState, begun_anew
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, normalize_obs, rollout
-from mqe_jax.train.schedules import Scheduled, scheduled
+from mqe_jax.train.schedules import Scheduled, current_values
 from mqe_jax.train.stages import Metrics, Stages
 
 
@@ -70,7 +70,7 @@ class Learner(NamedTuple):
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
 
 
-@checked(env=AnyBatch, config=TrainConfig, processes=PositiveInt)
+@check_arguments(env=AnyBatch, config=TrainConfig, processes=PositiveInt)
 def make_learner(
     env: VectorEnv,
     config: TrainConfig,
@@ -95,7 +95,7 @@ def make_learner(
     algorithm = stages(network, config)
 
     @single
-    @checked(key=RandomKey)
+    @check_arguments(key=RandomKey)
     def init(key: jax.Array) -> TrainState:
         params_key, env_key, stagger_key, key = jax.random.split(key, 4)
         env_state = env.reset(env_key)
@@ -123,16 +123,16 @@ def make_learner(
         return state if league is None else league.seat(dataclasses.replace(state, extra=league.begin(state)))
 
     @single
-    @checked(state=TrainState)
+    @check_arguments(state=TrainState)
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
-        now = scheduled(config, state.updates)
+        now = current_values(config, state.updates)
         rollout_state, transitions, metrics = rollout(
             env,
             network,
             state.params,
             state.obs_normalizer,
-            _assisted(state.rollout, now.assistance) if config.curriculum.assistance else state.rollout,
+            _set_assistance(state.rollout, now.assistance) if config.curriculum.assistance else state.rollout,
             rollout_key,
             config.rollout_steps,
             normalize=config.normalization.observations,
@@ -175,7 +175,7 @@ def make_learner(
     return Learner(init, update)
 
 
-def _assisted(state: RolloutState, assistance: jax.Array) -> RolloutState:
+def _set_assistance(state: RolloutState, assistance: jax.Array) -> RolloutState:
     """Sets the assistance of every environment, which takes effect with its next episode."""
     env_state = replace_fields(state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance))
     return state._replace(env_state=env_state)
@@ -230,7 +230,7 @@ def _prepare(
     value_normalizer = state.value_normalizer
     value, next_value = value_denormalize(value_normalizer, pair)
     advantage, target = stages.advantages(now, transitions, value, next_value)
-    counted = stages.counted(active)
+    counted = stages.value_mask(active)
     if config.normalization.values:
         value_normalizer = value_update(value_normalizer, target, counted, config.normalization.value_decay)
     unexplained = devices.variance(target - value, counted) / jnp.maximum(devices.variance(target, counted), 1e-8)

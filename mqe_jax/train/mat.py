@@ -20,7 +20,7 @@ from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Memory, NetworkMemory, Params
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, Mat, Network
+from mqe_jax.train.networks import ChunkResult, EnvDims, Mat, Network
 
 
 def attention(
@@ -186,12 +186,12 @@ def network(settings: Mat, dims: EnvDims) -> Network:
         privileged: jax.Array,
         action: jax.Array,
         active: jax.Array | None = None,
-    ) -> Evaluation:
+    ) -> ChunkResult:
         features = encode(params["encoder"], obs, heads, active)
         mean = decode(params["decoder"], features, action, heads, active)
         log_std = jnp.broadcast_to(log_std_of(params, settings), mean.shape)
         values = _head(params["value_head"], features)[..., 0]
-        return Evaluation(log_prob(action, mean, log_std), entropy(log_std), values)
+        return ChunkResult(log_prob(action, mean, log_std), entropy(log_std), values)
 
     return Network(
         init=lambda key: init_params(key, dims, settings),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mqe_jax.core.limits import PositiveInt
-from mqe_jax.core.settings import FrozenMapping, Range, checked, fail, record
+from mqe_jax.core.settings import FrozenMapping, Range, check_arguments, fail, record
 from mqe_jax.core.types import AnyEnvironment, teams_of
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
@@ -51,7 +51,7 @@ class Needs:
         return {"task": self.task, "agents": self.dims.agents, **{x: getattr(self, x) for x in names}, **sizes}
 
 
-@checked(env=AnyEnvironment, config=TrainConfig)
+@check_arguments(env=AnyEnvironment, config=TrainConfig)
 def needs_of(env: Any, config: TrainConfig) -> Needs:
     """Returns the needs of a policy of one of an environment's teams, of a task or a batch of it.
 

@@ -43,7 +43,7 @@ class EnvDims(NamedTuple):
     """Number of values V: one per agent, or one of the team."""
 
 
-class Evaluation(NamedTuple):
+class ChunkResult(NamedTuple):
     """Log-probabilities, entropies and values of a chunk under the current parameters."""
 
     log_prob: jax.Array
@@ -67,7 +67,7 @@ class Network(NamedTuple):
     may act autoregressively within one call.
     `value(params, critic_memory, is_first (L, N), obs (L, N, A, O), privileged (L, N, P), active (L, N, A)) ->
     (value (L, N, V), critic_memory)`
-    `evaluate(params, memory, is_first (L, C), obs, privileged, action, active) -> Evaluation`, all agents in parallel
+    `evaluate(params, memory, is_first (L, C), obs, privileged, action, active) -> ChunkResult`, all agents in parallel
     `active` says which agents take part, None: all. The observations of the others are 0; a network in which agents see
     each other leaves them out.
     `chunk_length`: steps of truncated backpropagation through time; 1 for feed-forward networks
@@ -78,7 +78,7 @@ class Network(NamedTuple):
     initial_memory: Callable[[int], NetworkMemory]
     act: Callable[..., tuple[jax.Array, jax.Array, Memory]]
     value: Callable[..., tuple[jax.Array, Memory]]
-    evaluate: Callable[..., Evaluation]
+    evaluate: Callable[..., ChunkResult]
     chunk_length: int = 1
 
 
@@ -118,12 +118,12 @@ class GaussianSettings(NetworkSettings):
             fail("log_std_init", self.log_std_init, f"at least log_std_min ({self.log_std_min})")
 
     def bounded_log_std(self, parameter: jax.Array) -> jax.Array:
-        """Returns the parameter clipped to the bounds by `nn.bounded`."""
+        """Returns the parameter clipped to the bounds by `nn.clip_parameter`."""
         from mqe_jax.train import nn
 
         low = -math.inf if self.log_std_min is None else self.log_std_min
         high = math.inf if self.log_std_max is None else self.log_std_max
-        return nn.bounded(parameter, low, high)
+        return nn.clip_parameter(parameter, low, high)
 
 
 NETWORKS: dict[str, type[NetworkSettings]] = {}

@@ -113,7 +113,7 @@ def gru(params: Params, h: jax.Array, x: jax.Array) -> jax.Array:
 
 
 @jax.custom_vjp
-def bounded(x: jax.Array, low: float, high: float) -> jax.Array:
+def clip_parameter(x: jax.Array, low: float, high: float) -> jax.Array:
     """Clips a parameter to [low, high] with a custom gradient.
 
     Within the bounds the gradient is that of the identity. Outside, it is passed where a descent step reduces the
@@ -135,4 +135,4 @@ def _bounded_backward(
     return jnp.where(outwards, 0.0, gradient), zero, zero
 
 
-bounded.defvjp(_bounded_forward, _bounded_backward)
+clip_parameter.defvjp(_bounded_forward, _bounded_backward)

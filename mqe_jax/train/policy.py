@@ -16,7 +16,7 @@ from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.files import check_folder, check_locks
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, build, check, checked, fail, to_mapping
+from mqe_jax.core.settings import PathText, build, check, check_arguments, fail, to_mapping
 from mqe_jax.core.types import AnyEnvironment, AnyPolicy, Memory, Observations, Params, RandomKey, VectorEnv, teams_of
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
@@ -212,7 +212,7 @@ def check_obs(obs: Any, agents: int, size: int | None = None) -> jax.Array:
     return obs
 
 
-@checked(state=TrainState, env=AnyEnvironment, config=TrainConfig)
+@check_arguments(state=TrainState, env=AnyEnvironment, config=TrainConfig)
 def policy_of(state: TrainState, env: VectorEnv, config: TrainConfig, **metadata: Any) -> TrainedPolicy:
     """Returns the policy of a learner state, which learns in an environment."""
     needs = needs_of(env, config)
@@ -243,7 +243,7 @@ NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
 """Reads the policies that have names, the shipped ones, which `mqe_jax.policies.zoo` adds."""
 
 
-@checked(run_dir=PathText, policy=TrainedPolicy, name=PathText, half=bool)
+@check_arguments(run_dir=PathText, policy=TrainedPolicy, name=PathText, half=bool)
 def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False) -> Path:
     """Writes a policy into a folder, which it creates, atomically; with `half`, its parameters as float16.
 

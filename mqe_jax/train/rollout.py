@@ -99,7 +99,7 @@ def rollout(
         episode_steps = state.episode_steps + 1
         episode_return = state.episode_return + mean_of_team(after.reward, active)
         of_episodes = {"episode_length": episode_steps.astype(jnp.float32), "episode_return": episode_return}
-        ended = {**after.outcome.named(), **of_episodes}
+        ended = {**after.outcome.by_name(), **of_episodes}
         state = RolloutState(
             env_state=after,
             memory=NetworkMemory(actor_memory, critic_memory),

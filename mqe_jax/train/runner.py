@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core import interrupts
-from mqe_jax.core.devices import Processes, connected
+from mqe_jax.core.devices import Processes, translate_errors
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import PathText, check, fail, to_mapping
 from mqe_jax.core.types import AnyBatch, Matchmaker, PyTree, VectorEnv, generator, raw_keys
@@ -26,9 +26,9 @@ from mqe_jax.train.learner import Learner, TrainState
 from mqe_jax.train.logs import LOGGERS, CsvLog, MetricsLog, ProgressLog, check_loggers, row_of
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
-from mqe_jax.train.seeds import Seeds, without_shared
+from mqe_jax.train.seeds import SeedBatch, without_shared
 from mqe_jax.train.stages import Stages
-from mqe_jax.train.start import check_parameters, first_state, learned, own_learner, without_environments
+from mqe_jax.train.start import check_parameters, first_state, learned_state, own_learner, without_environments
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 _METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
@@ -106,7 +106,7 @@ def open_training(
     elif resume:
         fail("resume", True, "false without a run_dir")
     learner, processes = own_learner(env, configs[0], league, teacher, stages)
-    with connected(), open_folders(folders, resume) if processes.leads else contextlib.nullcontext():
+    with translate_errors(), open_folders(folders, resume) if processes.leads else contextlib.nullcontext():
         processes.gather([0])  # the others wait for these checks
         checkpoints = common_checkpoints(folders) or [None] * len(configs)
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
@@ -133,12 +133,12 @@ class Training:
     ) -> None:
         self._env, self._configs, self._folders, self._stages = env, configs, folders, stages
         self._config, self._processes, self._progress = configs[0], processes, progress
-        self._seeds = seeds = Seeds(learner.init, len(configs))
+        self._seeds = seeds = SeedBatch(learner.init, len(configs))
         first = [
             first_state(env, learner, processes, own, path, seeds.shared, league, progress.doing, stages)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
-        self._stacked = processes.stacked(seeds.shared)
+        self._stacked = processes.stack(seeds.shared)
         self._state = self._stacked.together(seeds.stack([state for state, _ in first]))
         self._update = self._stacked.compile(seeds.map(learner.update), more=True)
         self.env_steps = int(first[0][0].updates) * self._config.steps_per_update  # done by each seed
@@ -176,8 +176,8 @@ class Training:
                     with self._progress.doing("compiling"):
                         self._update.lower(self._state).compile()
                 self._progress.start(self.env_steps)
-                with interrupts.deferred() as signalled:
-                    while self.env_steps < total_steps and not self._stopped(stop, signalled):
+                with interrupts.defer() as signalled:
+                    while self.env_steps < total_steps and not self._should_stop(stop, signalled):
                         rows = self._step(files)
                         self._progress.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
                         if on_update is not None:
@@ -200,7 +200,7 @@ class Training:
         own = self._stacked.own(self._state)
         return [self._seeds.take(own, i) for i in range(len(self._configs))]
 
-    def _stopped(self, stop: Callable[[], bool], signalled: Callable[[], int]) -> bool:
+    def _should_stop(self, stop: Callable[[], bool], signalled: Callable[[], int]) -> bool:
         """Returns whether the run ends here, for all processes; after a signal to one of them, all save and end."""
         asked = self._processes.gather([int(stop()), signalled()])
         if number := int(asked[:, 1].max()):
@@ -213,7 +213,7 @@ class Training:
         """Performs and logs one update of every seed; returns the rows of metrics.csv."""
         began = time.perf_counter()
         after, metrics = self._update(self._state)
-        metrics, finite = jax.device_get((metrics, _all_finite(learned(after))))
+        metrics, finite = jax.device_get((metrics, _all_finite(learned_state(after))))
         updates, rows = self.env_steps // self._config.steps_per_update + 1, []
         for i in range(len(self._configs)):
             own = jax.tree.map(lambda x: x[i], metrics)  # noqa: B023
@@ -221,7 +221,7 @@ class Training:
             row["fps"] *= len(self._configs)
             if not finite or not all(math.isfinite(row[name]) for name in _METRICS):
                 folder = self._folders[i] if self._folders else None
-                _check_finite(learned(self._seeds.take(self._stacked.own(after), i)), row, folder)
+                _check_finite(learned_state(self._seeds.take(self._stacked.own(after), i)), row, folder)
             rows.append(row)
         for logs, done, row in zip(files, self.rows, rows, strict=True):
             for log in logs:

@@ -22,7 +22,7 @@ class Scheduled(NamedTuple):
     learning_rate_factor: jax.Array  # factor of `optimizer.schedule` on the learning rate
 
 
-def scheduled(config: TrainConfig, updates: jax.Array) -> Scheduled:
+def current_values(config: TrainConfig, updates: jax.Array) -> Scheduled:
     """Returns the values of the scheduled settings after a number of updates ()."""
     ppo, optimizer, curriculum = config.ppo, config.optimizer, config.curriculum
     progress, before = ((updates - i).astype(jnp.float32) / config.num_updates for i in (0, 1))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from mqe_jax.core.types import PyTree
 
 
-class Seeds:
+class SeedBatch:
     """S states of `init(key)`, with a leading axis S on all leaves but the shared ones."""
 
     def __init__(self, init: Callable[[jax.Array], PyTree], count: int) -> None:
@@ -29,7 +29,7 @@ class Seeds:
     def map(self, update: Callable[[PyTree], tuple[PyTree, PyTree]]) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
         """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled; metrics gain a leading axis S.
 
-        A single seed is computed without a batch axis, and thus bit for bit as outside of `Seeds`.
+        A single seed is computed without a batch axis, and thus bit for bit as outside of `SeedBatch`.
         """
 
         def alone(states: PyTree) -> tuple[PyTree, PyTree]:

@@ -31,7 +31,7 @@ class Stages:
         self.network, self.config = network, config
         self.optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
-    def counted(self, active: jax.Array) -> jax.Array:
+    def value_mask(self, active: jax.Array) -> jax.Array:
         """Returns which values (..., V) count, of agents of which some are active (..., A)."""
         return jnp.any(active, axis=-1, keepdims=True) if self.config.ppo.value == "joint" else active
 
@@ -44,7 +44,7 @@ class Stages:
         """
         config, active = self.config, transitions.active
         reward = jnp.where(active, transitions.reward, jnp.zeros_like(transitions.reward))
-        counted = self.counted(active)
+        counted = self.value_mask(active)
         if config.ppo.value == "joint":
             reward = mean_of_team(reward, active)[..., None]
         advantage, target = gae(
@@ -100,7 +100,7 @@ class Stages:
             own = jax.grad(self.loss, has_aux=True)(params, minibatch, now)
             gradient, metrics = devices.mean(own)
             if config.optimizer.target_kl is not None:
-                adapted = _adapted(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
+                adapted = _adapt(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
                 falls_only = (now.learning_rate_factor < 1.0) | (jnp.float32(now.actor_coef) < 1.0)
                 learning_rate = jnp.where(falls_only, jnp.minimum(adapted, learning_rate), adapted)
             params, optimizer_state, grad_norm = self.optimizer.update(
@@ -130,7 +130,7 @@ def _mean(x: jax.Array, active: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(count, 1.0)
 
 
-def _adapted(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
+def _adapt(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
     """Returns a smaller learning rate where the KL divergence exceeds the target, a larger one where it is below."""
     factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
     return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)

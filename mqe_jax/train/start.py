@@ -63,7 +63,7 @@ def first_state(
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
     stages: type[Stages] = Stages,
 ) -> tuple[TrainState, float]:
-    """Returns this process's initial or restored state and the seconds already spent; `shared` as in `Seeds`."""
+    """Returns this process's initial or restored state and the seconds already spent; `shared` as in `SeedBatch`."""
     start = processes.compile(learner.init, start=True)
 
     def init(key: jax.Array) -> TrainState:
@@ -135,10 +135,10 @@ def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> Trai
 
 def without_environments(state: TrainState) -> dict[str, Any]:
     """Returns the contents of a checkpoint without environment states."""
-    return {**learned(state), "key": state.key, "updates": state.updates}
+    return {**learned_state(state), "key": state.key, "updates": state.updates}
 
 
-def learned(state: TrainState) -> dict[str, Any]:
+def learned_state(state: TrainState) -> dict[str, Any]:
     """Returns the learned state: parameters, optimiser and statistics, without environment states."""
     omitted = ("rollout", "key", "updates")
     return {field.name: getattr(state, field.name) for field in dataclasses.fields(state) if field.name not in omitted}

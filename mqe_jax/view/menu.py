@@ -20,7 +20,7 @@ _LONGEST = 256  # of an option, characters; messages are no longer
 
 
 @dataclass(frozen=True)
-class Choice:
+class Entry:
     """A task with its policies, `DEFAULT` where none is named."""
 
     task: str  # id of the task
@@ -32,9 +32,9 @@ class Choice:
 class Menu:
     """The choices, and how one becomes a session."""
 
-    open: Callable[[Choice], Session]
+    open: Callable[[Entry], Session]
     """Creates the session of a choice; raises an InputError where that is not possible."""
-    shown: Choice  # the choice on the page
+    shown: Entry  # the choice on the page
     runs: dict[str, str] = field(default_factory=dict)  # task of each run folder
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 
 from mqe_jax.physics.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS
 from mqe_jax.view.markup import bars, observation_table, paragraph, table
-from mqe_jax.view.menu import DEFAULT, Choice, Menu
+from mqe_jax.view.menu import DEFAULT, Entry, Menu
 from mqe_jax.view.session import DRIVEN, Session
 from mqe_jax.viz.geometry import robot_bases, robot_color
 
@@ -54,7 +54,7 @@ class Panel:
         self._on_camera = on_camera
         self._robots = tuple(robots) or tuple(f"robot {i + 1}" for i in range(session.env.num_agents))
         self._wanted_steps, self._wants_reset = 0, False
-        self._wanted: Choice | None = None
+        self._wanted: Entry | None = None
         self.camera = ACTION if session.num_envs == 1 else FREE  # or the label of the followed body
         self.env, self.back = 0, 0  # the selected environment, and the steps by which the shown one lies back
         self.contacts = self.shapes = False  # what is shown of them
@@ -81,7 +81,7 @@ class Panel:
         wanted, self._wants_reset = self._wants_reset, False
         return wanted
 
-    def take_choice(self) -> Choice | None:
+    def take_choice(self) -> Entry | None:
         """Returns the choice made since the last call, or None."""
         wanted, self._wanted = self._wanted, None
         return wanted
@@ -153,7 +153,7 @@ class Panel:
 
         def choose(_: Any) -> None:
             rival = str(opponent.value) if menu.is_match(str(task.value)) else DEFAULT
-            self._wanted = Choice(str(task.value), str(policy.value), rival)
+            self._wanted = Entry(str(task.value), str(policy.value), rival)
 
         task.on_update(offer)
         load.on_click(choose)

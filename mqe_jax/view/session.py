@@ -23,7 +23,7 @@ HOLD_TIME = 0.35
 """Time after a button's last hold message at which it counts as released, s; the browser sends ten per second."""
 
 
-class Moment(NamedTuple):
+class Scene(NamedTuple):
     """What is drawn of a step."""
 
     frame: Episode  # poses, those of an environment in each frame
@@ -50,7 +50,7 @@ class Drive:
     def change(self, step: tuple[float, float, float]) -> None:
         """Adds fractions of the maximum command to the command; zeros stop the robot."""
         self._held.clear()
-        moved = self.command + self._scaled(step)
+        moved = self.command + self._scale(step)
         self.command = np.clip(moved, self.low, self.high) if any(step) else np.zeros(3)
 
     def hold(self, direction: tuple[float, float, float]) -> None:
@@ -60,10 +60,10 @@ class Drive:
     def now(self) -> np.ndarray:
         """Returns the current command (3,), within its limits."""
         held = [direction for direction, until in list(self._held.items()) if until > self.clock()]
-        total = self.command + np.sum([np.zeros(3), *map(self._scaled, held)], axis=0)
+        total = self.command + np.sum([np.zeros(3), *map(self._scale, held)], axis=0)
         return np.clip(total, self.low, self.high)
 
-    def _scaled(self, direction: tuple[float, ...]) -> np.ndarray:
+    def _scale(self, direction: tuple[float, ...]) -> np.ndarray:
         return np.abs(direction) * np.where(np.asarray(direction) < 0, self.low, self.high)
 
 
@@ -98,7 +98,7 @@ class Session:
         self.times: deque[float] = deque(maxlen=length)
         self.rewards: deque[np.ndarray] = deque(maxlen=length)  # (N, terms)
         self.commands: deque[np.ndarray] = deque(maxlen=length)  # (N, A, 3)
-        self.moments: deque[Moment] = deque(maxlen=length)
+        self.moments: deque[Scene] = deque(maxlen=length)
 
     def reset(self) -> None:
         """Resets all environments."""
@@ -123,14 +123,14 @@ class Session:
         self.commands.append(np.asarray(commands))
         self.moments.append(self.moment())
 
-    def moment(self, back: int = 0) -> Moment:
+    def moment(self, back: int = 0) -> Scene:
         """Returns the current step, or that of `back` steps ago, at most the oldest of the history."""
         if back and self.moments:
             return self.moments[self.at(back)]
         data = self.state.data
         poses = map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat))
         arrays = map(np.asarray, (data.qvel, data.ctrl, self.state.obs))
-        return Moment(Episode(*poses, dt=self.env.dt), *arrays)
+        return Scene(Episode(*poses, dt=self.env.dt), *arrays)
 
     def at(self, back: int) -> int:
         """Returns the index into the history of the step `back` steps ago, at most its oldest."""

@@ -52,7 +52,7 @@ class Stage:
         still = [self._add_batch(f"fixed/{body}", geoms, [body]) for body, geoms in fixed.items()]
         self._place(still, *self._poses(frame))
         self._batches = [
-            self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in self._grouped(moving)
+            self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in self._group(moving)
         ]
         self._wall_handles = [self._add_wall(geom) for geom in self._walls]
         self.draw(frame)
@@ -86,7 +86,7 @@ class Stage:
     def overview(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns camera position and look-at point (3,), m, for the whole scene."""
         size = np.hypot(self.size[0], self.size[1] * self._count)
-        return seen(self.centre * [1.0, 0.0, 0.0], 1.4 * float(size))
+        return chase(self.centre * [1.0, 0.0, 0.0], 1.4 * float(size))
 
     def release(self) -> None:
         self._root.position = (0.0, 0.0, 0.0)
@@ -119,7 +119,7 @@ class Stage:
             "/world/floor", color=colour, dimensions=(*side, 0.02), position=(*middle, -0.012), cast_shadow=False
         )
 
-    def _grouped(self, moving: dict[int, list[int]]) -> list[list[int]]:
+    def _group(self, moving: dict[int, list[int]]) -> list[list[int]]:
         """Returns the moving bodies, grouped by their geoms: bodies with the same ones share a mesh."""
         names = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
         fields = [np.round(getattr(self._model, f"geom_{name}"), 5) + 0.0 for name in names]
@@ -154,7 +154,7 @@ class Stage:
         )
 
 
-def seen(look_at: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+def chase(look_at: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
     """Returns camera position and look-at point (3,), m, at a distance from behind and above, m."""
     return look_at + distance * np.array([-0.62, -0.28, 0.73]), look_at
 

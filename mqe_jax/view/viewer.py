@@ -16,7 +16,7 @@ from mqe_jax.view.overlay import Overlay
 from mqe_jax.view.panel import ACTION, FREE, Panel, robot_labels
 from mqe_jax.view.server import open_server
 from mqe_jax.view.session import Session
-from mqe_jax.view.stage import Stage, seen, start_frame
+from mqe_jax.view.stage import Stage, chase, start_frame
 from mqe_jax.viz.recording import Episode
 
 DRAW_RATE = 25.0
@@ -83,7 +83,7 @@ class Viewer:
             due = drawn = shown = time.monotonic()
             counted = self.session.steps
             while True:
-                if self._exchanged():
+                if self._open_chosen():
                     due, counted = time.monotonic(), self.session.steps
                 dt = self.session.env.dt
                 now = time.monotonic()
@@ -106,7 +106,7 @@ class Viewer:
         finally:
             self.server.stop()
 
-    def _exchanged(self) -> bool:
+    def _open_chosen(self) -> bool:
         """Opens the session that was chosen on the page, if any; keeps the present one where that is not possible."""
         choice = self._panel.take_choice()
         if choice is None or self._menu is None:
@@ -125,7 +125,7 @@ class Viewer:
 
     def _draw(self) -> None:
         moment, panel = self.session.moment(self._panel.back), self._panel
-        self._stage.draw(moment.frame, self._followed())
+        self._stage.draw(moment.frame, self._target())
         if panel.shapes != self._shapes:
             self._shapes = panel.shapes
             self._overlay.show_shapes(self._shapes)
@@ -147,14 +147,14 @@ class Viewer:
         env, frame = self.session.env, self.session.moment(self._panel.back).frame
         return frame.qpos[self._panel.env, env.index.base_qpos[: env.num_agents, :3]]
 
-    def _followed(self) -> tuple[int, list[int]] | None:
+    def _target(self) -> tuple[int, list[int]] | None:
         camera = self._panel.camera
         if camera == FREE:
             return None
         return self._panel.env, list(self._bodies.values()) if camera == ACTION else [self._bodies[camera]]
 
     def _aim(self) -> None:
-        self._point(self.session.moment(self._panel.back).frame, self._followed())
+        self._point(self.session.moment(self._panel.back).frame, self._target())
 
     def _point(self, frame: Episode, followed: tuple[int, list[int]] | None) -> None:
         """Points the cameras of all clients, also of later ones, at the followed bodies or the whole scene."""
@@ -163,7 +163,7 @@ class Viewer:
             position, look_at = self._stage.overview()
         else:
             self._stage.draw(frame, followed)
-            position, look_at = seen(np.array([0.0, 0.0, 0.2]), 3.0 + self._stage.span)
+            position, look_at = chase(np.array([0.0, 0.0, 0.2]), 3.0 + self._stage.span)
         cameras = [client.camera for client in self.server.get_clients().values()]
         for camera in (self.server.initial_camera, *cameras):
             camera.position, camera.look_at = position, look_at

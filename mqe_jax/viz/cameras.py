@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.viz.framing import Camera, fitted, goal_points, hidden, smoothed, targets
-from mqe_jax.viz.geometry import body_boxes, extent, pose, posed, robot_bases
+from mqe_jax.viz.framing import Camera, fit, goal_points, hidden, smooth, targets
+from mqe_jax.viz.geometry import body_boxes, extent, pose, pose_boxes, robot_bases
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
@@ -28,7 +28,7 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
     """Returns a three-quarter view from behind and above that contains the track and all robot trajectories."""
     low, high = extent(model, episode)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])])
-    return fitted(model, corners, Camera((0.0, 0.0, 0.0), 1.0), aspect, (1.5, 60.0))
+    return fit(model, corners, Camera((0.0, 0.0, 0.0), 1.0), aspect, (1.5, 60.0))
 
 
 def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 16 / 9) -> list[Camera]:
@@ -44,7 +44,7 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
     direction = _direction(model, episode, points, goals, aspect, fixed)
     width = max(1, min(round(_SMOOTHING / episode.dt), len(episode) // 5))
     views = _following(model, points, goals, direction, aspect, fixed or width)
-    return views if fixed else smoothed(views, width)
+    return views if fixed else smooth(views, width)
 
 
 def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
@@ -54,7 +54,7 @@ def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
     margins = _MARGIN * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for index in range(len(episode)):
         pose(model, data, episode, index)
-        boxes = posed(data, bodies, local)
+        boxes = pose_boxes(data, bodies, local)
         boxes[:robots] = data.xpos[bodies[:robots], None] + margins
         frames.append(boxes.reshape(-1, 3))
     return frames
@@ -99,7 +99,7 @@ def _following(
     for index in range(len(points)):
         around = points[max(0, index - width) : index + width + 1]
         corners = np.stack([np.min(around, axis=0), np.max(around, axis=0)]).reshape(-1, 3)
-        views.append(fitted(model, np.concatenate([corners, goals]), direction, aspect, _DISTANCES))
+        views.append(fit(model, np.concatenate([corners, goals]), direction, aspect, _DISTANCES))
     return views
 
 
@@ -111,4 +111,4 @@ def _beside(model: mujoco.MjModel, episode: Episode) -> list[Camera]:
         pose(model, data, episode, index)
         x, y, _ = data.xpos[robot]
         views.append(Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0))
-    return smoothed(views, max(1, round(0.3 / episode.dt)))
+    return smooth(views, max(1, round(0.3 / episode.dt)))

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GOAL_SITE, HIDDEN_GROUP
-from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose, posed, robot_bases, robot_color
+from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose, pose_boxes, robot_bases, robot_color
 from mqe_jax.viz.recording import Episode
 
 _ROOM = 1.07  # factor of the distance at which the points would reach the image's edges
@@ -42,7 +42,7 @@ class Camera:
         return np.array(self.lookat) - self.distance * self.axes[0]
 
 
-def fitted(
+def fit(
     model: mujoco.MjModel, corners: np.ndarray, camera: Camera, aspect: float, distances: tuple[float, float]
 ) -> Camera:
     """Returns a camera of the same direction whose image contains and centres the points `corners` (P, 3)."""
@@ -61,7 +61,7 @@ def fitted(
     return replace(camera, lookat=tuple(lookat.tolist()), distance=float(np.clip(_ROOM * distance, *distances)))
 
 
-def smoothed(views: Sequence[Camera], width: int) -> list[Camera]:
+def smooth(views: Sequence[Camera], width: int) -> list[Camera]:
     """Returns cameras smoothed by a triangular window of `2 width + 1` frames."""
     values = np.array([[*camera.lookat, camera.distance] for camera in views])
     padded = np.concatenate([np.repeat(values[:1], width, 0), values, np.repeat(values[-1:], width, 0)])
@@ -105,13 +105,13 @@ def legend(env: QuadrupedEnv, size: tuple[int, int]) -> Callable[[np.ndarray], n
         x += font.getlength(label) + 16 * unit
     picture, gap = np.asarray(plate), round(8 * unit)
 
-    def drawn(frame: np.ndarray) -> np.ndarray:
+    def draw_legend(frame: np.ndarray) -> np.ndarray:
         height, width = (min(a, b - gap) for a, b in zip(picture.shape[:2], frame.shape[:2], strict=True))
         frame = frame.copy()
         frame[-gap - height : len(frame) - gap, gap : gap + width] = picture[:height, :width]
         return frame
 
-    return drawn
+    return draw_legend
 
 
 _SPAN = 0.18  # distance from a trunk's centre of the points that are looked for in front and behind, m
@@ -150,7 +150,7 @@ def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> 
     rows = []
     for index, camera in enumerate(views):
         pose(model, data, episode, index)
-        boxes = posed(data, bodies, local)
+        boxes = pose_boxes(data, bodies, local)
         span = 0.35 * np.ptp(boxes, axis=1) * (0, 0, 1)
         span[:trunks] = _SPAN * data.xmat[bodies[:trunks]].reshape(-1, 3, 3)[:, :, 0]
         points = boxes.mean(axis=1) + np.array([-1, 0, 1])[:, None, None] * span  # (3, targets, 3)

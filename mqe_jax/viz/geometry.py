@@ -77,7 +77,7 @@ def body_boxes(model: mujoco.MjModel, bodies: Sequence[int]) -> np.ndarray:
     return np.array(boxes).reshape(-1, 8, 3)
 
 
-def posed(data: mujoco.MjData, bodies: Sequence[int], boxes: np.ndarray) -> np.ndarray:
+def pose_boxes(data: mujoco.MjData, bodies: Sequence[int], boxes: np.ndarray) -> np.ndarray:
     """Returns the corners (B, 8, 3) of boxes given in the frames of the bodies in the world frame, m."""
     rotation = data.xmat[list(bodies)].reshape(-1, 3, 3)
     return data.xpos[list(bodies), None] + boxes @ rotation.transpose(0, 2, 1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import checked, fail
+from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.evaluate import Act, acting
@@ -46,8 +46,8 @@ class Episode:
 
 
 @single
-@checked(env=AnySingle, policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
-def record(
+@check_arguments(env=AnySingle, policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
+def record_episodes(
     env: QuadrupedEnv, policy: Policy | Act, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
 ) -> list[Episode]:
     """Records one episode in each of several environments, until it ends or for `seconds`.
@@ -66,7 +66,7 @@ def record(
 
     def one_step(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
         state, memory = carry
-        seen = jax.vmap(functools.partial(env.observed, groups=groups))(state) if groups else state
+        seen = jax.vmap(functools.partial(env.with_observations, groups=groups))(state) if groups else state
         action, memory = act(observations(seen), memory, key)
         state = jax.vmap(env.step)(state, action)
         done = state.terminated | state.truncated

@@ -16,7 +16,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
-from mqe_jax.core.settings import PathText, checked
+from mqe_jax.core.settings import PathText, check_arguments
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GROUND_GROUP
@@ -157,7 +157,7 @@ def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
         raise InputError("episode: its coordinates hold NaN or infinite numbers")
 
 
-@checked(
+@check_arguments(
     env=AnySingle,
     episode=Episode,
     path=PathText,

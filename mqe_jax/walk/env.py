@@ -123,7 +123,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         angle = jax.random.uniform(direction_key, (), maxval=2 * jnp.pi)
         push = jnp.where(pushed, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         data = state.data.replace(qvel=state.data.qvel.at[self.index.base_qvel[0, :2]].add(push))
-        shove, shove_steps = self._shoved(state, jax.random.fold_in(time_key, 1))
+        shove, shove_steps = self._shove(state, jax.random.fold_in(time_key, 1))
         newest = jnp.clip(action, -self.action_limit, self.action_limit)
         walk = dataclasses.replace(
             walk,
@@ -137,7 +137,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         )
         return super().advance(dataclasses.replace(state, data=data, task=walk), action)
 
-    def _shoved(self, state: State[WalkState], key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _shove(self, state: State[WalkState], key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Returns force and torque of the shove in this step (6,), and the steps until it ends ()."""
         walk = state.task
         if not self.task.shove:
@@ -223,14 +223,14 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return ObservationLayout((Block("skill", self.trainee.observation_size, "the skill's own, of one step"),))
 
     def observe(self, state: State[WalkState], robot_state: RobotState) -> dict[str, jax.Array]:
-        sensed = self._sensed(state, robot_state)
+        sensed = self._sense(state, robot_state)
         if self.task.randomize:
             keys = jax.random.split(jax.random.fold_in(state.key, _NOISE), 3)
             parts = zip(sensed, (0.02, 0.005, 0.5), keys, strict=True)
             sensed = Proprioception(*(x + size * jax.random.normal(key, x.shape) for x, size, key in parts))
         return {"skill": self._skill_observation(state.task, sensed)[None]}
 
-    def _sensed(self, state: State[WalkState], robot_state: RobotState) -> Proprioception:
+    def _sense(self, state: State[WalkState], robot_state: RobotState) -> Proprioception:
         gravity = rotate_inverse(robot_state.quaternion[0], gravity_w(state.task.slope) / GRAVITY)
         return Proprioception(gravity, robot_state.joint_position[0], robot_state.joint_velocity[0])
 
@@ -240,11 +240,11 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
 
     @property
     def privileged_layout(self) -> ObservationLayout:
-        def seen(key: jax.Array) -> dict[str, jax.Array]:
+        def privileged(key: jax.Array) -> dict[str, jax.Array]:
             state = self.begin(key)
             return self._privileged(state, self.read(state.data))
 
-        shapes = jax.eval_shape(seen, jax.random.PRNGKey(0))
+        shapes = jax.eval_shape(privileged, jax.random.PRNGKey(0))
         return ObservationLayout(tuple(Block(name, len(x)) for name, x in shapes.items()))
 
     def observe_privileged(self, state: State[WalkState], robot_state: RobotState) -> jax.Array:
@@ -259,7 +259,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         shove = {"shove": walk.shove * jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])} if task.shove else {}
         lag = {"action_lag": random.action_lag[None].astype(jnp.float32)} if task.action_lag else {}
         return {
-            "skill": self._skill_observation(walk, self._sensed(state, robot_state)),
+            "skill": self._skill_observation(walk, self._sense(state, robot_state)),
             "linear_velocity": 2.0 * rotate_inverse(quaternion, robot_state.linear_velocity_w[0]),
             "angular_velocity": 0.25 * robot_state.angular_velocity_b[0],
             "up": rotate_inverse(quaternion, jnp.asarray(_UP)),

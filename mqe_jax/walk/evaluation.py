@@ -17,7 +17,7 @@ from mqe_jax import walk_policy
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.limits import Environments, Seed
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, checked
+from mqe_jax.core.settings import PathText, check_arguments
 from mqe_jax.physics import robots
 from mqe_jax.physics.robots.index import Proprioception, foot_positions
 from mqe_jax.physics.robots.robot import Robot
@@ -165,7 +165,7 @@ def _run(
         robot_state = env.read(state.data)
         sensed = Proprioception(state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0])
         _, memory = env.skill.targets(params, memory, commands[:width], sensed)
-        state = env.observed(env.advance(state, memory.action[None]))
+        state = env.with_observations(env.advance(state, memory.action[None]))
         robot_state = env.read(state.data)
         quaternion = robot_state.quaternion[0]
         feet = foot_positions(env.robot, robot_state.joint_position[0])
@@ -179,7 +179,7 @@ def _run(
         state, memory, record = jax.vmap(one)(state, memory, commands[number])
         return (state, memory), record
 
-    state = jax.vmap(lambda key, spec: env.observed(env.with_spec(env.begin(key), spec)))(keys, specs)
+    state = jax.vmap(lambda key, spec: env.with_observations(env.with_spec(env.begin(key), spec)))(keys, specs)
     memory = jax.vmap(lambda _: env.skill.init_memory())(keys)
     return jax.lax.scan(advance, (state, memory), numbers)[1]
 
@@ -216,7 +216,7 @@ def _frequency(height: np.ndarray) -> float:
     return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
 
 
-@checked(
+@check_arguments(
     skill=str,
     weights=PathText | None,
     robot=str,

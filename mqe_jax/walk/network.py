@@ -35,25 +35,25 @@ from mqe_jax.skills import agile
 from mqe_jax.skills.weights import Networks
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import EnvDims, Evaluation, GaussianSettings, Network, register_network
+from mqe_jax.train.networks import ChunkResult, EnvDims, GaussianSettings, Network, register_network
 from mqe_jax.walk.task import LATENT_TARGET
 from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
 _CRITIC = (512, 256, 128)
 _PRECISION = "tensorfloat32"  # full float32 products over 2100 numbers would take most of an update on a GPU
 
-Mirror = tuple[np.ndarray, np.ndarray]
+Reflect = tuple[np.ndarray, np.ndarray]
 """Source and sign of each number of a mirrored vector."""
 
 
-def _mirror(*blocks: Mirror) -> Mirror:
+def _mirror(*blocks: Reflect) -> Reflect:
     """Joins the mirrors of consecutive blocks."""
     starts = np.cumsum([0, *(len(source) for source, _ in blocks)])
     source = np.concatenate([source + start for (source, _), start in zip(blocks, starts[:-1], strict=True)])
     return source, np.concatenate([sign for _, sign in blocks])
 
 
-def _signs(*signs: float) -> Mirror:
+def _signs(*signs: float) -> Reflect:
     return np.arange(len(signs)), np.array(signs, np.float32)
 
 
@@ -71,7 +71,7 @@ class Form:
     row_size: int  # numbers of an observation that a row has; the others are of the newest observation alone
     infer: Callable[..., tuple[jax.Array, Any]]
     """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an adaptation network."""
-    mirror: Mirror  # of an input
+    mirror: Reflect  # of an input
 
     @property
     def past(self) -> int:
@@ -83,13 +83,13 @@ class Form:
         flat = history.reshape(*history.shape[:-2], -1)
         return flat if self.row_size == obs.shape[-1] else jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
 
-    def mirrored(self, inputs: jax.Array) -> jax.Array:
+    def reflect(self, inputs: jax.Array) -> jax.Array:
         """Mirrors inputs (..., n)."""
         return inputs[..., self.mirror[0]] * self.mirror[1]
 
     def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
         """Returns the mean square difference () of actions of mirrored inputs (B, n) from mirrored actions (B, 12)."""
-        other, _ = self.infer(params, self.mirrored(inputs), precision=_PRECISION)
+        other, _ = self.infer(params, self.reflect(inputs), precision=_PRECISION)
         return jnp.mean(jnp.square(other - mirror_action(mean)))
 
 
@@ -222,7 +222,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         privileged: jax.Array,
         action: jax.Array,
         active: jax.Array | None = None,
-    ) -> Evaluation:
+    ) -> ChunkResult:
         obs = obs[..., 0, :]
         inputs = form.inputs(windows(memory.actor, is_first, obs[..., : form.row_size], form.rows), obs)
         mean, latent = form.infer(params["policy"], inputs, precision=_PRECISION)
@@ -233,7 +233,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
             losses["adaptation"] = settings.adaptation_coef * error
         if settings.symmetry_coef > 0:
             losses["symmetry"] = settings.symmetry_coef * form.symmetry_loss(params["policy"], inputs, mean)
-        return Evaluation(
+        return ChunkResult(
             log_prob(action, mean[..., None, :], log_std[..., None, :]),
             entropy(log_std)[..., None],
             value(params, (), is_first, obs, privileged)[0],

@@ -120,7 +120,7 @@ def sample_spec(key: jax.Array, task: WalkTask, trainee: Trainee, assistance: ja
     chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
     difficulty = 1.0 - assistance
     share = task.start + (1.0 - task.start) * difficulty
-    velocity = share * jnp.stack([uniform(*bounds) for bounds in trainee.skill.trained(VELOCITY)])
+    velocity = share * jnp.stack([uniform(*bounds) for bounds in trainee.skill.trained_ranges(VELOCITY)])
     velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
     velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
     if trainee.skill.turn is not None:

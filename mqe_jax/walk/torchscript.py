@@ -20,7 +20,7 @@ import numpy as np
 
 from mqe_jax.core import limits
 from mqe_jax.core.files import archive
-from mqe_jax.core.settings import PathText, checked
+from mqe_jax.core.settings import PathText, check_arguments
 from mqe_jax.walk_policy import NETWORKS, Params
 
 _DTYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2"}
@@ -89,7 +89,7 @@ class _Unpickler(_PurePython):
         return tensor
 
 
-@checked(path=PathText)
+@check_arguments(path=PathText)
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Returns the tensors of a scripted or traced `Sequential` by dotted name, float32, such as 0.weight.
 
@@ -130,4 +130,4 @@ def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) ->
     """Reads the official pair of TorchScript checkpoints into this package's weights."""
     flat = {f"adaptation.{name}": value for name, value in read_torchscript(adaptation).items()}
     flat |= {f"body.{name}": value for name, value in read_torchscript(body).items()}
-    return NETWORKS.nested(flat, f"{adaptation}, {body}")
+    return NETWORKS.nest(flat, f"{adaptation}, {body}")

@@ -35,7 +35,7 @@ class Trainee(abc.ABC):
     @property
     def evaluated(self) -> np.ndarray:
         """Lowest and highest velocity command in evaluations (3, 2), m/s and rad/s: those of the training."""
-        return self.skill.trained(VELOCITY)
+        return self.skill.trained_ranges(VELOCITY)
 
     @abc.abstractmethod
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from mqe_jax.core.settings import PathText, checked, fail, override, to_mapping
+from mqe_jax.core.settings import PathText, check_arguments, fail, override, to_mapping
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.physics import robots
 from mqe_jax.train.config import PPO, Checkpointing, Curriculum, Normalization, OptimizerSettings, TrainConfig
@@ -54,7 +54,7 @@ SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {"walk": (WALK, WalkTask()),
 """Settings and task of each skill that can be trained."""
 
 
-@checked(
+@check_arguments(
     skill=str,
     run_dir=PathText,
     config=TrainConfig | None,

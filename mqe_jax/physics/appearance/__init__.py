@@ -33,7 +33,7 @@ SITE_GROUP = 5  # of sites, which are not shown
 GOAL_SITE = "goal"  # first part of the names of sites that a camera keeps in view: gates, goals, finish lines
 
 
-def mixed(first: Color, second: Color, part: float) -> Color:
+def mix(first: Color, second: Color, part: float) -> Color:
     """Returns the mean of two colours, `part` in [0, 1] of it the second."""
     r, g, b, a = ((1.0 - part) * x + part * y for x, y in zip(first, second, strict=True))
     return r, g, b, a

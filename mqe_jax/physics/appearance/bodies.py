@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mqe_jax.physics.appearance import DARK_WOOD, GLASS, INK, STEEL, WHITE, WOOD, YELLOW, Color, mixed
+from mqe_jax.physics.appearance import DARK_WOOD, GLASS, INK, STEEL, WHITE, WOOD, YELLOW, Color, mix
 from mqe_jax.physics.appearance.shapes import Kind, add_box, add_rod, add_visual
 
 _PROUD = 0.004  # distance by which details stand out from the collision shape, m
@@ -30,7 +30,7 @@ def crate(body: Any, half: np.ndarray) -> None:
         angle = np.arctan2(half[2], half[1 - axis]) / 2
         quat = np.array([np.cos(angle), 0.0, 0.0, 0.0])
         quat[1 + axis] = sign * np.sin(angle)
-        add_box(body, mixed(WOOD, DARK_WOOD, 0.55), size, (0, 0, 0), quat=quat)
+        add_box(body, mix(WOOD, DARK_WOOD, 0.55), size, (0, 0, 0), quat=quat)
 
 
 def football(body: Any, radius: float) -> None:
@@ -50,7 +50,7 @@ def drum(body: Any, radius: float, height: float) -> None:
     add_visual(body, Kind.mjGEOM_CYLINDER, WOOD, size=(radius, half, 0), pos=(0, 0, half))
     for z in (0.16 * height, 0.84 * height):
         add_visual(body, Kind.mjGEOM_CYLINDER, STEEL, size=(radius + 0.006, 0.035, 0), pos=(0, 0, z))
-    lid = mixed(WOOD, WHITE, 0.35)
+    lid = mix(WOOD, WHITE, 0.35)
     add_visual(body, Kind.mjGEOM_CYLINDER, lid, size=(0.93 * radius, 0.003, 0), pos=(0, 0, height))
 
 
@@ -72,7 +72,7 @@ def plank(body: Any, half: np.ndarray, center: float) -> None:
     x, y, z = half
     edges = np.linspace(-x, x, 15)
     for i, (a, b) in enumerate(itertools.pairwise(edges)):
-        tone = (mixed(WOOD, WHITE, 0.12), WOOD)[i % 2]
+        tone = (mix(WOOD, WHITE, 0.12), WOOD)[i % 2]
         add_box(body, tone, ((b - a) / 2, y, z + 0.002), (center + (a + b) / 2, 0, 0))
     for side in (-1, 1):
         add_box(body, DARK_WOOD, (x, 0.025, z + _PROUD), (center, side * (y - 0.025), 0))

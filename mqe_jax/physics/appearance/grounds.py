@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from mqe_jax.physics.appearance import CLAY, GRASS, INK, ROBOT_COLORS, STONE, WHITE, WOOD, YELLOW, Color, mixed
+from mqe_jax.physics.appearance import CLAY, GRASS, INK, ROBOT_COLORS, STONE, WHITE, WOOD, YELLOW, Color, mix
 from mqe_jax.physics.appearance.shapes import (
     Ground,
     Point,
@@ -35,7 +35,7 @@ def pads(poses: Sequence[Sequence[float]], colors: Sequence[int]) -> tuple[Shape
     """Returns a frame in each robot's colour about its place at the start; poses x, y, yaw."""
     size, marks = (0.9, 0.6), []
     for (x, y, yaw, *_), color in zip(poses, colors, strict=False):
-        paint = mixed(ROBOT_COLORS[color % len(ROBOT_COLORS)], WHITE, 0.25)
+        paint = mix(ROBOT_COLORS[color % len(ROBOT_COLORS)], WHITE, 0.25)
         marks += [
             mark((x, y, 0.0), size, WHITE, 3, yaw),
             mark((x, y, 0.0), (size[0] - 0.08, size[1] - 0.08), paint, 4, yaw),
@@ -68,7 +68,7 @@ def hall(x: Point, y: Point, color: Color, shapes: Sequence[Shape] = ()) -> Grou
 
 def halves(x: Point, y: Point) -> Ground:
     """Returns a floor whose halves are those of the first and of the second team, with a line between them."""
-    blue, red = (mixed(ROBOT_COLORS[i], STONE, 0.74) for i in (0, 2))
+    blue, red = (mix(ROBOT_COLORS[i], STONE, 0.74) for i in (0, 2))
     return Ground(
         _HALL, (rectangle(x, (y[0], 0.0), blue), rectangle(x, (0.0, y[1]), red), line((x[0], 0.0), (x[1], 0.0)))
     )
@@ -169,7 +169,7 @@ def dohyo(top: tuple[float, float, float], size: tuple[float, float, float], rad
     for side, color in ((-1, ROBOT_COLORS[0]), (1, ROBOT_COLORS[2])):
         shapes += [line((x - 0.4, y + side * 0.45), (x + 0.4, y + side * 0.45), width=0.07, z=z)]
         at = y + side * (width / 2 - 0.2)
-        shapes += [line((x - 0.9, at), (x + 0.9, at), mixed(color, WHITE, 0.15), 0.14, z=z)]
+        shapes += [line((x - 0.9, at), (x + 0.9, at), mix(color, WHITE, 0.15), 0.14, z=z)]
     points = tuple((x + a * radius, y + b * radius, z) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1)))
     return Ground(_HALL, tuple(shapes), points)
 
@@ -182,7 +182,7 @@ def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top
     """
     random = np.random.default_rng(2)
     blue: Color = (0.36, 0.62, 0.74, 1.0)
-    foam = mixed(blue, WHITE, 0.35)
+    foam = mix(blue, WHITE, 0.35)
     shapes: list[Shape] = [rectangle((ends[0] - 1.0, ends[1] + 1.0), (-40.0, 40.0), blue)]
     for _ in range(70):
         x, y = random.uniform(ends[0] - 0.8, ends[1] + 0.8), random.uniform(-6.0, 6.0)
@@ -190,12 +190,12 @@ def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top
     length, width, bridge = widths
     planks = np.linspace(*ends, 24).tolist()
     for i, (a, b) in enumerate(itertools.pairwise(planks)):
-        tone = (WOOD, mixed(WOOD, WHITE, 0.18))[i % 2]
+        tone = (WOOD, mix(WOOD, WHITE, 0.18))[i % 2]
         shapes.append(rectangle((a, b), (-bridge / 2, bridge / 2), tone, 1, top))
     points = []
     for x, color in zip(platforms, (0, 2), strict=True):
         x_range, y_range = (x - length / 2, x + length / 2), (-width / 2, width / 2)
-        shapes.append(rectangle(x_range, y_range, mixed(ROBOT_COLORS[color], STONE, 0.55), 1, top))
+        shapes.append(rectangle(x_range, y_range, mix(ROBOT_COLORS[color], STONE, 0.55), 1, top))
         shapes += outline((x_range[0] + 0.06, x_range[1] - 0.06), (y_range[0] + 0.06, y_range[1] - 0.06), z=top)
         points += [(x, y, top) for y in y_range]
     return Ground(shapes=tuple(shapes), goals=tuple(points))

@@ -34,7 +34,7 @@ def resolve(impl: str = "auto") -> str:
     if impl not in allowed:
         raise InputError(f"impl: unknown engine {impl!r}{nearest(impl, allowed)}; allowed: {', '.join(allowed)}")
     if impl == "auto":
-        return next(name for name in ENGINES if _load(name).preferred())
+        return next(name for name in ENGINES if _load(name).is_preferred())
     obstacle = _load(impl).obstacle()
     if obstacle is not None:
         raise InputError(f"impl {impl!r} {obstacle}")

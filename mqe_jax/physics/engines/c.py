@@ -50,7 +50,7 @@ class CEngine(Engine):
         weakref.finalize(self, self._stepper.retire).atexit = False
 
     @classmethod
-    def preferred(cls) -> bool:
+    def is_preferred(cls) -> bool:
         return jax.default_backend() == "cpu"
 
     @classmethod
@@ -121,15 +121,15 @@ class _Stepper:
         key = count, names, forced
         with self._lock:
             idle = self._idle.setdefault(key, [])
-            batch, rows = idle.pop() if idle else (Batch(self._model, nsim=count), self._repeated(count))
+            batch, rows = idle.pop() if idle else (Batch(self._model, nsim=count), self._repeat(count))
         try:
-            row = self._stepped(batch, rows, names, forced, substeps, flat)
+            row = self._step_batch(batch, rows, names, forced, substeps, flat)
         finally:
             if not self._retired:
                 idle.append((batch, rows))
         return row.reshape(*lead, -1)
 
-    def _stepped(
+    def _step_batch(
         self,
         batch: Batch,
         rows: _Rows | None,
@@ -158,13 +158,13 @@ class _Stepper:
         parts = [batch.bind("qpos"), batch.bind("qvel"), batch.bind("qacc_warmstart"), sensordata]
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
-    def _repeated(self, count: int) -> _Rows | None:
+    def _repeat(self, count: int) -> _Rows | None:
         """Returns motors, gain (count, J) and bias (count, J, 3) of the model, repeated for each environment."""
         if self._motors is None:
             return None
         gain, bias = self._model.actuator_gainprm[:, 0], self._model.actuator_biasprm[:, :3]
         gain, bias = np.tile(gain.astype(np.float32), (count, 1)), _columns(np.tile(bias, (count, 1, 1)))
-        return self._motors.repeated(count), gain, bias
+        return self._motors.repeat(count), gain, bias
 
 
 def _drive(
@@ -201,7 +201,7 @@ def _drive(
             batch.bind(name)[ids] = values[ids]
         batch.bind("time")[ids] = 0.0
         if len(ids) < batch.nsim:
-            every, gain, bias = motors.repeated(len(ids)), gain[ids], bias[ids]
+            every, gain, bias = motors.repeat(len(ids)), gain[ids], bias[ids]
         _step_limited(batch, every, substeps, ids, gain, bias)
     _clamp(batch, motors, slice(None))
 

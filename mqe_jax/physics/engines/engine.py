@@ -45,7 +45,7 @@ class Engine(abc.ABC):
     """Maximum constraints of each environment, for engines with such a limit (Warp's njmax)."""
 
     @classmethod
-    def preferred(cls) -> bool:
+    def is_preferred(cls) -> bool:
         """Returns whether `auto` chooses this engine on this machine, unless one before it in the registry is."""
         return False
 

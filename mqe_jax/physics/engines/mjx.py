@@ -14,7 +14,7 @@ import numpy as np
 
 from mqe_jax.physics.engines import private
 from mqe_jax.physics.engines.engine import Engine
-from mqe_jax.physics.robots.index import placed
+from mqe_jax.physics.robots.index import scatter
 from mqe_jax.physics.robots.motors import Motors
 
 if TYPE_CHECKING:
@@ -58,35 +58,35 @@ class MjxEngine(Engine):
     ) -> tuple[mjx.Data, jax.Array]:
         ctrl = data.ctrl
         model = self.mjx_model.replace(**fields) if fields else self.mjx_model
-        model = _disabled(model, self.unused_terms(fields))
-        loop = _disabled(model, _BIT.mjDSBL_SENSOR) if self.last_apart else model
+        model = _disable(model, self.unused_terms(fields))
+        loop = _disable(model, _BIT.mjDSBL_SENSOR) if self.last_apart else model
 
         def substep(model: mjx.Model, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
-            data, overflow = self.physics_step(*self._driven(model, carry[0], ctrl))
+            data, overflow = self.physics_step(*self._drive(model, carry[0], ctrl))
             return data, carry[1] | overflow
 
         carry, length = (data, jnp.zeros((), bool)), num_substeps - self.last_apart
         carry, _ = jax.lax.scan(lambda carry, _: (substep(loop, carry), None), carry, None, length, unroll=self.unroll)
         data, overflow = substep(model, carry) if self.last_apart else carry
-        return self._clamped(data.replace(ctrl=ctrl)), overflow
+        return self._clamp(data.replace(ctrl=ctrl)), overflow
 
-    def _driven(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
+    def _drive(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
         """Returns model and data for one physics step: the motors' armature and control, and the clamped joints."""
         motors = self.motors
         if motors is None:
             return model, data
         gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
         ctrl, added = motors.limit(jnp, ctrl, *self._joints(data, motors), gain, bias)
-        armature = model.dof_armature + placed(np.zeros(self.model.nv), motors.joint_qvel, added)
-        return model.replace(dof_armature=armature), self._clamped(data).replace(ctrl=ctrl)
+        armature = model.dof_armature + scatter(np.zeros(self.model.nv), motors.joint_qvel, added)
+        return model.replace(dof_armature=armature), self._clamp(data).replace(ctrl=ctrl)
 
-    def _clamped(self, data: mjx.Data) -> mjx.Data:
+    def _clamp(self, data: mjx.Data) -> mjx.Data:
         """Returns data with the joint speeds that motors and contacts allow."""
         motors = self.motors
         if motors is None:
             return data
         position, velocity = self._joints(data, motors)
-        qpos, qvel = placed(data.qpos, motors.joint_qpos, position), placed(data.qvel, motors.joint_qvel, velocity)
+        qpos, qvel = scatter(data.qpos, motors.joint_qpos, position), scatter(data.qvel, motors.joint_qvel, velocity)
         return data.replace(qpos=qpos, qvel=qvel)
 
     def _joints(self, data: mjx.Data, motors: Motors) -> tuple[jax.Array, jax.Array]:
@@ -108,7 +108,7 @@ class JaxEngine(MjxEngine):
         self.mjx_model = self._step.model
 
     @classmethod
-    def preferred(cls) -> bool:
+    def is_preferred(cls) -> bool:
         return True
 
     def blank(self) -> mjx.Data:
@@ -142,7 +142,7 @@ class WarpEngine(MjxEngine):
         self.mjx_model = private.without_warnings(self._mjx.put_model(self._model, device, impl="warp"))
 
     @classmethod
-    def preferred(cls) -> bool:
+    def is_preferred(cls) -> bool:
         kinds = [device.device_kind.lower() for device in jax.devices()]
         nvidia = any("cuda" in kind or "nvidia" in kind for kind in kinds)
         return jax.default_backend() == "gpu" and nvidia and private.warp_is_installed()
@@ -193,7 +193,7 @@ def _with_jacobian(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _disabled(model: mjx.Model, disable: int) -> mjx.Model:
+def _disable(model: mjx.Model, disable: int) -> mjx.Model:
     """Returns the model with further disable flags."""
     flags = model.opt.disableflags
     return model.replace(opt=model.opt.replace(disableflags=type(flags)(flags | disable)))

@@ -93,7 +93,7 @@ def _contacts(model: mjx.Model, data: mjx.Data, cap: int) -> mjx.Contact:
             if pairs.types == (mjx.GeomType.CAPSULE, mjx.GeomType.BOX) and len(rows):
                 both = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
                 nearest = _capsule_box(model, data, geom[rows])
-                corrected = _corrected(dist[both], pos[both], frame[both], *nearest)
+                corrected = _correct(dist[both], pos[both], frame[both], *nearest)
                 dist, pos, frame = (x.at[both].set(y) for x, y in zip((dist, pos, frame), corrected, strict=True))
         count = len(dist) // len(geom)
         contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), pairs.contact)
@@ -160,7 +160,7 @@ def _capsule_box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> tuple[jax
     )
 
 
-def _corrected(
+def _correct(
     dist: jax.Array, pos: jax.Array, frame: jax.Array, true_dist: jax.Array, true_pos: jax.Array, normal: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Replaces the two contacts of MJX-JAX for each capsule and box, where the deeper one is not at the true distance.

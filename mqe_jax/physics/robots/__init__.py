@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import check_arguments
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.go2 import GO2
 from mqe_jax.physics.robots.robot import Robot
@@ -11,7 +11,7 @@ from mqe_jax.physics.robots.robot import Robot
 ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
 
 
-@checked(name=str)
+@check_arguments(name=str)
 def get(name: str) -> Robot:
     """Returns a robot by name; InputError for an unknown name, with the nearest known one."""
     if name not in ROBOTS:
@@ -19,7 +19,7 @@ def get(name: str) -> Robot:
     return ROBOTS[name]
 
 
-@checked(robot=Robot)
+@check_arguments(robot=Robot)
 def register(robot: Robot) -> Robot:
     """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it."""
     if ROBOTS.setdefault(robot.name, robot) is not robot:

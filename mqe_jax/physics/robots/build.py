@@ -89,7 +89,7 @@ def build_robot(
                 )
         for visual_shape in robot.visuals if visual else ():
             if visual_shape.link == link:
-                rgba = visual_shape.tinted(agent_color)
+                rgba = visual_shape.mix_color(agent_color)
                 _add_geom(body, visual_shape.primitive, left, rgba=rgba, contype=0, conaffinity=0, group=VISUAL_GROUP)
 
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, robot.stand_height))
@@ -100,11 +100,11 @@ def build_robot(
         front = 1 if leg[0] == "F" else -1
         left = 1 if leg[1] == "L" else -1
         hip = trunk.add_body(name=f"{leg}_hip", pos=(front * robot.leg_root[0], left * robot.leg_root[1], 0.0))
-        _add_inertial(hip, robot.hip.mirrored(front, left))
+        _add_inertial(hip, robot.hip.reflect(front, left))
         thigh = hip.add_body(name=f"{leg}_thigh", pos=(0.0, left * robot.hip_length, 0.0))
-        _add_inertial(thigh, robot.thigh.mirrored(1, left))
+        _add_inertial(thigh, robot.thigh.reflect(1, left))
         calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -robot.thigh_length))
-        _add_inertial(calf, robot.calf.mirrored(1, left))
+        _add_inertial(calf, robot.calf.reflect(1, left))
         for body, joint, axis in zip((hip, thigh, calf), JOINTS, ((1, 0, 0), (0, 1, 0), (0, 1, 0)), strict=True):
             index = JOINT_NAMES.index(f"{leg}_{joint}")
             limits = (robot.joint_lower[index], robot.joint_upper[index])

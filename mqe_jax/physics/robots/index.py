@@ -40,7 +40,7 @@ class RobotIndex:
         return len(self.trunk_body)
 
 
-def placed(base: Any, addresses: np.ndarray, values: jax.Array) -> jax.Array:
+def scatter(base: Any, addresses: np.ndarray, values: jax.Array) -> jax.Array:
     """Returns the array `base` (n,) with values at addresses, which are host integers of the same shape.
 
     A GPU computes this together with what precedes and follows it; a scatter takes kernels of its own.

@@ -189,7 +189,7 @@ class Motors:
         """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry it further."""
         return np.float32((1.0 - ROUNDING) * REACH) * np.where(self._steep, np.float32(np.inf), self.speed)
 
-    def repeated(self, count: int) -> Motors:
+    def repeat(self, count: int) -> Motors:
         """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast ones."""
         rows = {name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")}
         return dataclasses.replace(self, **rows)

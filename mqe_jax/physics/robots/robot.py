@@ -62,7 +62,7 @@ class Link:
         )
         return cls(mass, com, _six(axes @ np.diag(moments) @ axes.T))
 
-    def mirrored(self, x: int, y: int) -> Link:
+    def reflect(self, x: int, y: int) -> Link:
         """Returns the link reflected by the signs `x` and `y` (each 1 or -1)."""
         xx, yy, zz, xy, xz, yz = self.inertia
         cx, cy, cz = self.com
@@ -73,7 +73,7 @@ class Link:
         xx, yy, zz, xy, xz, yz = self.inertia
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
-    def welded(self, other: Link, position: Vector) -> Link:
+    def weld(self, other: Link, position: Vector) -> Link:
         """Returns this link with `other` fixed to it at `position` (m, link frame, same axes)."""
         mass = self.mass + other.mass
         centers = (np.asarray(self.com), np.asarray(position) + np.asarray(other.com))
@@ -153,7 +153,7 @@ class VisualShape:
         if self.link not in LINKS:
             raise InputError(f"VisualShape.link: unknown link {self.link!r}; allowed: {', '.join(LINKS)}")
 
-    def tinted(self, agent_color: Color) -> Color:
+    def mix_color(self, agent_color: Color) -> Color:
         """Returns the base colour mixed with the agent's colour."""
         own, agent = np.asarray(self.color), np.asarray(agent_color)
         r, g, b, a = ((1.0 - self.tint) * own + self.tint * agent).tolist()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import check_arguments
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.registry import NAMED_PLANNERS, PLANNERS, Planner, load
@@ -31,7 +31,7 @@ def planner_of(task: str, name: str = "scripted") -> Planner:
     return load("mqe_jax.policies.scripted", planner) if isinstance(planner, str) else planner
 
 
-@checked(env=AnySingle, name=str)
+@check_arguments(env=AnySingle, name=str)
 def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
     """Returns the scripted policy of a task, from the observations (A, O) of one team to its actions (A, 3).
 

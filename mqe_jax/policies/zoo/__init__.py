@@ -12,7 +12,7 @@ from annotated_types import Ge
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import NonNegative
-from mqe_jax.core.settings import PathText, build, checked, record, to_mapping
+from mqe_jax.core.settings import PathText, build, check_arguments, record, to_mapping
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
 
@@ -51,7 +51,7 @@ def file_of(task: str) -> Path:
     return FOLDER / f"{task}.safetensors"
 
 
-@checked(task=str)
+@check_arguments(task=str)
 def card(task: str) -> Card:
     """Returns the card of a task's shipped policy.
 
@@ -70,7 +70,7 @@ def load(task: str) -> TrainedPolicy:
     return dataclasses.replace(policy, deterministic=about.mode == "deterministic")
 
 
-@checked(policy=TrainedPolicy, about=Card, folder=PathText)
+@check_arguments(policy=TrainedPolicy, about=Card, folder=PathText)
 def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
     """Writes a policy with its card, its parameters as float16; returns the file."""
     metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}

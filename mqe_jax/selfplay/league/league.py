@@ -139,7 +139,7 @@ class League:
         expected = 1.0 / (1.0 + 10.0 ** ((theirs - league.rating) / 400.0))
         gain = jnp.sum(jnp.where(rated > 0, score - games * expected, 0.0))
         return league._replace(
-            pool=pool.record(league.pool, league.member, jnp.where(plays_member, score, 0.0), members),
+            pool=pool.record_result(league.pool, league.member, jnp.where(plays_member, score, 0.0), members),
             played=league.played + games.astype(jnp.int32),
             rating=league.rating + jnp.clip(gain, -_SWING, _SWING),
             recent=_FADE * league.recent + counts,

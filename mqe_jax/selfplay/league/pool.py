@@ -41,7 +41,7 @@ def mean_win_rate(pool: Pool) -> jax.Array:
     return jnp.sum(jnp.where(present, win_rate(pool), 0.0)) / jnp.sum(present.astype(jnp.float32))
 
 
-def record(pool: Pool, member: jax.Array, score: jax.Array, games: jax.Array) -> Pool:
+def record_result(pool: Pool, member: jax.Array, score: jax.Array, games: jax.Array) -> Pool:
     """Adds results of blocks against their members: indices (B,), wins plus half of the draws (B,), games (B,)."""
     met = jnp.zeros_like(pool.games).at[member].add(games) > 0
     fade = jnp.where(met, _DECAY, 1.0)

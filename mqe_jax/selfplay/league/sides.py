@@ -23,38 +23,38 @@ class BothSides(Wrapper):
         super().__init__(inner)
         self.privileged_observation_size += 1
 
-    def passed(self, action: jax.Array) -> jax.Array:
-        return self._exchanged(action)
+    def pass_on(self, action: jax.Array) -> jax.Array:
+        return self._swap(action)
 
-    def seen(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
-        changed = self._changed()
+    def view(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
+        changed = self._swaps()
         metrics = dict(inner.metrics)
         for theirs in [name for name in metrics if name.startswith("team1/")]:
             own = theirs.removeprefix("team1/")
             for name, other in ((own, theirs), (theirs, own)):
                 metrics[name] = jnp.where(changed, inner.metrics[other], inner.metrics[name])
 
-        def told(privileged: jax.Array) -> jax.Array:
+        def add_side(privileged: jax.Array) -> jax.Array:
             return jnp.concatenate([privileged, changed[:, None].astype(privileged.dtype)], axis=1)
 
         return {
-            "obs": self._exchanged(inner.obs),
-            "final_obs": jax.tree.map(self._exchanged, inner.final_obs),
-            "privileged_obs": told(inner.privileged_obs),
-            "final_privileged_obs": jax.tree.map(told, inner.final_privileged_obs),
-            "reward": self._exchanged(inner.reward),
-            "active": jax.tree.map(self._exchanged, inner.active),
-            "groups": jax.tree.map(self._exchanged, inner.groups),
-            "final_groups": jax.tree.map(self._exchanged, inner.final_groups),
+            "obs": self._swap(inner.obs),
+            "final_obs": jax.tree.map(self._swap, inner.final_obs),
+            "privileged_obs": add_side(inner.privileged_obs),
+            "final_privileged_obs": jax.tree.map(add_side, inner.final_privileged_obs),
+            "reward": self._swap(inner.reward),
+            "active": jax.tree.map(self._swap, inner.active),
+            "groups": jax.tree.map(self._swap, inner.groups),
+            "final_groups": jax.tree.map(self._swap, inner.final_groups),
             "outcome": inner.outcome.by_team(lambda x: jnp.where(changed[:, None], x[:, ::-1], x)),
             "metrics": metrics,
         }
 
-    def _changed(self) -> jax.Array:
+    def _swaps(self) -> jax.Array:
         """Returns where the teams have changed places (N,) bool."""
         return devices.rows(lambda n: jnp.arange(n) >= n // 2, self.num_envs)
 
-    def _exchanged(self, x: jax.Array) -> jax.Array:
+    def _swap(self, x: jax.Array) -> jax.Array:
         """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A, ...)."""
         other = jnp.roll(x, self.num_agents // 2, axis=1)
-        return where_rows(self._changed(), other, x)
+        return where_rows(self._swaps(), other, x)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mqe_jax.core.files import replacing, write_atomically
 from mqe_jax.core.literal import line, to_label
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, checked
+from mqe_jax.core.settings import PathText, check_arguments
 from mqe_jax.core.types import RESULTS, observations
 from mqe_jax.envs import VectorEnv
 from mqe_jax.selfplay.opponents import Versus
@@ -135,7 +135,7 @@ class Standings:
         ]
         return {"task": self.task, "ratings": rows, "policies": [*self.policies], "results": self.results.tolist()}
 
-    @checked(folder=PathText)
+    @check_arguments(folder=PathText)
     def save(self, folder: str | Path) -> None:
         """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
         folder, text = Path(folder), io.StringIO()
