@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import http.server
 import io
+import itertools
 import json
 import os
 import shutil
@@ -274,3 +275,25 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         tab.keyboard.press("r")
         tab.keyboard.press("Space")
         tab.wait_for_function("document.querySelector('#pause').textContent === 'Continue'")
+
+
+def test_a_phone_shows_what_to_do_and_its_button_and_pads_drive(page: Path) -> None:
+    """Nothing covers anything else; who falls in a match, here one without physics, loses."""
+    with opened(page, "seed=3", 390, 844, touch=True) as tab:
+        assert tab.locator("#aim").inner_text() == "Drive the sheep through the gate."
+        assert tab.locator(".who").all_inner_texts() == ["robot 1", "robot 2"]
+        boxes = [tab.locator(name).bounding_box() for name in ("#bar", "#guide", "#walk")]
+        assert all(one["y"] + one["height"] <= other["y"] for one, other in itertools.pairwise(boxes))
+        assert tab.locator("#turn").is_visible() and tab.evaluate("document.documentElement.scrollWidth") == 390
+        for control in ("#take", "#walk"):
+            tab.locator(control).tap()
+            tab.wait_for_function("document.querySelector('.who').innerText === 'robot 1 (you)'")
+            assert tab.locator("#view").input_value() == "0"
+            photograph(tab, f"phone{control[1:]}")
+            tab.locator("#take").tap()
+            tab.wait_for_function("document.querySelector('#drive').value === ''")
+        lost = "teams: [[0], [1]]}, outcome: {'team1/win': 1}, result: 'fall'"
+        step = f"Episode.prototype.step = function() {{ Object.assign(this, {{settings: {{...this.settings, {lost}}})}}"
+        tab.locator("#take").tap()
+        tab.evaluate(f"import('./episode.js').then(({{ Episode }}) => {{ {step} }})")
+        tab.wait_for_function("document.querySelector('#result').innerText === 'You lose (a robot fell)'")

@@ -13,7 +13,7 @@ import pytest
 
 from mqe_jax import cli, skills
 from mqe_jax.cli.commands import Eval
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import override
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
@@ -143,6 +143,21 @@ def test_a_policy_file_holds_its_mode(deterministic: bool, tmp_path: Path) -> No
     policy = dataclasses.replace(load_policy("go1gate"), deterministic=deterministic)
     file = save_policy(tmp_path / "new" / "folder", policy)
     assert load_policy(file).deterministic is deterministic and load_policy(file, deterministic=True).deterministic
+
+
+def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:
+    policy = load_policy("go1gate")
+    policy = dataclasses.replace(policy, params=jax.tree.map(lambda x: jnp.asarray(x) * 1.0001, policy.params))
+    full, half = (save_policy(tmp_path, policy, f"{half}", half=half) for half in (False, True))
+    assert half.stat().st_size < 0.62 * full.stat().st_size
+    loaded = load_policy(half)
+    assert {x.dtype for x in jax.tree.leaves(loaded.params)} == {jnp.dtype("float32")}
+    obs = jax.random.normal(jax.random.PRNGKey(1), (64, 2, policy.needs.dims.observation))
+    actions = [each.act(obs, each.initial_memory(64))[0] for each in (policy, loaded)]
+    np.testing.assert_allclose(*actions, atol=5e-3)
+    with pytest.raises(NonFiniteError, match="holds NaN or infinite"):
+        huge = jax.tree.map(lambda x: 1e6 * jnp.ones_like(x), policy.params)
+        save_policy(tmp_path, dataclasses.replace(policy, params=huge), half=True)
 
 
 # -- scripted policies: the registry of them, and actions on observations made by hand ---------------------------------

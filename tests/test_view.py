@@ -181,6 +181,30 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
     viewer.server.stop()
 
 
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_own_lights_alone_and_cameras_at_the_action_of_one_environment(num_envs: int, monkeypatch: Any) -> None:
+    pytest.importorskip("mjviser")
+    from viser import SceneApi
+
+    from mqe_jax.view.viewer import Viewer
+
+    lights: dict[str, Any] = {}
+    for name in ("configure_default_lights", "configure_environment_map", "add_light_directional"):
+        monkeypatch.setattr(SceneApi, name, lambda _, *first, name=name, **rest: lights.update({name: (first, rest)}))
+    viewer, run = Viewer(port=free_port()), session(Driven(), num_envs=num_envs)
+    viewer.show(run)
+    camera, robots = viewer.server.initial_camera, run.moment().frame.qpos[0, FakeEnv.robot_x[:, None] + np.arange(2)]
+    assert [lights[f"configure_{name}"][0] for name in ("default_lights", "environment_map")] == [(False,), (None,)]
+    assert lights["add_light_directional"][1]["cast_shadow"] is False
+    distance = float(np.linalg.norm(np.subtract(camera.position, camera.look_at)))
+    followed, (position, target) = num_envs == 1, viewer._stage.overview()
+    middle = robots.mean(axis=0) if followed else np.zeros(2)
+    np.testing.assert_allclose(np.asarray(viewer._stage._root.position)[:2], -middle, atol=1e-5)
+    near, whole = 3.0 + np.linalg.norm(np.subtract(*robots)), np.linalg.norm(np.subtract(position, target))
+    assert distance == pytest.approx(near if followed else whole, abs=0.02) and whole > near + 0.2
+    viewer.server.stop()
+
+
 def test_matches_are_counted_by_outcome() -> None:
     run = session(FakeEnv())
     run.outcomes, run.counts = ("win", "draw", "loss"), np.zeros(3, int)
