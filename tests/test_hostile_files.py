@@ -228,9 +228,6 @@ def test_bad_archives(case: str, tmp_path: Path) -> None:
         load_recording(path)
 
 
-# -- what is packed for another machine --------------------------------------------------------------------------------
-
-
 # -- impossible content, whose checksum is right -----------------------------------------------------------------------
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -238,7 +235,7 @@ SETTINGS = run_settings(normalization__observations=True, ppo__epochs=1, ppo__mi
 
 
 @pytest.fixture(scope="module")
-def trained_ranges(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a short run."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     train(PROBE, SETTINGS, folder)

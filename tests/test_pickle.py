@@ -82,29 +82,27 @@ def test_policies(name: str) -> None:
 
 def test_another_process_steps_environments_and_policies_alike(tmp_path: Path) -> None:
     """Gymnasium's copies keep their state."""
-    env = make("go1plane", num_envs=2, **PLANE)
+    env, file = make("go1plane", num_envs=2, **PLANE), tmp_path / "all"
     single = gymnasium.make("mqe/go1wrestling-v0", opponent="random", **PLANE)
     several = gymnasium.make_vec("mqe/go1plane-v0", num_envs=2, **PLANE)
-    everything = env, load_policy("random", env), single, several
     for each in (single, several):
         each.reset(seed=0)
+    everything = env, load_policy("random", env), single, several
     code = """
 import pathlib, pickle, sys
 import jax, numpy as np
-env, policy, *adapters = pickle.loads(pathlib.Path(sys.argv[1]).read_bytes())
-state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-action, _ = policy.act(state.obs[None], (), jax.random.PRNGKey(0))
-after = [jax.jit(env.step)(state, action[0]).data.qpos]
-after += [each.step(np.full(each.action_space.shape, 0.1, np.float32))[0] for each in adapters]
-pathlib.Path(sys.argv[1]).write_bytes(pickle.dumps([np.asarray(x) for x in after]))
+def step(env, policy, *adapters):
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    action, _ = policy.act(state.obs[None], (), jax.random.PRNGKey(0))
+    after = [np.asarray(jax.jit(env.step)(state, action[0]).data.qpos)]
+    return after + [each.step(np.full(each.action_space.shape, 0.1, np.float32))[0] for each in adapters]
+if __name__ == "__main__":
+    file = pathlib.Path(sys.argv[1])
+    file.write_bytes(pickle.dumps(step(*pickle.loads(file.read_bytes()))))
 """
-    file = tmp_path / "all"
     file.write_bytes(pickle.dumps(everything))
     subprocess.run([sys.executable, "-c", code, str(file)], check=True)
-    stepped = pickle.loads(file.read_bytes())
-    state = jax.jit(env.reset)(KEY)
-    action, _ = everything[1].act(state.obs[None], (), KEY)
-    assert_close = lambda one, other: np.testing.assert_allclose(one, other, atol=1e-5)  # noqa: E731
-    assert_close(stepped[0], jax.jit(env.step)(state, action[0]).data.qpos)
-    for each, other in zip((single, several), stepped[1:], strict=True):
-        assert_close(each.step(np.full(each.action_space.shape, 0.1, np.float32))[0], other)
+    here: dict[str, Any] = {}
+    exec(code, here)
+    for one, other in zip(here["step"](*everything), pickle.loads(file.read_bytes()), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)

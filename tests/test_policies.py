@@ -153,8 +153,8 @@ def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:
     loaded = load_policy(half)
     assert {x.dtype for x in jax.tree.leaves(loaded.params)} == {jnp.dtype("float32")}
     obs = jax.random.normal(jax.random.PRNGKey(1), (64, 2, policy.needs.dims.observation))
-    actions = [each.act(obs, each.initial_memory(64))[0] for each in (policy, loaded)]
-    np.testing.assert_allclose(*actions, atol=5e-3)
+    one, other = (each.act(obs, each.initial_memory(64))[0] for each in (policy, loaded))
+    np.testing.assert_allclose(one, other, atol=5e-3)
     with pytest.raises(NonFiniteError, match="holds NaN or infinite"):
         huge = jax.tree.map(lambda x: 1e6 * jnp.ones_like(x), policy.params)
         save_policy(tmp_path, dataclasses.replace(policy, params=huge), half=True)

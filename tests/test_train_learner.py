@@ -11,7 +11,7 @@ import pytest
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, override
-from mqe_jax.core.types import VectorEnv
+from mqe_jax.core.types import Batch, VectorEnv
 from mqe_jax.policies import SimplePolicy
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
@@ -58,15 +58,34 @@ VARIANTS = {
     },
     "happo": {"network__share_policy": False, "ppo__value": "joint", "ppo__epochs": 2},
 }
-Happo: type[Stages] = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "happo.py"))["Happo"]
+Happo: Any = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "happo.py"))["Happo"]
+TURNS: list[Any] = []
+"""Advantages and active agents, then ratios, of every turn of `NotedHappo`."""
+
+
+class Noted(Stages):
+    def update(self, carry: Any, batch: Batch, now: Any, key: jax.Array) -> Any:
+        jax.debug.callback(lambda *turn: TURNS.append(turn), batch.advantage, batch.active, ordered=True)
+        return super().update(carry, batch, now, key)
+
+
+class NotedHappo(Happo, Noted):
+    def _ratio(self, *inputs: Any) -> jax.Array:
+        jax.debug.callback(TURNS.append, ratio := super()._ratio(*inputs), ordered=True)
+        return ratio
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     env = Probe(probes.show_hidden, probes.pay_sum_and_difference, num_envs=32)
-    _, metrics = learn(env, small(**VARIANTS[variant]), 60, Happo if variant == "happo" else Stages)
+    _, metrics = learn(env, small(**VARIANTS[variant]), 60, NotedHappo if variant == "happo" else Stages)
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
     assert float(metrics["ended"]["episode_length"]) == 4.0
+    if variant == "happo":
+        (advantage, active), ratio, (next_advantage, _), _ = TURNS[-4:]
+        factor = ratio[..., active[0, 0].argmax(), None]
+        np.testing.assert_allclose(next_advantage, advantage * factor, rtol=1e-5)
+        assert np.abs(factor - 1).max() > 1e-3
 
 
 def test_an_environment_of_two_teams_is_refused() -> None:
