@@ -131,6 +131,16 @@ def test_commands_on_pages_exist(page: str) -> None:
     check_commands(read(page))
 
 
+def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
+    pytest.importorskip("mkdocs")
+    pages = importlib.import_module("docs_pages").pages()
+    for name, task in TASKS.items():
+        assert pages[f"tasks/{name}.md"].startswith(f"# {task.title} (`{name}`)\n\n{task.aim}\n")
+        assert {"render", "train", "view"} == {words[1] for words in commands(pages[f"tasks/{name}.md"])}
+    for text in [*pages.values(), *(path.read_text(encoding="utf-8") for path in (ROOT / "mqe_jax").rglob("*.py"))]:
+        check_commands(text)
+
+
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs")
     pytest.importorskip("mkdocstrings")

@@ -15,6 +15,7 @@ from mqe_jax.physics.engines import c
 from mqe_jax.physics.robots.motors import Motors, leg_response
 from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
+from tests.driving import start_in_air
 from tests.test_engines import QUICK
 
 SOAK = pytest.mark.soak
@@ -92,6 +93,13 @@ def test_the_response_is_that_of_a_leg() -> None:
     response = leg_response(robots.get("go1"))
     assert response.shape == (3, 3) and np.all(np.diff(np.diag(response)[1:]) > 0) and response[1, 2] > 20.0
     np.testing.assert_allclose(response, response.T, rtol=1e-6)
+
+
+def test_joints_in_the_air_start_along_their_torque_line() -> None:
+    """Explicit integration of a physics step exceeds the line, an implicit one stays below."""
+    for joint, row in start_in_air("go2").items():
+        for name in ("torque", "speed_5", "speed_10"):
+            assert 0.75 < row[name] / row[f"line_{name}"] < 1.35, (joint, row)
 
 
 @pytest.mark.parametrize("robot", ["go1", pytest.param("go2", marks=SOAK)])

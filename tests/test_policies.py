@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mqe_jax
 from mqe_jax import cli, skills
 from mqe_jax.cli.commands import Eval
 from mqe_jax.core.errors import InputError, NonFiniteError
@@ -25,6 +27,7 @@ from mqe_jax.policies.scripted import planner_of
 from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.policies.scripted.matches import plan_tug
 from mqe_jax.runs.build import players
+from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import SKILLS, Command, Skill
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, save_policy
@@ -54,6 +57,18 @@ def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> N
     assert all(0.0 <= rate <= 1.0 for rate in (*card.results.values(), *card.endings.values()))
     assert {*card.endings} == {*ENDINGS}
     assert sum(card.endings.values()) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_cards_have_the_rates_of_the_readme(capfd: pytest.CaptureFixture[str]) -> None:
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\|.* `(go1[\w-]+)`:[^|]*\| ([\d.]+) \| ([\d.]+) \|", readme, re.MULTILINE)
+    assert {row[0] for row in rows} == {*zoo.names()} and cli.main(["zoo"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    listed = {line.split()[0]: line.split()[1:3] for line in lines if line.startswith("go1")}
+    for task, *rates in rows:
+        count = 2 if task in MATCHES else 1
+        assert [*map(float, listed[task][:count])] == [*map(float, rates[:count])], task
 
 
 def test_a_shipped_policy_does_what_its_card_says() -> None:
@@ -335,6 +350,16 @@ def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: 
     assert env.name == "go1gate" and isinstance(policy, TrainedPolicy)
     with pytest.raises(InputError, match="go1gate"):
         players(**Eval(target="./go1gate", impl="c").playing)
+
+
+def test_what_a_user_makes_says_what_it_is() -> None:
+    env = make("go1tug", impl="c", num_envs=4, episode_length=3.0, rewards={"push": 4})
+    start, end = "<go1tug: 1 vs 1 agents, observation 10, action ", "engine c, episode_length=3.0, rewards.push=4.0>"
+    batch, scripted = VectorEnv(env, 4), load_policy("scripted", env)
+    assert repr(env).startswith(start) and repr(env).endswith(end)
+    policy = "SimplePolicy(task='go1tug', agents=1, name='scripted')"
+    assert repr(versus(batch, [scripted])) == f"<Versus of 4 against [{policy}]: <VectorEnv of 4: {env!r}>>"
+    assert {*mqe_jax.__all__} <= {*dir(mqe_jax)} and "annotations" not in dir(mqe_jax)
 
 
 def test_who_acts_is_named() -> None:

@@ -21,7 +21,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import read_policy
-from mqe_jax.train.runner import train
+from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
 from tests.test_opponents import matches
 from tests.training import Probe, content, differences
@@ -142,3 +142,16 @@ def test_typed_keys_are_saved(tmp_path: Path) -> None:
     loaded = load_tree(tmp_path / "file", jax.eval_shape(lambda: tree), kind="checkpoint").tree
     for name, key in tree.items():
         assert loaded[name].dtype == key.dtype and (jnp.asarray(loaded[name] == key)).all()
+
+
+def test_a_training_resumes_with_its_own_generator(tmp_path: Path) -> None:
+    config, states = settings(network__recurrent=False), []
+    with jax.default_prng_impl("rbg"):
+        train(PROBE, config, tmp_path / "whole")
+        note = lambda state, row: states.append(state)  # noqa: E731
+        train_seeds(PROBE, [config], [tmp_path / "half"], on_update=note, stop=lambda: len(states) == 2)
+    with pytest.raises(InputError, match=r"jax_default_prng_impl.*rbg"):
+        train(PROBE, config, tmp_path / "half", resume=True)
+    with jax.default_prng_impl("rbg"):
+        train(PROBE, config, tmp_path / "half", resume=True)
+    assert not differences(content(tmp_path / "whole"), content(tmp_path / "half"))

@@ -102,6 +102,29 @@ def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("terminal", [False, True])
+def test_compiling_is_shown_and_does_not_count(terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    """20 s of compiling, then 60 s for each hundredth of the steps."""
+    now = [0.0]
+    monkeypatch.setattr(logs.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(logs, "_PLAIN_SECONDS", 0.0)
+    monkeypatch.setattr(logs.Console, "is_terminal", terminal)
+    monkeypatch.setenv("COLUMNS", "120")
+    with logs.ProgressLog("gate", 10_000) as log:
+        with log.doing("compiling"):
+            now[0] += 20.0
+            if log._bar is not None:
+                log._bar.refresh()
+        log.start(1_000)
+        for step in (1_100, 1_200):
+            now[0] += 60.0
+            log.write({"env_steps": step, "fps": 10.0})
+    said = capsys.readouterr().err
+    assert ("compiling (0:00:20)" if terminal else "gate: compiling") in said
+    assert said.count("takes about 89 minutes here; on a CPU, mqe train go1gate --config demo") == 1
+    assert "1:28:00 left" in said
+
+
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find(name))
