@@ -104,7 +104,7 @@ def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_compiling_is_shown_and_does_not_count(terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    """20 s of compiling, then 60 s for each hundredth of the steps."""
+    """20 s of compiling, then 20 s of evaluating and 60 s of work for each hundredth of the steps."""
     now = [0.0]
     monkeypatch.setattr(logs.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(logs, "_PLAIN_SECONDS", 0.0)
@@ -117,6 +117,8 @@ def test_compiling_is_shown_and_does_not_count(terminal: bool, monkeypatch: pyte
                 log._bar.refresh()
         log.start(1_000)
         for step in (1_100, 1_200):
+            with log.doing("evaluating"):
+                now[0] += 20.0
             now[0] += 60.0
             log.write({"env_steps": step, "fps": 10.0})
     said = capsys.readouterr().err
