@@ -47,6 +47,15 @@ def test_a_flag_of_one_process_is_true_for_all() -> None:
         assert together(devices.any_of)(jnp.array(flags)).tolist() == [any(flags)] * 2
 
 
+def test_processes_of_different_settings_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes = devices.Processes({}, {})
+    monkeypatch.setattr(processes, "gather", lambda numbers: np.array([numbers, numbers]))
+    processes.check_equal("settings")
+    monkeypatch.setattr(processes, "gather", lambda numbers: np.array([numbers, [numbers[0] + 1]]))
+    with pytest.raises(InputError, match="processes have different settings"):
+        processes.check_equal("settings")
+
+
 def test_random_numbers_belong_to_the_environment() -> None:
     """Of 6 environments on 1, 2 and 3 processes; `alone` draws the same in all."""
     whole = jax.random.normal(KEY, (6, 2))

@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import parse_json, read_rows, read_tensors
+from mqe_jax.core.files import linear_layers, parse_json, read_rows, read_tensors
 from mqe_jax.core.settings import override
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.selfplay.league import pool
@@ -333,6 +333,12 @@ def test_a_policy_of_impossible_metadata(metadata: dict[str, Any], said: str, tr
     rewrite(path, "policy", "normalizer/samples", 1.0, metadata)
     with pytest.raises(InputError, match=rf"policy\.safetensors: its settings cannot be read \({said}"):
         read_policy(path)
+
+
+def test_weights_that_no_network_has() -> None:
+    layers = {"0.weight": np.full((32, 6), 1e20, np.float32), "0.bias": np.zeros(32, np.float32)}
+    with pytest.raises(InputError, match=r"^weights: 0\.weight holds magnitudes to 1e\+20; at most 10000 is allowed"):
+        linear_layers("weights", layers, {"0": (6, 32)})
 
 
 @pytest.mark.parametrize("steps", ["16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16"])

@@ -82,10 +82,11 @@ def test_only_drawing_needs_a_gl_library(tmp_path: Path) -> None:
     assert (tmp_path / "clip.png").stat().st_size
 
 
-def test_help_needs_no_docstrings(tmp_path: Path) -> None:
-    code = "import sys; from mqe_jax.cli import main; main(['--help']); sys.exit(main(['train', '--help']))"
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"]])
+def test_help_needs_no_docstrings(words: list[str], tmp_path: Path) -> None:
+    code = f"import sys; from mqe_jax.cli import main; sys.exit(main({words}))"
     said = run(code, tmp_path, env={**os.environ, "PYTHONOPTIMIZE": "2"}).stdout
-    assert "usage: mqe COMMAND" in said and "--ppo.gae-lambda" in said
+    assert ("--ppo.gae-lambda" if "train" in words else "usage: mqe COMMAND") in said
 
 
 def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
