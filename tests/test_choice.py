@@ -102,7 +102,7 @@ def test_each_skill_gets_commands_that_it_is_trained_for(match: Any) -> None:
     np.testing.assert_allclose(commands[skill.index((*names, "skill"))], [2.5, -1.0, 2.5, 1.0])
     given = {}
     for part, bounds, columns in zip(skill.parts, skill._bounds, skill._columns, strict=True):
-        own = part.bounded(jnp.clip(commands[columns], *bounds))
+        own = part.limit_turn(jnp.clip(commands[columns], *bounds))
         given[part.name] = np.asarray(own)[part.index(names)]
     np.testing.assert_allclose(given["walk"], [1.2, -0.7, 1.2], rtol=1e-6)
     np.testing.assert_allclose(given["agile"], [2.5, -1.0, 1.2], rtol=1e-6)  # |vx x yaw rate| is at most 3
@@ -117,7 +117,7 @@ def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(name: str, 
     assert isinstance(own, TrainedPolicy) and isinstance(translated, Translated)
     actions = [x.act(obs, x.initial_memory(64), key)[0][:, 0] for x in (own, translated)]
     commands = [env.controller.skill_commands(x)[:, :3] for env, x in zip((alone, match), actions, strict=True)]
-    bounded = match.controller.skill.parts[BOTH.index(name)].bounded(commands[1])
+    bounded = match.controller.skill.parts[BOTH.index(name)].limit_turn(commands[1])
     np.testing.assert_allclose(bounded, commands[0], atol=1e-6)
     assert set(np.asarray(actions[1])[:, 3].tolist()) == {-0.5 if name == "walk" else 0.5}
 

@@ -139,7 +139,7 @@ def test_the_best_of_several_episodes_is_rendered(tmp_path: Path, monkeypatch: A
         for n, success, reward in ((6, 0.5, 2.0), (4, 1.0, 0.5), (5, 1.0, 1.0))
     ]
     rendered = []
-    monkeypatch.setattr(recording, "record", lambda *arguments, **named: recorded)
+    monkeypatch.setattr(recording, "record_episodes", lambda *arguments, **named: recorded)
     monkeypatch.setattr(render, "render_episode", lambda env, episode, path, **named: rendered.append(episode) or "egl")
     assert cli.main(["render", "fake", "-o", str(tmp_path / "clip.png"), "--best-of", "3", "--json"]) == 0
     said = json.loads(capfd.readouterr().out)

@@ -27,7 +27,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, check, load_yaml, override
 from mqe_jax.envs import TASKS, QuadrupedEnv, VectorEnv, make, register_task
 from mqe_jax.envs.registry import register_planner
-from mqe_jax.envs.replay import Recording, load_recording
+from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
 from mqe_jax.policies import all_agents
@@ -44,7 +44,7 @@ from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import register_network
 from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy, save_policy
 from mqe_jax.train.runner import train
-from mqe_jax.viz import recording, render
+from mqe_jax.viz import clips, curves, recording, render
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
 
@@ -221,6 +221,17 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("unknown name", lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}), ("self", "__dataclass_self__", "init")),
     ("path: ", lambda x, v: v[0](v[1]), tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0")))),
     ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),
+    ("env: ", lambda x, v: save_recording("a.npz", v, None, None), (None, "go1gate")),
+    ("recording: ", lambda x, v: replay(v), (None, "a.npz")),
+    ("policy: ", lambda x, v: tournament.play(x["matches"], v, [], KEY), (None, "idle", TrainedPolicy)),
+    ("policies", lambda x, v: tournament.round_robin(x["matches"], v, KEY), (None, [], {}, {"a": "idle"})),
+    ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones((2, 2)), np.full((2, 2, 3), NAN))),
+    ("reference: ", lambda x, v: tournament.rate(GAMES, v), (None, -1, 1, "a")),
+    ("episodes", lambda x, v: recording.best(v), (None, [], [3])),
+    ("episodes", lambda x, v: recording.typical(v), (None, [], [3])),
+    ("episode: ", lambda x, v: render.render_frames(x["fake"], v), (None, 3)),
+    ("frames: ", lambda x, v: clips.write_clip(Path("a.gif"), v, 25.0), (None, 3)),
+    ("tables", lambda x, v: curves.plot_curves(v, "a"), (None, [], [3])),
     ("name: ", lambda x, v: robots.get(v), (None, 3, {}, [])),
     ("not a regular file", lambda x, v: v[0](v[1]), FILES),
 ]  # fmt: skip

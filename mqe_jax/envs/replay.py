@@ -16,6 +16,7 @@ from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import archive, parse_json, write_atomically
 from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, fail, to_mapping
+from mqe_jax.core.types import AnySingle
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.physics.engines import STATE_FIELDS
@@ -55,6 +56,7 @@ class Recording:
         return make(self.task, impl=impl, control=self.control, num_envs=1, **self.params)
 
 
+@check_arguments(file=PathText, env=AnySingle, states=State)
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
     """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
@@ -80,6 +82,7 @@ def load_recording(file: str | pathlib.Path) -> Recording:
             raise ValueError(error) from None
 
 
+@check_arguments(recording=Recording, env=AnySingle | None)
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
     """Replays a recording, by default on the recorded engine; returns the states after each action (T, ...)."""
     env = recording.make_env() if env is None else env

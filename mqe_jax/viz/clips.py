@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from PIL import Image
 from mqe_jax.core import files
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import replacing
-from mqe_jax.core.settings import fail
+from mqe_jax.core.limits import Positive
+from mqe_jax.core.settings import PathText, check_arguments, fail
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
@@ -41,6 +42,7 @@ def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at
     return path
 
 
+@check_arguments(path=PathText, frames=Iterable, fps=Positive)
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
     suffix = path.suffix.lower()

@@ -6,14 +6,16 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import mujoco
 import numpy as np
+from annotated_types import MinLen
 from numpy.typing import ArrayLike
 
 from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
+from mqe_jax.core.settings import check_arguments
 from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
@@ -33,6 +35,7 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
     return [float(window.mean()) if window.size else math.nan for window in windows]
 
 
+@check_arguments(tables=Annotated[Sequence[Mapping[str, Any]], MinLen(1)], title=str)
 def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> Figure:
     """Returns a figure of average step reward (else return) and success over environment steps.
 

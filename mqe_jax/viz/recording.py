@@ -2,11 +2,12 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from annotated_types import MinLen
 
 from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength
 from mqe_jax.core.precision import single
@@ -108,11 +109,13 @@ def record_episodes(
     return recorded
 
 
+@check_arguments(episodes=Annotated[list[Episode], MinLen(1)])
 def best(episodes: list[Episode]) -> Episode:
     """Returns the best episode: by success, then by average step reward."""
     return max(episodes, key=lambda episode: (episode.success, episode.reward))
 
 
+@check_arguments(episodes=Annotated[list[Episode], MinLen(1)])
 def typical(episodes: list[Episode]) -> Episode:
     """Returns the median of the successful episodes, by success, then by average step reward; of all if none is."""
     successful = [episode for episode in episodes if episode.success > 0] or episodes

@@ -128,6 +128,7 @@ def grain(model: mujoco.MjModel) -> None:
     model.geom_matid[model.geom_group == GROUND_GROUP] = material
 
 
+@check_arguments(env=AnySingle, episode=Episode)
 def render_frames(
     env: QuadrupedEnv,
     episode: Episode,

@@ -8,18 +8,21 @@ import io
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pydantic
+from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from mqe_jax.core.files import replacing, write_atomically
+from mqe_jax.core.limits import NonNegativeInt
 from mqe_jax.core.literal import line, to_label
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, check_arguments
-from mqe_jax.core.types import RESULTS, observations
+from mqe_jax.core.settings import PathText, check_arguments, fail
+from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
 from mqe_jax.envs import VectorEnv
 from mqe_jax.selfplay.opponents import Versus
 from mqe_jax.train.policy import Policy, check_policy
@@ -41,7 +44,19 @@ class Ratings(NamedTuple):
     high: Array
 
 
+def _check_results(value: Any) -> Any:
+    shape = np.shape(value)
+    if shape != (*shape[:1] * 2, 3) or not np.all(np.isfinite(value)) or np.min(value) < 0:
+        raise ValueError("outcomes of policies against policies, as of round_robin")
+    return value
+
+
+Results = Annotated[Any, pydantic.AfterValidator(_check_results)]
+"""Kind of an argument that is a result of `round_robin`."""
+
+
 @single
+@check_arguments(matches=AnyBatch, policy=AnyPolicy, key=RandomKey)
 def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns a policy's outcomes as team 0 against each of K opponents, in each environment's first episode (K, 3)."""
     check_policy(policy, matches)
@@ -68,6 +83,7 @@ def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: j
     return np.asarray(run(key)).reshape(-1, len(opponents), 3).sum(axis=0)
 
 
+@check_arguments(matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey)
 def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `RESULTS`."""
     keys = jax.random.split(key, len(policies))
@@ -75,18 +91,22 @@ def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Arr
     return np.stack([play(matches, policy, teams, k) for policy, k in zip(teams, keys, strict=True)])
 
 
+@check_arguments(results=Results)
 def scores(results: NDArray[Any]) -> Array:
     """Returns the points of each policy against each, as both teams together, in games; a draw counts half (P, P)."""
     points = results[..., 0] + 0.5 * results[..., 1]
     return points + (results.sum(axis=-1) - points).T
 
 
+@check_arguments(results=Results, reference=NonNegativeInt)
 def rate(results: NDArray[np.int64], reference: int) -> Ratings:
     """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `reference` is 0, and their intervals.
 
     A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
     of a Bayesian bootstrap (doi 10.1214/aos/1176345338) of all these games.
     """
+    if reference >= len(results):
+        fail("reference", reference, f"the index of one of the {len(results)} policies")
     games = results + np.array([0.0, 0.5, 0.0])
     weights = np.random.default_rng(0).standard_gamma(games, (_SAMPLES, *games.shape))
     weights *= games.sum(axis=-1, keepdims=True) / weights.sum(axis=-1, keepdims=True)
