@@ -56,7 +56,7 @@ class Recording:
         return make(self.task, impl=impl, control=self.control, num_envs=1, **self.params)
 
 
-@check_arguments(file=PathText, env=AnySingle, states=State)
+@check_arguments(file=PathText, env=AnySingle)
 def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
     """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
