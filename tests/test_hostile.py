@@ -221,7 +221,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("unknown name", lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}), ("self", "__dataclass_self__", "init")),
     ("path: ", lambda x, v: v[0](v[1]), tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0")))),
     ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),
-    ("env: ", lambda x, v: save_recording("a.npz", v, None, None), (None, "go1gate")),
+    ("env: ", lambda x, v: save_recording("a.npz", v, x["states"], KEY), (None, "go1gate")),
     ("recording: ", lambda x, v: replay(v), (None, "a.npz")),
     ("policy: ", lambda x, v: tournament.play(x["matches"], v, [], KEY), (None, "idle", TrainedPolicy)),
     ("policies", lambda x, v: tournament.round_robin(x["matches"], v, KEY), (None, [], {}, {"a": "idle"})),
