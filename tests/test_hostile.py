@@ -51,6 +51,7 @@ from tests import inputs
 KEY, NAN = jax.random.PRNGKey(0), math.nan
 LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3))
 WALLS = np.full((3, 2, 3), NAN)
+FRAME = np.zeros((16, 16, 3), np.uint8)
 GAMES = np.ones((1, 1, 3), np.int64)
 RATINGS = tournament.Ratings(np.zeros(1), np.zeros(1), np.zeros(1))
 
@@ -230,7 +231,10 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("episodes", lambda x, v: recording.best(v), (None, [], [3])),
     ("episodes", lambda x, v: recording.typical(v), (None, [], [3])),
     ("episode: ", lambda x, v: render.render_frames(x["fake"], v), (None, 3)),
-    ("frames: ", lambda x, v: clips.write_clip(Path("a.gif"), v, 25.0), (None, 3)),
+    ("frames: ", lambda x, v: clips.write_clip("a.gif", v, 25.0), (None, 3, [], ["x"], [WALLS], [FRAME, FRAME[:8]])),
+    ("output", lambda x, v: clips.write_clip(v, [FRAME], 25.0), ("a.txt", "a")),
+    ("Episode: ", lambda x, v: recording.Episode(v, v, v, 0.1), (None, WALLS)),
+    ("dt: ", lambda x, v: recording.Episode(WALLS[:, 0], WALLS[:, :0], np.zeros((3, 0, 4)), v), (None, -1.0, 0)),
     ("tables", lambda x, v: curves.plot_curves(v, "a"), (None, [], [3])),
     ("name: ", lambda x, v: robots.get(v), (None, 3, {}, [])),
     ("not a regular file", lambda x, v: v[0](v[1]), FILES),

@@ -43,14 +43,29 @@ def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at
 
 
 @check_arguments(path=PathText, frames=Iterable, fps=Positive)
-def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+def write_clip(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
-    suffix = path.suffix.lower()
-    with replacing(path) as temporary:
+    file, checked = check_output(Path(path)), _check_frames(frames)
+    suffix = file.suffix.lower()
+    with replacing(file) as temporary:
         if suffix == ".mp4":
-            _write_mp4(temporary, frames, fps)
+            _write_mp4(temporary, checked, fps)
         else:
-            _write_images(temporary, [Image.fromarray(frame) for frame in frames], suffix, fps)
+            _write_images(temporary, [Image.fromarray(frame) for frame in checked], suffix, fps)
+
+
+def _check_frames(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yields at least one frame, each (H, W, 3) uint8, as the first."""
+    first = None
+    for index, frame in enumerate(frames):
+        shape, dtype = getattr(frame, "shape", ()), getattr(frame, "dtype", type(frame).__name__)
+        first = first or shape
+        if dtype != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape or shape != first:
+            expected = "(H, W, 3)" if shape == first else str(first)
+            raise InputError(f"frames: frame {index} is {dtype} {shape}; it must be uint8 {expected}")
+        yield np.asarray(frame)
+    if first is None:
+        raise InputError("frames: there are none")
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:

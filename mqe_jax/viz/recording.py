@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from annotated_types import MinLen
 
-from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength, Positive
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check_arguments, fail
+from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.train.evaluate import Act, acting
@@ -36,6 +37,14 @@ class Episode:
     """Mean over steps of the sum of the reward terms."""
     settled: float = 0.0
     """Time from which `success` has its last value, s."""
+
+    def __post_init__(self) -> None:
+        shapes = [getattr(x, "shape", ()) for x in (self.qpos, self.mocap_pos, self.mocap_quat)]
+        bodies = (*shapes[0][:1], *shapes[1][1:2])
+        if len(shapes[0]) != 2 or shapes[1:] != [(*bodies, 3), (*bodies, 4)]:
+            allowed = "(T, nq), (T, M, 3) and (T, M, 4)"
+            raise InputError(f"Episode: qpos, mocap_pos and mocap_quat have the shapes {shapes}; expected {allowed}")
+        check("dt", self.dt, Positive)
 
     def __len__(self) -> int:
         return len(self.qpos)

@@ -128,7 +128,11 @@ def grain(model: mujoco.MjModel) -> None:
     model.geom_matid[model.geom_group == GROUND_GROUP] = material
 
 
-@check_arguments(env=AnySingle, episode=Episode)
+_SIZE = tuple[Pixels, Pixels]
+_BACKEND = Literal["auto", "egl", "osmesa"] | None
+
+
+@check_arguments(env=AnySingle, episode=Episode, size=_SIZE, backend=_BACKEND)
 def render_frames(
     env: QuadrupedEnv,
     episode: Episode,
@@ -141,6 +145,7 @@ def render_frames(
     `views` holds a camera for each frame, by default those of the view `scene`. `backend` is `auto` (from
     `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
+    _check_fits(env, episode)
     model = rendering_model(env.mj_model, episode)
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
