@@ -3,8 +3,6 @@
 Frame: the environment's; metre, second, radian.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -6,8 +6,6 @@ speed affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is tha
 calls of 50 environment steps, whole step and bare physics.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

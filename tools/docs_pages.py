@@ -7,8 +7,6 @@ built site needs neither the repository nor another host. The page of `mqe play-
 build/play, and else the site says how to build it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

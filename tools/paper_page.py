@@ -3,8 +3,6 @@
 The text between `<!-- begin NAME -->` and `<!-- end NAME -->` is replaced; NAME is one of those in `sections`.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

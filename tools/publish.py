@@ -7,8 +7,6 @@ a SWEEP only this.
 `python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into results/measurements.json under NAME.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import dataclasses

@@ -4,8 +4,6 @@
 the tag. The commands run in another folder, from which the source tree cannot be imported.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

@@ -6,8 +6,6 @@ Flat ground, episodes of 20 s, a new command every 4 s, drawn uniformly from the
 the agile skill (`wide`, of which walking gets what it is trained for). Changes come after 0.2 to 2 s. Prints JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Each module needs the library of the same name; without that library, importing 
 extra to install. `python -m mqe_jax.adapters SCRIPT` runs a script of such a library, which knows the tasks by name.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 The script creates a task by the `make` of its library: `ENV_NAME=go1gate` for the baselines of JaxMARL.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import runpy

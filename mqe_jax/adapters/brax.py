@@ -6,8 +6,6 @@ Importing this module registers every task under its id, for `brax.envs.get_envi
 episodes. Brax's own wrapper also works, except on Warp, but restarts an environment from the same initial state.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -7,8 +7,6 @@ The reward is the mean over the agents of team 0: all agents in cooperative task
 and, as `info["agent_rewards"]`, the rewards of all agents (A,).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

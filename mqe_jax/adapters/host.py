@@ -1,7 +1,5 @@
 """A batch of environments stepped from the host with numpy arrays, for the Gymnasium and PettingZoo adapters."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import warnings

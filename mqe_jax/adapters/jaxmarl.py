@@ -3,8 +3,6 @@
 Importing this module adds every task, under its id, to `jaxmarl.make` and `jaxmarl.registered_envs`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Arguments of `mqe`, by command."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import os

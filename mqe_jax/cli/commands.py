@@ -3,8 +3,6 @@
 Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 """
 
-from __future__ import annotations
-
 import textwrap
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal

@@ -1,7 +1,5 @@
 """The commands `export` and `play-site`."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command `launch`: a training in several processes, one for each device of one or many hosts."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

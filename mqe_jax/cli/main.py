@@ -1,7 +1,5 @@
 """The entry point of `mqe` and its exit codes."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

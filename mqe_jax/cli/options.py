@@ -1,7 +1,5 @@
 """What commands share: options; the `--json` object and tables on standard output, messages on standard error."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

@@ -1,7 +1,5 @@
 """The start of a command, and compiled programs that JAX stores: where they are, and that each file is whole."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import importlib

@@ -1,7 +1,5 @@
 """The commands `skill eval` and `skill convert`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path

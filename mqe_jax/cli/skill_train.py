@@ -1,7 +1,5 @@
 """The command `skill train`, whose flags are the settings of a skill's training."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated

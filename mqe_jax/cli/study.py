@@ -1,7 +1,5 @@
 """The commands `sweep`, `report` and `tournament`."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import field
 from pathlib import Path

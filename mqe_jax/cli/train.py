@@ -3,8 +3,6 @@
 JAX and MuJoCo are imported when it runs: a wrong flag is named before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any

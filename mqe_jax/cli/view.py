@@ -1,7 +1,5 @@
 """The command `view`."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import importlib.util

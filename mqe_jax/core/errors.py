@@ -1,7 +1,5 @@
 """Errors that the command line prints as one line, and suggestions of the nearest allowed name."""
 
-from __future__ import annotations
-
 import os
 import reprlib
 import sys

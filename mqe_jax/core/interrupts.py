@@ -4,8 +4,6 @@ Python runs a signal's handler between two of its own instructions, which compil
 loses an exception that is raised in a callback. So in the command line a thread waits for the signals.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

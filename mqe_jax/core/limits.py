@@ -4,8 +4,6 @@ Kinds of numbers are types of fields of records (`settings.record`) and of argum
 A plain `int` or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
 """
 
-from __future__ import annotations
-
 import typing
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Texts of others (paths, names, settings, errors), shown as they are: in a terminal, HTML, Markdown, or a figure."""
 
-from __future__ import annotations
-
 import html
 import re
 import sys

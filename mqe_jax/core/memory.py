@@ -1,7 +1,5 @@
 """Memory that a batch of environments or a rollout would need, compared with what is free before it is allocated."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Single precision, whatever `jax_enable_x64` is."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar

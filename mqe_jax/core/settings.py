@@ -15,8 +15,6 @@ Every number has bounds: those of its kind (`mqe_jax.core.limits`), or of `Numbe
 as a number) are accepted, bytes are not; "none" means None for an optional field.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import inspect

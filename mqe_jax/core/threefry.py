@@ -3,8 +3,6 @@
 The loops' small operations cost run time in every environment step, and more time to compile than the unrolled rounds.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Vectorised environments with automatic reset."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

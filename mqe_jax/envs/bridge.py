@@ -1,7 +1,5 @@
 """go1bridge, the paper's Traverse Bridge: two robots meet on a bridge wide enough for one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import jax

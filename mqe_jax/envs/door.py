@@ -1,7 +1,5 @@
 """go1revolvingdoor, the paper's Revolving Door: two robots compete to pass a door that is wide enough for one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import jax

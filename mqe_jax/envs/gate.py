@@ -1,7 +1,5 @@
 """go1gate, the paper's Narrow Gate: two robots pass, one after the other, through a gap wide enough for one."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

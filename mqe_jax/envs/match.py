@@ -4,8 +4,6 @@ A match is symmetric under a half turn about its centre ("turn") or a reflection
 the second half of the agents, observes in the transformed frame, so that one policy can control either team.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import jax

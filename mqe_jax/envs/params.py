@@ -1,7 +1,5 @@
 """Parameters common to all tasks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 

@@ -1,7 +1,5 @@
 """go1plane: robots on flat ground without obstacles, for tests and demonstrations."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

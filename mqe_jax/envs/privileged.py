@@ -1,7 +1,5 @@
 """The privileged observation: the simulator's state and randomised physics, for critics and distillation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

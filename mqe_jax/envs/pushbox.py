@@ -1,7 +1,5 @@
 """go1pushbox, the paper's Push Box: two robots push a box, too heavy for one of them, through a gate."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

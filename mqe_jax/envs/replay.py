@@ -1,7 +1,5 @@
 """Recordings of one environment: saved where the physics diverged, and replayed for analysis."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

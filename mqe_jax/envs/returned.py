@@ -1,7 +1,5 @@
 """Checks of what the methods of a task return; a ValueError names the method, what it returned and what is expected."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
 

@@ -1,7 +1,5 @@
 """Rewards: named terms times weights of the same names, summed and logged in one place."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """go1seesaw, the paper's Climb on Seesaw: one robot keeps a seesaw tilted while the other walks up to a platform."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -1,7 +1,5 @@
 """Batches of environments that show another batch differently, for training."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """go1wrestling, the paper's Sumo Wrestling: two robots try to push each other out of a ring or tip each other over."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import jax

@@ -1,7 +1,5 @@
 """Compares an exported graph in onnxruntime with the exported function, on episodes of the task."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from typing import Any

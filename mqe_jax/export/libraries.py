@@ -1,7 +1,5 @@
 """The page's browser libraries: npm packages at pinned versions, checked by SHA-256 and kept in the user's cache."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import subprocess

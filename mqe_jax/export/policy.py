@@ -15,8 +15,6 @@ and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: those of the s
 `memory` if it is one array, else `memory_NAME`.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Mapping

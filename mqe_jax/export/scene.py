@@ -1,7 +1,5 @@
 """A task's scene for other programs: MJCF, and the numbers that stepping and drawing need beside it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -5,8 +5,6 @@ graphs of `mqe_jax.export.task`, and `starts.bin`: `STARTS` initial states sampl
 shared by all tasks, as files named by their content.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -15,8 +15,6 @@ The state is `qpos`, `qvel`, `sensordata`, `step` (environment steps since the r
 normal numbers. The next value of an input X is the output `next_X`; recurrent states start at zero.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Translates a JAX function to an ONNX graph over a symbolic batch axis, by jax2onnx."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Collision bits: two geoms collide where the contype of one shares a bit with the other's conaffinity."""
 
-from __future__ import annotations
-
 GROUND_BIT, WALL_BIT, OBJECT_BIT = 1, 2, 4
 MAX_ROBOTS = 16
 

@@ -1,7 +1,5 @@
 """Scene objects: records, which a task's parameters may nest, that add one body each to a scene; SI units."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

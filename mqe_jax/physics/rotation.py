@@ -1,7 +1,5 @@
 """Rotations: quaternions wxyz, and roll, pitch, yaw in rad."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike

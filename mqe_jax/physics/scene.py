@@ -1,7 +1,5 @@
 """A scene: a track, N robots and movable objects, compiled to a MuJoCo model with its index tables."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Mapping
 

@@ -1,7 +1,5 @@
 """Settings to environments and learners: what users name becomes a training, or the players of an episode."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

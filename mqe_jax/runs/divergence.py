@@ -1,7 +1,5 @@
 """Recordings of environments whose physics diverges, in training and evaluation."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections import deque

@@ -1,7 +1,5 @@
 """Shipped settings of trainings, by name; it imports no JAX."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A sweep by one call: many trainings in one folder, and their report."""
 
-from __future__ import annotations
-
 import functools
 import math
 import time

@@ -1,7 +1,5 @@
 """Throughput in environment steps per second: of whole steps with skill and resets, and of physics alone."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Cells of a study and their estimates over seeds: bands, final values, scores and aggregates."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Figures of a study as PNG: learning curves, evaluations during training, profiles, terms of the reward."""
 
-from __future__ import annotations
-
 import io
 import itertools
 from collections.abc import Iterator, Mapping, Sequence

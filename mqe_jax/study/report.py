@@ -1,7 +1,5 @@
 """The report of a sweep, generated from its finished runs: the same files from the same runs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

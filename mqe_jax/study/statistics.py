@@ -5,8 +5,6 @@ Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al. 
 MARL). Numbers equal those of the `rliable` package (tests/test_study_report.py).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ FOLDER/runs/...      run folders, complete, with checkpoints
 FOLDER/report/...    the report, regenerated when the sweep ends (`mqe_jax.study.report`)
 """
 
-from __future__ import annotations
-
 import contextlib
 import fnmatch
 import itertools

@@ -1,7 +1,5 @@
 """The network `actor_critic`: feed-forward or recurrent actors, centralised or decentralised critic."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Checkpoints of any pytree of arrays, written atomically as safetensors files."""
 
-from __future__ import annotations
-
 import json
 import re
 import zlib

@@ -1,7 +1,5 @@
 """Checks that training settings fit the environment and the network."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Settings of a training run: typed, validated, nested records that YAML files and flags mirror."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 

@@ -7,8 +7,6 @@ checkpoints/           complete learner states (`checkpoint.save_checkpoint`)
 evaluations.json       evaluations during training, best/ the policy of the best one (`monitor.EvaluationLog`)
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path

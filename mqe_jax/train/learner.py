@@ -4,8 +4,6 @@ A rollout of all environments, advantages, then epochs of minibatches. MAPPO, JR
 differ in the ratio that PPO clips, the value (per agent or per team) and the network; all three are settings.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Training loggers: a CSV file, TensorBoard events, Weights & Biases, progress on the terminal."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import importlib

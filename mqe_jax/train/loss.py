@@ -1,7 +1,5 @@
 """Generalised advantage estimation, and elementwise terms of the PPO loss, which the caller averages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -7,8 +7,6 @@ log-probabilities.
 Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as in OpenRL.
 """
 
-from __future__ import annotations
-
 import math
 
 import jax

@@ -6,8 +6,6 @@
 Source: Gorsane et al. 2022, arXiv 2209.10485, section 4.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

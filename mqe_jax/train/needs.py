@@ -1,7 +1,5 @@
 """What a policy needs of its environment: its file holds it, and `mqe_jax.train.policy.check_policy` compares it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Network layers as `init` / `apply` pairs over nested dicts of arrays."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

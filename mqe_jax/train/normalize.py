@@ -1,7 +1,5 @@
 """Running statistics: of all observations, and exponentially averaged ones of value targets."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The optimiser: Adam with clipping by global norm, as an `init` / `update` pair."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Policies: whatever acts for a team, and the trained ones, which are saved, loaded and exchanged."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

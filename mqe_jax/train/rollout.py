@@ -1,7 +1,5 @@
 """Steps all environments under the current policy; collects transitions and metrics; forms minibatches."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax

@@ -1,7 +1,5 @@
 """The settings that change during training, as functions of the number of updates done."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

@@ -3,8 +3,6 @@
 Warp's contact buffers are shared and overwritten in every step: one copy suffices, and checkpoints omit them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

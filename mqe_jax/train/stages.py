@@ -1,7 +1,5 @@
 """The stages of an update of the learner: advantages, loss, gradient steps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """The state from which a training run starts: sampled, or restored from a checkpoint of the same settings."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math

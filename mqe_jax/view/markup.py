@@ -1,7 +1,5 @@
 """HTML of the panel. viser's Markdown renders HTML that is in a text, so every text of the panel is escaped here."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What can be chosen in the page: a task, its policy and opponent from the package and from run folders."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the scene can show over the robots: contact points with their forces, and collision shapes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -1,7 +1,5 @@
 """The control panel in the browser: choices, state, buttons, keys, readouts, live plots."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -8,8 +8,6 @@ viser has no setting for this. Written for viser 1.1.1, which starts its server 
 While viser starts, that name is replaced by a function that adds the documented argument `process_request`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import http

@@ -1,7 +1,5 @@
 """The simulation behind the viewer: environments, a policy, and a teleoperated robot. Independent of the browser."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The 3-D scene in the browser: environments side by side, one batch of instances per mesh."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

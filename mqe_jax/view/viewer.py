@@ -1,7 +1,5 @@
 """The viewer: a local web server, and the loop that steps and renders in real time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

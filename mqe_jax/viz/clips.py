@@ -1,7 +1,5 @@
 """Clips and images, written atomically: .mp4, .webp, .gif and .png."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Free cameras whose image contains some points; what an image contains; the legend of a clip."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

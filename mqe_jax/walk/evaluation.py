@@ -1,7 +1,5 @@
 """Evaluation of a skill: tracking, falls, pushes, shoves, slopes, forces, standing, gait frequency."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -14,8 +14,6 @@ exchanging a gait's left and right feet shifts its phase, which the clock shows.
 Source: walk-these-ways, Margolis and Agrawal, arXiv 2212.03238.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Reward terms of skills that walk, after walk-these-ways (Margolis and Agrawal, arXiv 2212.03238)."""
 
-from __future__ import annotations
-
 import functools
 
 import jax

@@ -1,7 +1,5 @@
 """Parameters of the walking task of all skills, and their sampling."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated
 

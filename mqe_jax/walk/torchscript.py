@@ -5,8 +5,6 @@ The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tens
 containers; every module class becomes a plain object that keeps its attributes.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import os

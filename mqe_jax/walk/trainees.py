@@ -1,7 +1,5 @@
 """The skills that the walking task trains: their observations, their gaits, and what they shall be good at."""
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Callable
 

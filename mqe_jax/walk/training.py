@@ -1,7 +1,5 @@
 """Training of skills by `mqe_jax.train`; settings as in walk-these-ways (arXiv 2212.03238) where known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax

@@ -1,7 +1,5 @@
 """What scenes look like: colours, and geoms without mass or contacts that only rendering models have; metres."""
 
-from __future__ import annotations
-
 Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
 
 # Robots by agent: 1 blue, 2 green, 3 red, 4 orange. In matches team 0 is blue and green, team 1 red and orange.

@@ -1,7 +1,5 @@
 """Visual geoms of the objects, in the frame of their bodies."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

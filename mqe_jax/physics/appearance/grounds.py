@@ -1,7 +1,5 @@
 """The grounds of the tasks: running track, meadow, hall, pitch, water; sky and light."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Sequence

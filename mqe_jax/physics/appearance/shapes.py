@@ -1,7 +1,5 @@
 """Visual geoms, flat marks on the ground, and the walls of tracks and gates."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence

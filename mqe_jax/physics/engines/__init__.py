@@ -7,8 +7,6 @@
 | `jax` | MJX, JAX implementation | CPU, GPU, TPU |
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

@@ -6,8 +6,6 @@ function by that number. The structures are those of XLA's stable C interface (`
 xla/ffi/api/c_api.h, version 0.3).
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

@@ -6,8 +6,6 @@ Between a plane and a box MJX-JAX keeps only corners within 1 mm of the deepest 
 It also misses or misplaces contacts between a capsule and an edge of a box, which are corrected for moving boxes.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

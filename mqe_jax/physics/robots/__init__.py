@@ -1,7 +1,5 @@
 """Robots: the `Robot` type, robot data, body tree, index tables and kinematics; the registry of robots by name."""
 
-from __future__ import annotations
-
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.physics.robots.go1 import GO1

@@ -1,7 +1,5 @@
 """The MuJoCo body tree of a robot."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -9,8 +9,6 @@ gives 23.7 N m and 30.1 rad/s, at the calf 35.55 N m and 20.06 rad/s. The torque
 rad/s and zero at 28, is conservative beside a measured curve of the motor: 20.2 N m up to 13.5 rad/s, zero at 30.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mqe_jax.physics.robots.robot import (

@@ -8,8 +8,6 @@ scale with the mass (15.2 kg against 11.3 kg), kp 30 (Go1: 20) and kd 0.75 (Go1:
 are alike; action scale as on the Go1; torques up to the motors' limits.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mqe_jax.physics.robots.robot import (

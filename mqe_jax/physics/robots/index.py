@@ -1,7 +1,5 @@
 """Index tables of the robots of a compiled scene, their state after a step, and closed-form kinematics of the legs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
