@@ -74,6 +74,15 @@ def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str
     assert env.max_steps == 1000
 
 
+def test_the_ball_can_start_between_the_attackers() -> None:
+    changes = {"ball_between": 0.5, "ball_noise": 0.2, "head_start": 0.5}
+    env: Any = make("go1football-defender", impl="c", control="position", **changes)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 256))
+    y = np.asarray(jax.vmap(env.ball)(states.data))[:, 1]
+    between = np.abs(y) <= 0.2
+    assert 0.4 < between.mean() < 0.6 and np.all(np.abs(y[~between] + 2.1) <= 0.2)
+
+
 def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
     model, data = duel.compiled.model, mujoco.MjData(duel.compiled.model)
     data.qpos[duel.index.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner

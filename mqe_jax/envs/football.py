@@ -112,7 +112,7 @@ class Football(QuadrupedEnv[S, F]):
         params = self.params
         key, start_key = jax.random.split(key) if params.head_start else (key, key)
         noise = jax.random.uniform(key, (2,), minval=-params.ball_noise, maxval=params.ball_noise)
-        position = jnp.array([*self.ball_spot, params.ball.radius]).at[:2].add(noise)
+        position = jnp.append(self.sample_spot(key), params.ball.radius).at[:2].add(noise)
         qpos = qpos.at[self.objects["ball"].qpos[:3]].set(position)
         if params.head_start:
             goal, attackers = self.sample_attack(jax.random.fold_in(start_key, 1))
@@ -121,6 +121,10 @@ class Football(QuadrupedEnv[S, F]):
             forward = jnp.where(attackers, way[0], 0.0)
             qpos = qpos.at[self.objects["ball"].qpos[:2]].add(way).at[self.index.base_qpos[:, 0]].add(forward)
         return qpos, qvel
+
+    def sample_spot(self, key: jax.Array) -> jax.Array:
+        """Returns the point (2,), m, about which the ball's initial position is sampled."""
+        return jnp.array(self.ball_spot)
 
     def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Returns the midpoint of a goal line (2,), m, of a head start, and which robots attack that goal (R,) bool."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.limits import Fraction
 from mqe_jax.core.settings import record
 from mqe_jax.envs.football import BALL_BLOCKS, FAR, GOALS, Football, FootballParams, Play
 from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
@@ -40,6 +41,8 @@ class DefenderParams(FootballParams):
 
     defender_idle: bool = False
     """Whether the defender stands still."""
+    ball_between: Fraction = 0.0
+    """Share of episodes that start with the ball between the two attackers, for training."""
     rewards: DefenderRewards = DefenderRewards()
     """Weights of the reward terms."""
 
@@ -92,6 +95,13 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         play = self.next_play(was.play, before, after)
         play = jax.tree.map(lambda old, new: jnp.where(was.scored, old, new), was.play, play)
         return DefenderState(was.scored | self.in_goal(after.state.data)[0], play)
+
+    def sample_spot(self, key: jax.Array) -> jax.Array:
+        spot, share = super().sample_spot(key), self.params.ball_between
+        if not share:
+            return spot
+        between = jax.random.bernoulli(jax.random.fold_in(key, 2), share)
+        return jnp.where(between, spot.at[1].set(0.0), spot)
 
     def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.asarray(GOALS[0]), jnp.array([True, True, False])
