@@ -22,6 +22,7 @@ import pytest
 
 from mqe_jax.envs import TASKS, VectorEnv, make
 from mqe_jax.physics.engines import Engine, private
+from mqe_jax.physics.engines import host_call as host_calls
 from mqe_jax.physics.engines.host_call import host_call
 from mqe_jax.physics.engines.mjx import WarpEngine
 from tests import engines as comparison
@@ -184,6 +185,14 @@ def test_warp_computes_no_terms_that_are_zero(
     assert content(model) == before and engine.model is model
 
 
+@pytest.fixture(params=["handler", "callback"])
+def host(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ways of calling a host function: by XLA's C interface and, where its version differs, by JAX's callback."""
+    assert host_calls.FITS
+    monkeypatch.setattr(host_calls, "FITS", request.param == "handler")
+
+
+@pytest.mark.usefixtures("host")
 def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change() -> None:
     seen = []
 
@@ -197,6 +206,15 @@ def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change()
     assert seen == [((2, 3), "int32", False)]
 
 
+@pytest.mark.parametrize(("version", "fits"), [((0, 3), True), ((0, 4), False), ((1, 0), False)])
+def test_a_host_function_needs_this_version_of_the_c_interface(
+    monkeypatch: pytest.MonkeyPatch, version: tuple[int, int], fits: bool
+) -> None:
+    monkeypatch.setattr(host_calls, "_VERSION", version)
+    assert host_calls._fits() == fits
+
+
+@pytest.mark.usefixtures("host")
 def test_what_a_host_function_raises_ends_the_program() -> None:
     def fail(*arrays: np.ndarray) -> np.ndarray:
         raise KeyboardInterrupt

@@ -3,15 +3,18 @@
 JAX does not store programs that contain its own callbacks, since those hold addresses of this process. Here a program
 holds a number that a function has in every process; XLA calls one handler, a C function made by ctypes, which finds the
 function by that number. The structures are those of XLA's stable C interface (`jax.ffi.include_dir()`,
-xla/ffi/api/c_api.h, version 0.3).
+xla/ffi/api/c_api.h, version 0.3). With another version of it, JAX's callbacks do the same without being stored.
 """
 
 import atexit
 import contextlib
 import ctypes
+import functools
+import re
 import weakref
 from collections.abc import Callable, Sequence
 from ctypes import POINTER, Structure, c_char_p, c_int, c_int64, c_size_t, c_void_p
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -88,8 +91,10 @@ def host_call(
     _latest[number] = function
     while len(_latest) > _KEPT:
         _latest.pop(next(iter(_latest)), None)
-    call = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")
-    out = call(*arguments, number=np.int64(number))
+    if FITS:
+        out = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")(*arguments, number=np.int64(number))
+    else:
+        out = jax.pure_callback(functools.partial(_call, number), result, *arguments, vmap_method="broadcast_all")
     assert isinstance(out, jax.Array)
     return out
 
@@ -104,13 +109,17 @@ def _array(buffer: Any, *, writable: bool = False) -> np.ndarray:
     return array
 
 
-def _execute(frame: Any) -> None:
-    number = frame.attributes.items[0].contents.value[0]
+def _call(number: int, *arguments: Any) -> np.ndarray:
     function = next(iter(_owners.get(number, {}).values()), _latest.get(number))
     if function is None:
         raise RuntimeError("the environment of this compiled program no longer exists")
+    return function(*map(np.asarray, arguments))
+
+
+def _execute(frame: Any) -> None:
     arguments = [_array(frame.arguments.items[i].contents) for i in range(frame.arguments.size)]
-    np.copyto(_array(frame.results.items[0].contents, writable=True), function(*arguments))
+    result = _call(frame.attributes.items[0].contents.value[0], *arguments)
+    np.copyto(_array(frame.results.items[0].contents, writable=True), result)
 
 
 @ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
@@ -131,7 +140,18 @@ def _handler(pointer: Any) -> int | None:
     return None
 
 
-jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
+def _fits() -> bool:
+    """Returns whether JAX's C interface has this version, or a later one of the same major version."""
+    header = Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h"
+    text = header.read_text("utf-8", "replace") if header.is_file() else ""
+    major, minor = (re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR"))
+    return bool(major and minor and int(major[1]) == _VERSION[0] and int(minor[1]) >= _VERSION[1])
+
+
+FITS = _fits()
+"""Whether the structures fit JAX; an unsuitable handler would make JAX lose its CPU backend."""
+if FITS:
+    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
 
 
 @atexit.register
