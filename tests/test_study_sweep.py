@@ -1,13 +1,17 @@
 """Sweeps on a probe: what is left, stops at any moment, complete run folders and a report at the end."""
 
+import csv
+import itertools
 import json
 import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import yaml
 
 from mqe_jax import cli
 from mqe_jax.core.errors import InputError
@@ -16,6 +20,7 @@ from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast
 from mqe_jax.policies import zoo
 from mqe_jax.runs import build as setup
+from mqe_jax.runs import measuring
 from mqe_jax.runs.presets import preset
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs
@@ -276,3 +281,60 @@ def test_one_file_may_hold_several_sweeps(tmp_path: Path) -> None:
     assert sweeps.load_sweep(path, "second").tasks == ("go1tug",)
     with pytest.raises(InputError, match=r"has no part 'secnd' \(did you mean 'second'\?\); it has: first, second"):
         sweeps.load_sweep(path, "secnd")
+
+
+MEASURES = """
+rates:
+  measure: evaluate
+  tasks: [go1gate, go1tug]
+  arguments: {policy: "{task}", episodes: 100}
+  variants: {scripted: {opponent: scripted}, heavy: {env: {robot: go2, randomization.payload: [3, 3]}}}
+"""
+
+
+def test_a_part_measures_policies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    calls: list[Any] = []
+
+    def evaluate(
+        task: str, policy: Any = None, opponent: Any = None, *, env: Any = None, episodes: int, impl: str
+    ) -> Any:
+        calls.append((task, policy, opponent, env, impl))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return SimpleNamespace(to_dict=lambda: {"success_rate": 0.5, "win_rate": None, "episodes": episodes})
+
+    monkeypatch.setitem(measuring.MEASURES, "evaluate", evaluate)
+    file, folder = tmp_path / "strength.yaml", tmp_path / "out"
+    file.write_text(MEASURES)
+    arguments = ["sweep", str(file), "--part", "rates", "--folder", str(folder), "--impl", "c"]
+    assert cli.main([*arguments, "--dry-run"]) == 0
+    assert capfd.readouterr().out.count("go1tug heavy") == 1 and not folder.exists()
+    cli.main(arguments)  # interrupted
+    assert cli.main(arguments) == 0 == cli.main(arguments)
+    assert calls[0] == ("go1gate", "go1gate", "scripted", None, "c") and len(calls) == 5
+    task, policy, _, env, _ = calls[-1]
+    assert (task, policy.task, policy.needs.robot, env["robot"]) == ("go1tug", "go1tug", "go2", "go2")
+    rows = list(csv.DictReader((folder / "rates.csv").open()))
+    assert [(row["task"], row["variant"]) for row in rows] == list(
+        itertools.product(("go1gate", "go1tug"), ("scripted", "heavy"))
+    )
+    assert [float(rows[0][name]) for name in ("value", "low", "high")] == pytest.approx([0.5, 0.4038, 0.5962], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("measure: evaluates", "measure: 'evaluates' is not allowed; it must be one of evaluate, tournament"),
+        ("tasks: [go1gat]", "did you mean 'go1gate'"),
+        (
+            "arguments: {episode: 3}",
+            "arguments.episode: 3 is not allowed; it must be an argument of evaluate: task, policy",
+        ),
+    ],
+)
+def test_measurements_that_cannot_be_made_are_named(tmp_path: Path, change: str, message: str) -> None:
+    part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
+    with pytest.raises(InputError, match=re.escape(message)):
+        measuring.plan(build(sweeps.Measurement, part), tmp_path)

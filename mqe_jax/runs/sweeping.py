@@ -13,10 +13,11 @@ from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import PathText, check_arguments
 from mqe_jax.envs.registry import task_id
 from mqe_jax.runs import build
+from mqe_jax.runs.measuring import measure
 from mqe_jax.runs.presets import base_config
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
-from mqe_jax.study.sweep import Job, load_sweep
+from mqe_jax.study.sweep import Job, Measurement, load_part
 from mqe_jax.train.config import TrainConfig
 
 
@@ -43,7 +44,7 @@ def sweep(
 ) -> dict[str, Any]:
     """Trains all combinations of tasks, algorithms, variants and seeds, and reports, as `mqe sweep`.
 
-    Another call resumes what was interrupted.
+    A part with `measure` evaluates policies instead. Another call resumes what was interrupted.
 
     Example:
         ```python
@@ -54,7 +55,7 @@ def sweep(
         ```
 
     Args:
-        file: YAML file with the fields of `mqe_jax.study.sweep.Sweep`.
+        file: YAML file with the fields of `mqe_jax.study.sweep.Sweep` or `Measurement`.
         folder: folder of the sweep; runs go into runs/, the report into report/.
         part: name of one sweep in a file that maps names to sweeps.
         cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT]. Default: all.
@@ -70,7 +71,9 @@ def sweep(
         InputError: for a file, a cell, a seed or a folder that is not allowed, or after all if trainings failed.
         NonFiniteError: after all, if the first that failed became non-finite.
     """
-    settings, folder, began = load_sweep(Path(file), part), Path(folder), time.monotonic()
+    settings, folder, began = load_part(Path(file), part), Path(folder), time.monotonic()
+    if isinstance(settings, Measurement):
+        return measure(settings, folder, impl, dry_run=dry_run)
     for task in settings.tasks:
         task_id(task)
 

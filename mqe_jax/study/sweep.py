@@ -64,6 +64,20 @@ class Sweep:
                 fail(f"variants.{name}", values, "a mapping of settings, under a name of letters and digits")
 
 
+@record
+class Measurement:
+    """Settings of a part that measures policies: a call for every combination of tasks and variants."""
+
+    measure: str
+    """What is called: evaluate, tournament or exploitability, as in `mqe_jax`."""
+    tasks: Annotated[tuple[str, ...], MinLen(1)]
+    """Ids of the tasks."""
+    arguments: Mapping[str, Any] = FrozenMapping()
+    """Arguments of the call, in which {task} stands for the task's id."""
+    variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
+    """Named arguments that override these, such as slippery: {env: {friction: 0.5}}."""
+
+
 @dataclass(frozen=True)
 class Job:
     """Seeds of one cell that are trained together, with the settings of each."""
@@ -81,7 +95,15 @@ class Job:
 
 
 def load_sweep(path: Path, part: str | None = None) -> Sweep:
-    """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to sweeps; InputError names the file."""
+    """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to parts; InputError names the file."""
+    loaded = load_part(path, part)
+    if isinstance(loaded, Measurement):
+        raise InputError(f"{path}: measure: {loaded.measure!r} is not allowed; it must be a sweep of trainings")
+    return loaded
+
+
+def load_part(path: Path, part: str | None = None) -> Sweep | Measurement:
+    """Reads a YAML file of trainings or measurements, or a part of it; errors as `load_sweep`."""
     values = load_yaml(path)
     if part is not None:
         if not isinstance(values.get(part), dict):
@@ -90,7 +112,7 @@ def load_sweep(path: Path, part: str | None = None) -> Sweep:
     elif "tasks" not in values and any(isinstance(value, dict) and "tasks" in value for value in values.values()):
         raise InputError(f"part: none is named; {path} has: {', '.join(values)}")
     try:
-        return build(Sweep, values)
+        return build(Measurement if "measure" in values else Sweep, values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

@@ -1,0 +1,114 @@
+"""Parts of a sweep that measure policies: evaluations, tournaments and whatever else returns a result by one call."""
+
+import dataclasses
+import inspect
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mqe_jax.core.errors import InputError, InUseError
+from mqe_jax.core.files import lock, write_atomically
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import fail
+from mqe_jax.envs.registry import task_id
+from mqe_jax.policies import load_policy
+from mqe_jax.runs import playing
+from mqe_jax.study.runs import table
+from mqe_jax.study.sweep import Measurement
+from mqe_jax.train.evaluate import Rate
+from mqe_jax.train.policy import TrainedPolicy
+
+MEASURES: dict[str, Callable[..., Any]] = {"evaluate": playing.evaluate, "tournament": playing.tournament}
+"""Functions of the front door by the name in `measure`; their results have `to_dict`."""
+RESULT, RATES = "result.json", "rates.csv"
+
+
+class Item(NamedTuple):
+    """One measurement of a part."""
+
+    task: str
+    variant: str
+    arguments: dict[str, Any]
+    file: Path
+
+
+def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
+    """Returns all measurements of a part; InputError for an unknown measure, task or argument."""
+    if part.measure not in MEASURES:
+        fail("measure", part.measure, f"one of {', '.join(MEASURES)}")
+    known = inspect.signature(MEASURES[part.measure]).parameters
+    items = []
+    for task in part.tasks:
+        for variant, changes in part.variants.items():
+            arguments = {"impl": impl, **_fill({**part.arguments, **changes}, task_id(task))}
+            for name in arguments.keys() - known.keys():
+                fail(f"arguments.{name}", arguments[name], f"an argument of {part.measure}: {', '.join(known)}")
+            items.append(Item(task, variant, arguments, folder / "results" / task / variant / RESULT))
+    return items
+
+
+def measure(part: Measurement, folder: Path, impl: str = "auto", *, dry_run: bool = False) -> dict[str, Any]:
+    """Makes the measurements of a part whose results are not there, and tabulates the rates; see `sweep`."""
+    items = plan(part, folder, impl)
+    for item in items:
+        if dry_run or item.file.is_file():
+            continue
+        try:
+            with lock(item.file.parent):
+                result = MEASURES[part.measure](item.task, **_for_robot(item.arguments))
+                content = {"measure": part.measure, "arguments": item.arguments, "result": result.to_dict()}
+                write_atomically(item.file, json.dumps(content, indent=1).encode())
+        except InUseError:
+            echo(f"mqe: skipped, in use by another process: {item.task}/{item.variant}")
+            continue
+        echo(f"mqe: wrote {item.file}")
+    rows = [] if dry_run else [row for item in items if item.file.is_file() for row in _rates(item)]
+    if rows:
+        write_atomically(folder / RATES, table(rows).encode())
+    left = [
+        {"task": x.task, "variant": x.variant, "steps_left": 0, "seconds": None} for x in items if not x.file.is_file()
+    ]
+    total = {"steps_left": 0, "seconds": None}
+    return {"left": {"jobs": left, **total}, "report": [str(folder / RATES)] if rows else []}
+
+
+def _fill(value: Any, task: str) -> Any:
+    """Returns arguments in which {task} stands for the task's id."""
+    if isinstance(value, str):
+        return value.replace("{task}", task)
+    if isinstance(value, Mapping):
+        return {name: _fill(x, task) for name, x in value.items()}
+    return [_fill(x, task) for x in value] if isinstance(value, list | tuple) else value
+
+
+def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Returns arguments whose policies act on the robot that `env` names, whichever they were trained on."""
+    robot = arguments.get("env", {}).get("robot")
+    if robot is None:
+        return arguments
+    changed = dict(arguments)
+    for name in ("policy", "opponent"):
+        try:
+            policy = load_policy(arguments.get(name, ""))
+        except InputError:  # scripted and other policies fit every robot
+            continue
+        if isinstance(policy, TrainedPolicy):
+            changed[name] = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, robot=robot))
+    return changed
+
+
+def _rates(item: Item) -> list[dict[str, Any]]:
+    """Returns the rates of an evaluation with their intervals, a row each."""
+    result = json.loads(item.file.read_text("utf-8"))["result"]
+    rates = {name: result[name] for name in ("success_rate", "win_rate", "draw_rate", "loss_rate") if name in result}
+    episodes, about = (
+        result.get("episodes"),
+        {name: result.get(name) or "" for name in ("opponent", "sides", "actions")},
+    )
+    return [
+        {"task": item.task, "variant": item.variant, **about, "rate": name, **Rate.of(x, episodes)._asdict()}
+        for name, x in rates.items()
+        if x is not None and math.isfinite(x)
+    ]
