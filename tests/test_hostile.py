@@ -32,7 +32,7 @@ from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
 from mqe_jax.policies import all_agents
 from mqe_jax.selfplay.demonstrations import Demonstrated
-from mqe_jax.selfplay.league import tournament
+from mqe_jax.selfplay.league import games, tournament
 from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.study.runs import read_curve
 from mqe_jax.study.sweep import Sweep, load_sweep
@@ -53,7 +53,7 @@ LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.in
 WALLS = np.full((3, 2, 3), NAN)
 FRAME = np.zeros((16, 16, 3), np.uint8)
 GAMES = np.ones((1, 1, 3), np.int64)
-RATINGS = tournament.Ratings(np.zeros(1), np.zeros(1), np.zeros(1))
+RATINGS = games.Estimate(np.zeros(1), np.zeros(1), np.zeros(1))
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +226,10 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("recording: ", lambda x, v: replay(v), (None, "a.npz")),
     ("policy: ", lambda x, v: tournament.play(x["matches"], v, [], KEY), (None, "idle", TrainedPolicy)),
     ("policies", lambda x, v: tournament.round_robin(x["matches"], v, KEY), (None, [], {}, {"a": "idle"})),
-    ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones((2, 2)), np.full((2, 2, 3), NAN))),
+    ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones(3), np.ones((2, 2)), np.full((2, 2, 3), NAN))),
+    ("results: ", lambda x, v: games.analyse(v), (None, GAMES)),
+    ("payoff: ", lambda x, v: games.nash(v), (None, 3, np.ones((1, 2)), np.ones((2, 2)), np.full((2, 2), NAN))),
+    ("rates: ", lambda x, v: games.mates(v, 1), (None, np.ones((1, 2)), np.full((2, 2), 2.0), np.full((1, 1), NAN))),
     ("reference: ", lambda x, v: tournament.rate(GAMES, v), (None, -1, 1, "a")),
     ("episodes", lambda x, v: recording.best(v), (None, [], [3])),
     ("episodes", lambda x, v: recording.typical(v), (None, [], [3])),

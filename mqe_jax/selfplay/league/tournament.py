@@ -8,12 +8,11 @@ import io
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pydantic
 from annotated_types import MinLen
 from numpy.typing import NDArray
 
@@ -24,6 +23,7 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check_arguments, fail
 from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
 from mqe_jax.envs import VectorEnv
+from mqe_jax.selfplay.league.games import Estimate, Results, estimate, games_of, resample
 from mqe_jax.selfplay.opponents import Versus
 from mqe_jax.train.policy import Policy, check_policy
 
@@ -31,28 +31,8 @@ Array = NDArray[np.float64]
 CSV, PICTURE = "tournament.csv", "tournament.png"
 
 _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
-_ITERATIONS = 500
-_SAMPLES = 200  # of the bootstrap
+_ITERATIONS = 40
 _LONG = 28  # characters of a name in the picture, at most
-
-
-class Ratings(NamedTuple):
-    """Ratings of P policies in Elo points, with the bounds of their 95% intervals (P,)."""
-
-    value: Array
-    low: Array
-    high: Array
-
-
-def _check_results(value: Any) -> Any:
-    shape = np.shape(value)
-    if shape != (*shape[:1] * 2, 3) or not np.all(np.isfinite(value)) or np.min(value) < 0:
-        raise ValueError("outcomes of policies against policies, as of round_robin")
-    return value
-
-
-Results = Annotated[Any, pydantic.AfterValidator(_check_results)]
-"""Kind of an argument that is a result of `round_robin`."""
 
 
 @single
@@ -93,36 +73,42 @@ def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Arr
 
 @check_arguments(results=Results)
 def scores(results: NDArray[Any]) -> Array:
-    """Returns the points of each policy against each, as both teams together, in games; a draw counts half (P, P)."""
+    """Returns the points of each policy against each, as both teams together, in games: (..., P, P, 3) to (..., P, P).
+
+    A draw counts half.
+    """
     points = results[..., 0] + 0.5 * results[..., 1]
-    return points + (results.sum(axis=-1) - points).T
+    return points + (results.sum(axis=-1) - points).swapaxes(-1, -2)
 
 
 @check_arguments(results=Results, reference=NonNegativeInt)
-def rate(results: NDArray[np.int64], reference: int) -> Ratings:
-    """Returns Bradley-Terry ratings (doi 10.2307/2334029), of which that of `reference` is 0, and their intervals.
+def rate(results: NDArray[Any], reference: int) -> Estimate:
+    """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,), of which that of `reference` is 0.
 
     A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
-    of a Bayesian bootstrap (doi 10.1214/aos/1176345338) of all these games.
+    of a Bayesian bootstrap of all these games.
     """
     if reference >= len(results):
         fail("reference", reference, f"the index of one of the {len(results)} policies")
-    games = results + np.array([0.0, 0.5, 0.0])
-    weights = np.random.default_rng(0).standard_gamma(games, (_SAMPLES, *games.shape))
-    weights *= games.sum(axis=-1, keepdims=True) / weights.sum(axis=-1, keepdims=True)
-    resampled = np.stack([_strengths(scores(again), reference) for again in weights])
-    low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
-    return Ratings(_strengths(scores(games), reference), low, high)
+    games = games_of(results)
+    samples = _strengths(scores(resample(games, np.random.default_rng(0))), reference)
+    return estimate(_strengths(scores(games), reference), samples)
 
 
 def _strengths(points: Array, reference: int) -> Array:
-    """Returns the maximum-likelihood ratings (P,) of points (P, P), by minorisation and maximisation."""
-    points = points * (1 - np.eye(len(points)))
-    games, strength = points + points.T, np.ones(len(points))
+    """Returns the maximum-likelihood ratings (..., P) of points (..., P, P), by Newton's method with bounded steps."""
+    count = points.shape[-1]
+    points = points * (1 - np.eye(count))
+    games, strength = points + points.swapaxes(-1, -2), np.zeros(points.shape[:-1])
     for _ in range(_ITERATIONS):
-        strength = points.sum(axis=1) / (games / (strength[:, None] + strength)).sum(axis=1)
-        strength /= strength[reference]
-    return _POINTS * np.log(strength)
+        expected = 1 / (1 + np.exp(strength[..., None, :] - strength[..., :, None]))
+        slope, bend = (points - games * expected).sum(axis=-1), games * expected * (1 - expected)
+        total = bend.sum(axis=-1)
+        curvature = total[..., None] * np.eye(count) - bend
+        curvature[..., reference, reference] += 1 + total.max(axis=-1)  # the reference stays where it is
+        step = np.linalg.solve(curvature, slope[..., None])[..., 0]
+        strength = strength + step / np.maximum(np.abs(step).max(axis=-1, keepdims=True) / 2, 1)
+    return _POINTS * (strength - strength[..., reference, None])
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -135,7 +121,7 @@ class Standings:
     """Names of the policies."""
     results: NDArray[np.int64]
     """Outcomes of each policy as team 0 against each (P, P, 3), as of `round_robin`."""
-    ratings: Ratings
+    ratings: Estimate
     """Ratings, relative to one of them."""
 
     def __repr__(self) -> str:
