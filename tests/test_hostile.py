@@ -30,7 +30,8 @@ from mqe_jax.envs.registry import register_planner
 from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
-from mqe_jax.policies import all_agents
+from mqe_jax.policies import all_agents, zoo
+from mqe_jax.policies.mixture import Mixture, save_mixture
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league import games, tournament
 from mqe_jax.selfplay.opponents import Mirror, versus
@@ -156,6 +157,11 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("actions: ", lambda x, v: Recording("a", {}, "c", "command", {"x": np.zeros(2)}, v), (np.zeros(2),)),
     ("params: ", lambda x, v: Recording("a", v, "c", "command", {}, np.zeros((2, 1, 1))), (None, {"control": "c"})),
     ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
+    ("mixture: ", lambda x, v: save_mixture("folder", v), (None, 3, Mixture)),
+    ("members: ", lambda x, v: Mixture(v, (1.0,)), (None, 3, (), ("a",), (load_policy,) * 5)),
+    ("weights", lambda x, v: Mixture((load_policy("go1tug"),), v), (None, 3, (), (0.5,), (NAN,), (0.5, 0.5))),
+    ("num_envs: ", lambda x, v: Mixture((load_policy("go1tug"),), (1.0,)).initial_memory(v), (0, NAN, "x")),
+    ("policy: ", lambda x, v: zoo.ship(v, zoo.card("go1tug")), (None, 3, Mixture)),
     ("folder: ", lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v), (None, 3, "")),
     ("policies", lambda x, v: mqe_jax.tournament("go1tug", v), (None, 3, [], [3], {})),
     ("task: ", lambda x, v: mqe_jax.tournament(v, ["idle"]), ("go1gate", "x")),

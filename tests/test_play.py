@@ -177,7 +177,7 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     agile = Path(__file__).parents[1] / "results" / "agile" / "go1wrestling-seed1.safetensors"
     (entry,) = entries(["go1wrestling", str(agile)])
     assert list(entry.policies) == ["shipped", "go1wrestling-seed1", "scripted"]  # they meet, each with its own skill
-    policy = zoo.load("go1wrestling")
+    policy = zoo.heaviest("go1wrestling")
     env = {"ring_radius": 1.5, "randomization.push": 1.0, "randomization.friction": [0.5, 1.0]}
     config = dataclasses.replace(policy.config, env=env)
     (tmp_path / "small").mkdir()

@@ -86,6 +86,7 @@ AnyEnvironment = Annotated[Any, _having(_ENV, "an environment, such as that of m
 AnySingle = Annotated[Any, _having(_ENV, "one environment, such as that of mqe_jax.make", lacks="num_envs")]
 AnyBatch = Annotated[Any, _having(f"{_ENV} num_envs", "a batch, such as VectorEnv(mqe_jax.make(task), 64)")]
 AnyPolicy = Annotated[Any, _having("task agents act initial_memory", _POLICY)]
+AnyTrained = Annotated[Any, _having("needs config act initial_memory", "a trained policy or a mixture of such")]
 PolicyOrAct = Annotated[Any, _having("act initial_memory", _ACT, callables=True)]
 
 Teams = tuple[tuple[int, ...], ...]

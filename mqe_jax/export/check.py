@@ -13,7 +13,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
-from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.policies.mixture import Trained
 
 STEPS = 100
 """Environment steps over which a graph is compared with JAX."""
@@ -26,7 +26,7 @@ zero at +-pi."""
 Arrays = dict[str, np.ndarray]
 
 
-def checked_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
+def checked_onnx(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above `LARGEST_ERROR`."""
     model = to_onnx(policy, env)
     return model, _largest(errors(model, *record_actions(policy, env, STEPS)), f"{STEPS} steps of {env.name}")
@@ -51,7 +51,7 @@ def _largest(errors: Mapping[str, float], where: str) -> float:
     return error
 
 
-def record_actions(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
+def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
     """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and idle opponents."""
     shapes = input_shapes(policy, env)
 

@@ -27,19 +27,21 @@ import mqe_jax
 from mqe_jax import skills
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import check_arguments
+from mqe_jax.core.types import AnyTrained
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import NUM_JOINTS
+from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import Skill
-from mqe_jax.train.policy import TrainedPolicy, check_policy
+from mqe_jax.train.policy import check_policy
 
 SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
 """Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
 
 
-@check_arguments(policy=TrainedPolicy, env=QuadrupedEnv)
-def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
+@check_arguments(policy=AnyTrained, env=QuadrupedEnv)
+def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of a policy with its mean actions; its task defines control mode, robot and walk policy.
 
     Raises:
@@ -52,7 +54,7 @@ def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
 
 
-def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
+def input_shapes(policy: Trained, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
     robots = {"obs": (env.observation_size,)}
     if env.control == "command":
@@ -62,7 +64,7 @@ def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[in
     return shapes | {name: x.shape for name, x in name_arrays("memory", policy.initial_memory()).items()}
 
 
-def policy_step(policy: TrainedPolicy, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+def policy_step(policy: Trained, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Returns the outputs of one step of one environment by name, the function that the graph maps over N."""
     action, memory = policy.act(inputs["obs"], fill_arrays("memory", policy.initial_memory(), inputs))
     outputs = {"action": action} | name_arrays("next_memory", memory)
@@ -104,7 +106,7 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
     return {"inputs": of(model.graph.input), "outputs": of(model.graph.output)}
 
 
-def _properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
+def _properties(policy: Trained, env: QuadrupedEnv) -> dict[str, str]:
     """Returns the metadata of the model as strings, JSON-encoded where structured."""
     layout = [[block.name, block.width, block.meaning] for block in env.observation_layout.blocks]
     return {

@@ -30,9 +30,10 @@ from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, 
 from mqe_jax.export.translate import Function
 from mqe_jax.physics import robots
 from mqe_jax.policies import load_policy, parameters_for, zoo
+from mqe_jax.policies.mixture import Trained
 from mqe_jax.policies.translated import together, translate
 from mqe_jax.skills.agile import AgileSkill
-from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.train.policy import Policy
 
 PAGE = Path(__file__).parent / "page"
 """Files of the page."""
@@ -124,7 +125,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
     return [entry for *_, entry in found]
 
 
-def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
+def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, Trained]]:
     """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a source stands for."""
     task = ALIASES.get(source, source)
     if os.sep not in source and (task in playable or not Path(source).exists()):

@@ -21,12 +21,13 @@ from mqe_jax.core.settings import PathText, check, check_arguments, fail
 from mqe_jax.core.types import AnyEnvironment, Memory, Observations, PolicyOrAct, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_PLANNERS, TASKS
-from mqe_jax.policies import zoo
+from mqe_jax.policies import mixture, zoo
+from mqe_jax.policies.mixture import Trained
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.translated import together, translate
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.needs import Needs
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, check_policy, groups_of, read_policy
+from mqe_jax.train.policy import Policy, check_obs, check_policy, groups_of
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -102,7 +103,7 @@ class BothTeams:
 
 
 @overload
-def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> TrainedPolicy: ...
+def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> Any: ...
 @overload
 def load_policy(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy: ...
 @check_arguments(source=PathText, env=AnyEnvironment | None, deterministic=bool)
@@ -117,7 +118,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
             of a shipped one declares it.
 
     Returns:
-        A `TrainedPolicy` for a shipped one or a path, else a `SimplePolicy`.
+        A `TrainedPolicy` or a `Mixture` for a shipped one or a path, else a `SimplePolicy`.
 
     Raises:
         InputError: for an unknown name, a file that cannot be read, a policy of another task, or a task without a
@@ -136,8 +137,8 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
         allowed = f"{', '.join((*NAMES, *further, *zoo.names()))}, a run folder, or a policy file"
         raise InputError(f"policy: unknown {str(source)!r}{hint}; allowed: {allowed}")
     else:
-        policy = read_policy(source)
-    policy = dataclasses.replace(policy, deterministic=deterministic or policy.deterministic)
+        policy = mixture.read(source)
+    policy = policy.acting(True) if deterministic else policy
     return policy if env is None else translate(policy, env, str(source))
 
 
@@ -151,9 +152,8 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
             policy: Any = load_policy(source, env, deterministic=deterministic)
         else:
             policy = check("policy", source, PolicyOrAct)
-            if isinstance(policy, TrainedPolicy):
-                name, mean = repr(policy), deterministic or policy.deterministic
-                policy = translate(dataclasses.replace(policy, deterministic=mean), env, name)
+            if isinstance(policy, Trained):
+                policy = translate(policy.acting(True) if deterministic else policy, env, repr(policy))
             elif hasattr(policy, "task"):
                 check_policy(policy, env, repr(policy))
     except InputError as error:
@@ -178,7 +178,7 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
         if isinstance(source, str | Path) and str(source) not in NAMES:
             with contextlib.suppress(InputError):  # `load_as` raises it, where it matters
                 policy = load_policy(source)
-        if isinstance(policy, TrainedPolicy) and policy.needs.control is not None and policy.task == task:
+        if isinstance(policy, Trained) and policy.needs.control is not None and policy.task == task:
             every.append(policy.needs)
     for needs in every:
         usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}

@@ -12,16 +12,17 @@ import jax
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import Memory
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import SKILLS
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
+from mqe_jax.train.policy import Policy, check_policy
 
 
 @dataclasses.dataclass(frozen=True)
 class Translated:
     """A trained policy whose actions mean `own`, as a policy of a task whose actions mean `here`."""
 
-    policy: TrainedPolicy
+    policy: Trained
     own: Commander = dataclasses.field(repr=False)
     here: Commander = dataclasses.field(repr=False)
 
@@ -50,7 +51,7 @@ class Translated:
         return self.here.translated(action, self.own), memory
 
 
-def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
+def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
     """Returns a trained policy as it acts in a task: itself, or of several skills with its own one.
 
     Raises:

@@ -17,6 +17,7 @@ from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, Vec
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.policies import all_agents, load_as, load_policy, parameters_for, zoo
+from mqe_jax.policies.mixture import Trained
 from mqe_jax.runs.presets import base_config
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
@@ -28,7 +29,7 @@ from mqe_jax.train.evaluate import Act
 from mqe_jax.train.learner import Learner
 from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.needs import needs_of
-from mqe_jax.train.policy import POLICY_FILE, Policy, TrainedPolicy, groups_of
+from mqe_jax.train.policy import POLICY_FILE, Policy, groups_of
 from mqe_jax.train.stages import Stages
 from mqe_jax.train.start import initial_key, policy_to_start
 
@@ -287,7 +288,7 @@ def players(
     if opponent is not None:
         other, against = load_as("opponent", opponent, task_env, deterministic=deterministic), opponent
     about: dict[str, Any] = {"policy": str(chosen)}
-    if isinstance(trained := getattr(own, "policy", own), TrainedPolicy):
+    if isinstance(trained := getattr(own, "policy", own), Trained):
         about["actions"] = "mean" if trained.deterministic else "sampled"
     if match:
         about["opponent"] = str(against)

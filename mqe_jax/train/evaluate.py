@@ -31,7 +31,7 @@ from mqe_jax.core.types import (
     teams_of,
     where_rows,
 )
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
+from mqe_jax.train.policy import Policy, check_policy
 from mqe_jax.train.rollout import active_of, mean_of_team
 
 Act = Callable[[Any, Memory, jax.Array], tuple[jax.Array, Memory]]
@@ -153,7 +153,7 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
     if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
         allowed = f"one of all {env.num_agents}; `mqe_jax.versus` shows one team of a match"
         fail("policy", f"one of {agents} agents", allowed)
-    if isinstance(either, TrainedPolicy):
+    if hasattr(either, "needs"):
         check_policy(either, env)
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")

@@ -1,10 +1,11 @@
 """Policies: whatever acts for a team, and the trained ones, which are saved, loaded and exchanged."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,17 @@ from mqe_jax.core.files import check_folder, check_locks
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, build, check, check_arguments, fail, to_mapping
-from mqe_jax.core.types import AnyEnvironment, AnyPolicy, Memory, Observations, Params, RandomKey, VectorEnv, teams_of
+from mqe_jax.core.types import (
+    AnyEnvironment,
+    AnyPolicy,
+    Memory,
+    Observations,
+    Params,
+    PyTree,
+    RandomKey,
+    VectorEnv,
+    teams_of,
+)
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
@@ -126,6 +137,10 @@ class TrainedPolicy:
         settings = self.config.network, self.config.normalization.observations
         return (self.needs.by_name(), *settings, self.deterministic)
 
+    def acting(self, deterministic: bool) -> Self:
+        """Returns the policy that acts with its mean actions, or samples them."""
+        return dataclasses.replace(self, deterministic=deterministic)
+
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the initial recurrent state: leading axis N, or none for a single environment."""
         num_envs = check("num_envs", num_envs, PositiveInt | None)
@@ -227,11 +242,12 @@ def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "p
     check("policy", policy, AnyPolicy)
     needs = {"task": policy.task, "agents": policy.agents}
     found: dict[str, Any] = {"task": env.name, "agents": len(teams_of(env)[0])}
-    if isinstance(policy, TrainedPolicy) and needs == found:
-        group, groups = policy.needs.group, {"policy", *getattr(env, "group_sizes", {})}
+    trained: Any = policy
+    if isinstance(own := getattr(policy, "needs", None), Needs) and needs == found:
+        group, groups = own.group, {"policy", *getattr(env, "group_sizes", {})}
         needs, found = {"group": group}, {"group": ", ".join(sorted(groups))}
         if group in groups:
-            needs, found = policy.needs.by_name(), needs_of(env, policy.config).by_name()
+            needs, found = own.by_name(), needs_of(env, trained.config).by_name()
     for need, value in needs.items():
         if value != found[need]:
             raise InputError(f"{field}: {name} needs {need} {value!r}; the environment has {found[need]!r}")
@@ -251,19 +267,29 @@ def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_F
         InputError: for a folder that cannot be written.
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
-    if Path(name).name != name:
-        fail("name", name, "the name of a file, without a folder")
-    path = Path(run_dir) / name
+    return write_policy(run_dir, name, *file_content(policy, half))
+
+
+def file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns the arrays and the metadata of a policy's file."""
     params = policy.params
     if half:
         params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)
-    if wrong := nonfinite({"params": params, "normalizer": policy.normalizer}):
-        raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
     records = {"needs": to_mapping(policy.needs), "config": to_mapping(policy.config)}
     metadata = {**policy.metadata, **records, "deterministic": policy.deterministic}
+    return {"params": params, "normalizer": policy.normalizer}, metadata
+
+
+def write_policy(folder: str | Path, name: str, arrays: PyTree, metadata: Mapping[str, Any]) -> Path:
+    """Writes the content of a policy's file; errors as `save_policy`."""
+    if Path(name).name != name:
+        fail("name", name, "the name of a file, without a folder")
+    path = Path(folder) / name
+    if wrong := nonfinite(arrays):
+        raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
     check_locks(path)
     check_folder(path.parent)
-    save_tree(path, {"params": params, "normalizer": policy.normalizer}, metadata, kind="policy")
+    save_tree(path, arrays, metadata, kind="policy")
     return path
 
 
@@ -274,10 +300,21 @@ def read_policy(run: str | Path) -> TrainedPolicy:
     Raises:
         InputError: in one line naming the file, if it is missing, damaged, of another format or non-finite.
     """
-    path = Path(check("policy", run, PathText))
-    if path.is_dir():
-        path = path / POLICY_FILE
+    path = policy_path(run)
     metadata = read_metadata(path, kind="policy")
+    if "members" in metadata:
+        raise InputError(f"{path}: holds a mixture of policies; a single policy is needed")
+    return policy_in(path, metadata)
+
+
+def policy_path(run: str | Path) -> Path:
+    """Returns the policy file of a run folder, or a policy file itself."""
+    path = Path(check("policy", run, PathText))
+    return path / POLICY_FILE if path.is_dir() else path
+
+
+def policy_in(path: Path, metadata: dict[str, Any], part: str = "") -> TrainedPolicy:
+    """Returns the policy of a file with its metadata, its arrays below the path name `part`; errors as there."""
     try:
         needs = build(Needs, metadata.pop("needs"))
         config = build(TrainConfig, metadata.pop("config"))
@@ -285,5 +322,5 @@ def read_policy(run: str | Path) -> TrainedPolicy:
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None
-    tree = load_tree(path, _template(needs.dims, config.network), kind="policy", half=True).tree
+    tree = load_tree(path, _template(needs.dims, config.network), kind="policy", half=True, part=part).tree
     return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)

@@ -13,8 +13,11 @@ from annotated_types import Ge
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import NonNegative
 from mqe_jax.core.settings import PathText, build, check_arguments, record, to_mapping
+from mqe_jax.core.types import AnyTrained
+from mqe_jax.policies import mixture
+from mqe_jax.policies.mixture import Mixture, Trained, save_mixture
 from mqe_jax.train.checkpoint import read_metadata
-from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
+from mqe_jax.train.policy import NAMED, TrainedPolicy, save_policy
 
 FOLDER = Path(__file__).parent
 
@@ -63,20 +66,24 @@ def card(task: str) -> Card:
     return build(Card, read_metadata(file_of(task), kind="policy")["card"])
 
 
-def load(task: str) -> TrainedPolicy:
+def load(task: str) -> Trained:
     """Returns a task's shipped policy, which acts as its card declares; errors as `card`."""
-    about = card(task)
-    policy = read_policy(file_of(task))
-    return dataclasses.replace(policy, deterministic=about.mode == "deterministic")
+    return mixture.read(file_of(task)).acting(card(task).mode == "deterministic")
 
 
-@check_arguments(policy=TrainedPolicy, about=Card, folder=PathText)
-def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
+@check_arguments(policy=AnyTrained, about=Card, folder=PathText)
+def ship(policy: Trained, about: Card, folder: Path = FOLDER) -> Path:
     """Writes a policy with its card, its parameters as float16; returns the file."""
     metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
-    deterministic = about.mode == "deterministic"
-    shipped = dataclasses.replace(policy, metadata=metadata, deterministic=deterministic)
-    return save_policy(folder, shipped, file_of(policy.task).name, half=True)
+    shipped = dataclasses.replace(policy.acting(about.mode == "deterministic"), metadata=metadata)
+    save: Any = save_mixture if isinstance(shipped, Mixture) else save_policy
+    return save(folder, shipped, file_of(policy.task).name, half=True)
 
 
-NAMED.update({name: functools.partial(load, name) for name in names()})
+def heaviest(task: str) -> TrainedPolicy:
+    """Returns a task's shipped policy, of a mixture the member with the largest weight; errors as `card`."""
+    policy = load(task)
+    return policy.heaviest if isinstance(policy, Mixture) else policy
+
+
+NAMED.update({name: functools.partial(heaviest, name) for name in names()})
