@@ -164,7 +164,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("policy: ", lambda x, v: zoo.ship(v, zoo.card("go1tug")), (None, 3, Mixture)),
     ("folder: ", lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v), (None, 3, "")),
     ("policies", lambda x, v: mqe_jax.tournament("go1tug", v), (None, 3, [], [3], {})),
-    ("task: ", lambda x, v: mqe_jax.tournament(v, ["idle"]), ("go1gate", "x")),
+    ("task: ", lambda x, v: mqe_jax.tournament(v, ["idle"]), ("x",)),
     ("planner: ", lambda x, v: register_task(TASKS["go1gate"], v), (3, "x")),
     ("planner: ", lambda x, v: register_planner("go1gate", "mine", v), (None, 3, "x")),
     ("name: ", lambda x, v: register_planner("go1gate", v, lambda obs: obs["base"]), (None, 3, "")),

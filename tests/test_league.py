@@ -283,12 +283,16 @@ def test_a_tournament_meets_every_pair_on_both_sides(tmp_path: Path, monkeypatch
     assert won[0, 2] >= 3 and won[1, 2] >= 3
     assert result["results"][2][2] == [0, 4, 0], "idle robots draw with each other"
     assert result["results"][2][1][2] >= 3, "an idle robot loses as team 0 too"
-    assert {row["policy"]: row["value"] for row in result["ratings"]}["scripted"] == 0
+    rated = {row["policy"]: row for row in result["ratings"]}
+    assert rated["scripted"]["value"] == 0 and rated["idle"]["worst"]["value"] < -0.5
+    payoff, both = np.array(result["payoff"]["value"]), np.array(result["results"])
+    np.testing.assert_allclose(payoff, (both[..., 0] - both[..., 2] + both[..., 2].T - both[..., 0].T) / 8)
+    assert rated["idle"]["mean"]["value"] == pytest.approx(payoff[2, :2].mean())
+    assert sum(row["nash_weight"]["value"] for row in rated.values()) == pytest.approx(1)
     assert (tmp_path / "tournament.png").stat().st_size > 5000
     rows = (tmp_path / "tournament.csv").read_text().splitlines()
     assert len(rows) == 10 and rows[3].startswith(f"forward,idle,{won[0, 2]},")
-    assert cli.main(["tournament", "go1gate", "idle", "--impl", "c"]) == 2
-    assert "one team" in capfd.readouterr().err
+    assert (tmp_path / "policies.csv").read_text().startswith("policy,rating,rating_low,rating_high,mean,")
     monkeypatch.setattr(tournament, "round_robin", lambda *arguments: pytest.fail("played"))
     assert cli.main(["tournament", *arguments, "-o", str(tmp_path / "tournament.csv")]) == 2
     assert "output: " in capfd.readouterr().err

@@ -78,16 +78,17 @@ class Report:
 
 @record
 class Tournament(TaskOptions):
-    """Play policies of a match against each other, and rate them: table, CSV and picture."""
+    """Play policies against each other and rate them, or as mates in a cooperative task: tables, CSV and picture."""
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """Id of a match, such as go1wrestling."""
+    """Id of a task, such as go1wrestling or go1gate."""
     policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME|RUN|FILE")]
-    """Policies; scripted, idle and random play too. Ratings are relative to scripted, or idle without it."""
+    """Policies. Scripted, idle and (in a match) random play too. Ratings are relative to scripted, or idle without
+    it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("runs/tournament")
-    """Folder of tournament.csv and tournament.png."""
+    """Folder of tournament.csv, tournament.png and, of a match, policies.csv."""
     episodes: Candidates = 64
-    """Episodes of each pair on each side."""
+    """Episodes of each pair on each side, or of each mixed team."""
     deterministic: bool = False
     """Use mean actions of trained policies; otherwise they are sampled, as in training."""
     seed: Seed = 0
@@ -96,17 +97,17 @@ class Tournament(TaskOptions):
     def run(self) -> dict[str, Any]:
         """Plays all pairs; prints a table, or returns the object for `--json`."""
         from mqe_jax.runs.playing import tournament
-        from mqe_jax.selfplay.league.tournament import CSV, PICTURE
+        from mqe_jax.selfplay.league.tournament import CSV, PICTURE, POLICIES
 
-        for name in (CSV, PICTURE):
+        for name in (CSV, POLICIES, PICTURE):
             check_output(self.output / name)
         options = {name: getattr(self, name) for name in ("impl", "episodes", "deterministic", "seed")}
-        standings = tournament(self.task, self.policies, env=self.overrides(), **options)
-        standings.save(self.output)
+        played = tournament(self.task, self.policies, env=self.overrides(), **options)
+        played.save(self.output)
         echo(f"mqe: wrote {self.output / CSV} and {PICTURE}")
         if not self.json:
-            print(standings)
-        return standings.to_dict()
+            print(played)
+        return played.to_dict()
 
 
 def _print(result: dict[str, Any]) -> None:

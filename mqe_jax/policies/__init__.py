@@ -27,7 +27,7 @@ from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.translated import together, translate
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.needs import Needs
-from mqe_jax.train.policy import Policy, check_obs, check_policy, groups_of
+from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, check_policy, groups_of
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -100,6 +100,72 @@ class BothTeams:
         others = seen.of(slice(size, None)).to(self.second)
         second, second_memory = self.second.act(others, memory[1], keys[1])
         return jnp.concatenate([first, second], axis=1), (first_memory, second_memory)
+
+
+@dataclasses.dataclass(frozen=True)
+class MixedTeam:
+    """A team whose agents follow different policies of the whole team, as one policy.
+
+    Each agent takes its own action from what its policy does for all. Trained policies of equal architecture are
+    exchanged as arrays, so that a compiled program serves all seats.
+    """
+
+    policies: tuple[Policy, ...]
+    """Policies of the team."""
+    seats: Any
+    """Index of each agent's policy (A,), an array that may be traced."""
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return self.policies[0].task
+
+    @property
+    def agents(self) -> int:
+        """Number of agents of the team."""
+        return self.policies[0].agents
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of observations that the policies see."""
+        return tuple(groups_of(*self.policies))
+
+    @functools.cached_property
+    def _kinds(self) -> list[list[int]]:
+        """Returns the indices of the policies that can be exchanged for each other, by their architectures."""
+        kinds: dict[Any, list[int]] = {}
+        for index, policy in enumerate(self.policies):
+            kind = repr(policy.architecture) if isinstance(policy, TrainedPolicy) else index
+            kinds.setdefault(kind, []).append(index)
+        return list(kinds.values())
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns the initial recurrent states of each agent's policy, of all architectures."""
+        every = tuple(self.policies[indices[0]].initial_memory(num_envs) for indices in self._kinds)
+        return (every,) * self.agents
+
+    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        """Returns the actions of all agents; see `Policy`."""
+        seen = Observations.at(obs)
+        check_obs(seen.obs, self.agents)
+        keys = jax.random.split(check("key", key, RandomKey), (self.agents, len(self._kinds)))
+        seats, actions, memories = jnp.asarray(self.seats), [], []
+        for agent in range(self.agents):
+            action, after = 0.0, []
+            for indices, now, own in zip(self._kinds, memory[agent], keys[agent], strict=True):
+                chosen, (first, *more) = jnp.asarray(indices) == seats[agent], [self.policies[i] for i in indices]
+                if isinstance(first, TrainedPolicy):
+                    place = jnp.argmax(chosen)
+                    each = [policy.arrays for policy in (first, *more) if isinstance(policy, TrainedPolicy)]
+                    arrays = jax.tree.map(lambda *x: jnp.stack(x)[place], *each)  # noqa: B023
+                    team, now = first.act_with(arrays, seen, now, own)
+                else:
+                    team, now = first.act(seen.to(first), now, own)
+                action = jnp.where(jnp.any(chosen), team[:, agent], action)
+                after.append(now)
+            actions.append(action)
+            memories.append(tuple(after))
+        return jnp.stack(actions, axis=1), tuple(memories)
 
 
 @overload

@@ -24,6 +24,7 @@ from mqe_jax.runs import build
 from mqe_jax.runs.build import Player, parameters_of
 from mqe_jax.runs.divergence import guard
 from mqe_jax.selfplay.league import tournament as league
+from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.league.tournament import Standings
 from mqe_jax.train.evaluate import Result, evaluate_batch
@@ -98,8 +99,8 @@ def tournament(
     episodes: int = 64,
     deterministic: bool = False,
     seed: int = 0,
-) -> Standings:
-    """Plays policies of a match against each other and rates them, as `mqe tournament`.
+) -> Standings | CrossPlay:
+    """Plays policies of a match against each other and rates them, or mixes teams of them, as `mqe tournament`.
 
     Example:
         ```python
@@ -109,25 +110,33 @@ def tournament(
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `load_policy` accepts; scripted, idle and random play too. Ratings are relative to scripted, or
-            idle without it.
-        episodes: episodes of each pair on each side.
+        policies: what `load_policy` accepts. In a match scripted, idle and random play too; ratings are relative to
+            scripted, or idle without it. In a task of one team, agent 0 follows each policy with each as its mates,
+            scripted and idle ones too.
+        episodes: episodes of each pair on each side, or of each team.
+
+    Returns:
+        `Standings` of a match, else a `CrossPlay`.
 
     Raises:
-        InputError: as `evaluate`, and for a task of one team.
+        InputError: as `evaluate`.
     """
     task = task_id(task) if isinstance(task, str) else task
     needed = parameters_for(task, *policies) if isinstance(task, str) else parameters_of(task)
     params = merge(needed, env or {})
-    match, _ = build.make_env(task, impl, params, 1)
-    if len(match.teams) < 2:
-        fail("task", match.name, "a match: it has one team")
-    fixed = build.reference_opponents(match)
-    names = tuple(dict.fromkeys([*policies, *fixed]))
-    _, matches = build.make_env(task, impl, params, len(names) * episodes)
-    teams = {name: load_policy(name, matches.env, deterministic=deterministic) for name in names}
-    results = league.round_robin(matches, teams, jax.random.PRNGKey(seed))
-    return league.Standings(match.name, names, results, league.rate(results, names.index(fixed[0])))
+    single, _ = build.make_env(task, impl, params, 1)
+    references, key = build.reference_opponents(single), jax.random.PRNGKey(seed)
+    match, own = len(single.teams) > 1, tuple(dict.fromkeys(policies))
+    if not match:
+        references = [name for name in references if name not in ("random", *own)]
+    names = tuple(dict.fromkeys([*own, *references]))
+    envs, copies = (len(names) * episodes, 1) if match else (episodes, len(names))
+    _, batch = build.make_env(task, impl, params, envs, copies)
+    teams = {name: load_policy(name, batch.env, deterministic=deterministic) for name in names}
+    if not match:
+        return CrossPlay(single.name, own, tuple(references), episodes, cross_play(batch, teams, episodes, key))
+    results = league.round_robin(batch, teams, key)
+    return Standings(single.name, names, results, league.rate(results, names.index(references[0])))
 
 
 @check_arguments(

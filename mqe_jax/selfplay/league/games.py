@@ -24,11 +24,24 @@ _BARRIERS = 10.0 ** -np.arange(1, 15)  # weights of the barrier; the last one bo
 
 
 class Estimate(NamedTuple):
-    """Numbers with the bounds of their 95% intervals, of one shape."""
+    """A number with the bounds of its 95% interval, or an array with those of its numbers."""
 
-    value: Array
-    low: Array
-    high: Array
+    value: Any
+    low: Any
+    high: Any
+
+    def at(self, *index: int) -> Estimate:
+        """Returns the estimate of one of the numbers."""
+        return Estimate(*(x[index] for x in self))
+
+    def text(self, scale: float = 100.0, form: str = ".0f") -> str:
+        """Returns one number with its interval."""
+        value, low, high = (format(scale * float(x) + 0.0, form) for x in self)
+        return f"{value} ({low} to {high})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain numbers for JSON."""
+        return {name: np.asarray(x).tolist() for name, x in self._asdict().items()}
 
 
 def _check_results(value: Any) -> Any:
@@ -161,16 +174,22 @@ def estimate(value: Any, samples: Any) -> Estimate:
 class Analysis(NamedTuple):
     """What the results of P policies say about each; payoffs are wins minus losses of a game."""
 
+    payoff: Estimate
+    """Payoff of each policy against each, on both sides together (P, P). Intervals are those of other episodes."""
     mean: Estimate
     """Mean payoff against the others (P,). Its interval is that of other opponents and episodes."""
     worst: Estimate
-    """Lowest payoff against one of the others (P,). Its interval and those below are those of other episodes."""
+    """Lowest payoff against one of the others (P,)."""
     weight: Estimate
     """Weight in the maximum-entropy Nash equilibrium (P,)."""
     average: Estimate
     """Nash average: payoff against that equilibrium (P,)."""
     cycles: Estimate
     """Share of intransitive triples ()."""
+
+    def by_policy(self) -> dict[str, Estimate]:
+        """Returns what describes each policy (P,), by name."""
+        return {"mean": self.mean, "worst": self.worst, "nash_average": self.average, "nash_weight": self.weight}
 
 
 @check_arguments(results=Results)
@@ -187,6 +206,7 @@ def analyse(results: NDArray[Any]) -> Analysis:
     averages = [each @ weight for each, weight in zip((matrix, *samples), weights, strict=True)]
     against = np.take_along_axis(matrix, others, -1)
     return Analysis(
+        estimate(matrix, samples),
         estimate(against.mean(axis=-1), np.take_along_axis(samples, drawn, -1).mean(axis=-1)),
         estimate(against.min(axis=-1), np.take_along_axis(samples, others[None], -1).min(axis=-1)),
         estimate(weights[0], weights[1:]),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,23 +15,22 @@ import numpy as np
 from annotated_types import MinLen
 from numpy.typing import NDArray
 
-from mqe_jax.core.files import replacing, write_atomically
 from mqe_jax.core.limits import NonNegativeInt
-from mqe_jax.core.literal import line, to_label
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check_arguments, fail
 from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
 from mqe_jax.envs import VectorEnv
-from mqe_jax.selfplay.league.games import Estimate, Results, estimate, games_of, resample
+from mqe_jax.selfplay.league.games import Analysis, Estimate, Results, analyse, estimate, games_of, resample
+from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
 from mqe_jax.selfplay.opponents import Versus
+from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.policy import Policy, check_policy
 
 Array = NDArray[np.float64]
-CSV, PICTURE = "tournament.csv", "tournament.png"
+CSV, POLICIES, PICTURE = "tournament.csv", "policies.csv", "tournament.png"
 
 _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 40
-_LONG = 28  # characters of a name in the picture, at most
 
 
 @single
@@ -113,7 +111,7 @@ def _strengths(points: Array, reference: int) -> Array:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Standings:
-    """The results of a tournament of P policies; as text, a table with the strongest first."""
+    """The results of a tournament of P policies; as text, tables with the strongest first."""
 
     task: str
     """Id of the match."""
@@ -124,56 +122,58 @@ class Standings:
     ratings: Estimate
     """Ratings, relative to one of them."""
 
+    @functools.cached_property
+    def analysis(self) -> Analysis:
+        """Mean, worst case, Nash average and cycles, with intervals."""
+        return analyse(self.results)
+
     def __repr__(self) -> str:
-        points, games = scores(self.results), np.maximum(self.results.sum(axis=-1) + self.results.sum(axis=-1).T, 1)
-        lines = [f"{'policy':<32} rating (95% interval); points of 100 games against each, in the same order"]
-        for i in self._order:
-            row = " ".join(f"{100 * points[i, j] / games[i, j]:4.0f}" if i != j else "    " for j in self._order)
-            low, value, high = (x[i] for x in (self.ratings.low, self.ratings.value, self.ratings.high))
-            lines.append(f"{line(self.policies[i]):<32} {value:6.0f} ({low:.0f} to {high:.0f})  {row}")
+        found, order = self.analysis, self._order
+        wide = 50 * np.max(found.payoff.high - found.payoff.low)
+        names, ratings = [shorten(self.policies[i]) for i in order], [self.ratings.at(i).text(1) for i in order]
+        columns = {"mean": found.mean, "worst case": found.worst, "Nash average": found.average}
+        texts = {name: [kind.at(i).text(form="+.0f") for i in order] for name, kind in columns.items()}
+        texts["Nash weight"] = [found.weight.at(i).text() for i in order]
+        lines = [
+            *table({"policy": names, "rating (95% interval)": ratings}),
+            "",
+            "wins minus losses of 100 games on both sides together (95% interval)",
+            *table(texts),
+            "",
+            f"the same of each pair, row against column; intervals are +-{wide:.0f} at most",
+            *grid(100 * found.payoff.value[np.ix_(order, order)], "+.0f", diagonal=False),
+            "",
+            f"cycles: {found.cycles.text()}% of all triples",
+        ]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the results as JSON can represent them, ratings with the strongest first."""
-        rows = [
-            {"policy": self.policies[i], **{name: float(x[i]) for name, x in self.ratings._asdict().items()}}
-            for i in self._order
-        ]
-        return {"task": self.task, "ratings": rows, "policies": [*self.policies], "results": self.results.tolist()}
+        found, policies = self.analysis, []
+        for i in self._order:
+            each = {name: x.at(i).to_dict() for name, x in found.by_policy().items()}
+            policies.append({"policy": self.policies[i], **self.ratings.at(i).to_dict(), **each})
+        pairs = {"results": self.results.tolist(), "payoff": found.payoff.to_dict(), "cycles": found.cycles.to_dict()}
+        return {"task": self.task, "ratings": policies, "policies": [*self.policies], **pairs}
 
     @check_arguments(folder=PathText)
     def save(self, folder: str | Path) -> None:
-        """Writes the results of every pair, the ratings, and a picture of the points, atomically."""
-        folder, text = Path(folder), io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(("team0", "team1", *RESULTS, "rating_of_team0", "low", "high"))
+        """Writes the results of every pair, what they say of each policy, and a picture of the points, atomically."""
+        folder, pairs = Path(folder), []
+        both = self.results + self.results.swapaxes(0, 1)[..., ::-1]
         for i, j in itertools.product(range(len(self.policies)), repeat=2):
-            names = self.policies[i], self.policies[j]
-            writer.writerow((*names, *self.results[i, j], *(f"{x[i]:.1f}" for x in self.ratings)))
-        write_atomically(folder / CSV, text.getvalue().encode())
-        _draw(self.policies, self.results, folder / PICTURE)
+            games = max(int(both[i, j].sum()), 1)
+            rates = [f"{x:.4f}" for count in both[i, j] for x in Rate.of(count / games, games)]
+            pairs.append((self.policies[i], self.policies[j], *self.results[i, j], *rates))
+        sides = [f"{name}{end}" for name in RESULTS for end in ("_both_sides", "_low", "_high")]
+        write_table(folder / CSV, ("team0", "team1", *RESULTS, *sides), pairs)
+        kinds = {"rating": self.ratings, **self.analysis.by_policy()}
+        header = [f"{name}{end}" for name in kinds for end in ("", "_low", "_high")]
+        rows = [(self.policies[i], *(f"{x[i]:.6g}" for kind in kinds.values() for x in kind)) for i in self._order]
+        write_table(folder / POLICIES, ("policy", *header), rows)
+        share = scores(self.results) / np.maximum(scores(self.results) + scores(self.results).T, 1)
+        draw(self.policies, share, "points of 100 games, row against column", folder / PICTURE, diagonal=False)
 
     @property
     def _order(self) -> list[int]:
         return np.argsort(-self.ratings.value, kind="stable").tolist()
-
-
-def _draw(names: Sequence[str], results: NDArray[np.int64], path: Path) -> None:
-    """Draws each policy's points per game against each, rows against columns."""
-    from matplotlib.figure import Figure
-
-    share = scores(results) / np.maximum(results.sum(axis=-1) + results.sum(axis=-1).T, 1)
-    size = 2.6 + 0.6 * len(names)
-    figure = Figure((size + 0.8, size), dpi=120, layout="constrained")
-    axes = figure.add_subplot()
-    axes.imshow(share, cmap="RdYlGn", vmin=0, vmax=1)
-    for (row, column), value in np.ndenumerate(share):
-        if row != column:
-            axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=9)
-    ends = (name if len(name) <= _LONG else f"...{name[3 - _LONG :]}" for name in names)  # the end names a run
-    shown = list(map(to_label, ends))
-    axes.set_xticks(range(len(names)), shown, rotation=45, ha="right")
-    axes.set_yticks(range(len(names)), shown)
-    figure.suptitle("points of 100 games, row against column", fontsize=10)
-    with replacing(path) as temporary:
-        figure.savefig(temporary)

@@ -1,0 +1,138 @@
+"""Cross-play of a cooperative task: teams whose agents follow policies of different trainings."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from annotated_types import MinLen
+from numpy.typing import NDArray
+
+from mqe_jax.core.limits import Episodes
+from mqe_jax.core.settings import PathText, check_arguments, fail
+from mqe_jax.core.types import AnyBatch, AnyPolicy, Memory, Observations, RandomKey, teams_of
+from mqe_jax.envs import VectorEnv
+from mqe_jax.policies import MixedTeam
+from mqe_jax.selfplay.league.games import Estimate, mates
+from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
+from mqe_jax.selfplay.league.tournament import CSV, PICTURE
+from mqe_jax.train.evaluate import Evaluator, Rate
+from mqe_jax.train.policy import Policy, check_policy, groups_of
+
+Array = NDArray[np.float64]
+
+
+@check_arguments(
+    batch=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], episodes=Episodes, key=RandomKey
+)
+def cross_play(batch: VectorEnv, policies: Mapping[str, Policy], episodes: int, key: jax.Array) -> Array:
+    """Returns the success rates of teams whose agent 0 follows one policy and the others another one (P, P).
+
+    The batch has P copies: a compiled program evaluates the teams of a row at once, and serves all rows.
+    """
+    for name, policy in policies.items():
+        check_policy(policy, batch, name)
+    if batch.num_agents < 2 or len(teams_of(batch)) > 1:
+        fail("task", batch.name, "one of a team of several agents")
+    count, team = len(policies), MixedTeam(tuple(policies.values()), (0,) * batch.num_agents)
+
+    def act(seats: jax.Array, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        return dataclasses.replace(team, seats=seats).act(seen, memory, key)
+
+    evaluator = Evaluator(batch.with_groups(groups_of(team)), act, team.initial_memory(batch.num_envs))
+    rates = np.zeros((count, count))
+    for first, row_key in enumerate(jax.random.split(key, count)):
+        seats = jnp.tile(jnp.arange(count)[:, None], batch.num_agents).at[:, 0].set(first)
+        results = evaluator(seats, episodes, jax.random.split(row_key, count))
+        rates[first] = [result.success_rate for result in results]
+    return rates
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CrossPlay:
+    """Success of mixed teams of P policies and some reference policies, N in all; as text, tables."""
+
+    task: str
+    """Id of the task."""
+    policies: tuple[str, ...]
+    """Names of the policies."""
+    references: tuple[str, ...]
+    """Names of the reference policies, further mates."""
+    episodes: int
+    """Episodes of each team."""
+    success: Array
+    """Success rates of teams whose agent 0 follows the row's policy, the others the column's (N, N)."""
+
+    @functools.cached_property
+    def means(self) -> dict[str, Estimate]:
+        """Means of `success` without reference policies: `same`, `cross` and `gap` of `games.mates`."""
+        count = len(self.policies)
+        return mates(self.success[:count, :count], self.episodes)
+
+    @property
+    def worst(self) -> tuple[int, int] | None:
+        """Indices of agent 0's policy and that of the others in the worst team of different policies; None with one."""
+        count = len(self.policies)
+        pairs = itertools.permutations(range(count), 2)
+        return min(pairs, key=lambda pair: self.success[pair], default=None)
+
+    def rate(self, first: int, others: int) -> Estimate:
+        """Returns the success of a team, by the indices of agent 0's policy and that of the others."""
+        return Estimate(*Rate.of(float(self.success[first, others]), self.episodes))
+
+    def __repr__(self) -> str:
+        count, names = len(self.policies), [*self.policies, *self.references]
+        wide = max(50 * (rate.high - rate.low) for rate in itertools.starmap(self.rate, self._pairs))
+        shown = {"same": "policies with themselves", "cross": "different policies", "gap": "difference"}
+        lines = [f"{self.task}: success in % of {self.episodes} episodes (95% interval)"]
+        lines += [
+            f"{text:<26}{self.means[name].text(form='.1f')}" for name, text in shown.items() if name in self.means
+        ]
+        if self.worst is not None:
+            first, others = self.worst
+            lines.append(f"{'worst different policies':<26}{self.rate(first, others).text(form='.1f')}: ")
+            lines[-1] += f"{first + 1} with {others + 1}"
+        lines += ["", f"agent 0 follows the row, the others the column; intervals are +-{wide:.0f} at most"]
+        lines += [*table({"policy": [*map(shorten, names)]}), "", *grid(100 * self.success, ".0f")]
+        columns = {}
+        for at, name in enumerate(self.references, count):
+            columns[f"agent 0 {name}"] = [self.rate(at, i).text() for i in range(count)]
+            columns[f"others {name}"] = [self.rate(i, at).text() for i in range(count)]
+        if columns:
+            lines += ["", "with a reference policy as a part of the team", *table({"": [""] * count, **columns})]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the results as JSON can represent them."""
+        size, worst = range(len(self.success)), None
+        if self.worst is not None:
+            worst = {"policies": [self.policies[i] for i in self.worst], **self.rate(*self.worst).to_dict()}
+        bounds = np.array([[self.rate(i, j) for j in size] for i in size])
+        return {
+            "task": self.task,
+            "policies": [*self.policies],
+            "references": [*self.references],
+            "episodes": self.episodes,
+            "success": Estimate(*np.moveaxis(bounds, -1, 0)).to_dict(),
+            **{name: mean.to_dict() for name, mean in self.means.items()},
+            "worst": worst,
+        }
+
+    @check_arguments(folder=PathText)
+    def save(self, folder: str | Path) -> None:
+        """Writes the success of every team, and a picture of it, atomically."""
+        folder, names = Path(folder), [*self.policies, *self.references]
+        rows = [(names[i], names[j], self.episodes, *(f"{x:.4f}" for x in self.rate(i, j))) for i, j in self._pairs]
+        write_table(folder / CSV, ("agent0", "others", "episodes", "success", "low", "high"), rows)
+        draw(names, self.success, "success in %, agent 0 (row) with the others (column)", folder / PICTURE)
+
+    @property
+    def _pairs(self) -> list[tuple[int, int]]:
+        return [(i, j) for i in range(len(self.success)) for j in range(len(self.success))]

@@ -1,0 +1,113 @@
+"""Mixed teams: each agent follows its own policy, and success is that of the policies' places."""
+
+import dataclasses
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax import cli
+from mqe_jax.core.errors import InputError
+from mqe_jax.envs import make
+from mqe_jax.policies import MixedTeam, SimplePolicy, load_policy
+from mqe_jax.selfplay.league import games
+from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
+from mqe_jax.selfplay.league.games import Estimate
+from mqe_jax.selfplay.league.tournament import Standings, rate
+from mqe_jax.train.evaluate import Rate
+from tests import fake_env
+
+KEY = jax.random.PRNGKey(0)
+OTHER = Path(__file__).parents[1] / "results" / "cooperative" / "go1gate-seed10.safetensors"
+
+
+def test_each_agent_does_what_its_own_policy_does_for_it() -> None:
+    """Of policies that are exchanged as arrays, of another architecture, and scripted ones; with recurrent states."""
+    env = make("go1gate", impl="c", num_envs=1)
+    trained: Any = load_policy("go1gate", env, deterministic=True)
+    changed = dataclasses.replace(trained, params=jax.tree.map(lambda x: 0.9 * jnp.asarray(x), trained.params))
+    policies = trained, load_policy("scripted", env), changed, load_policy(OTHER, env, deterministic=True)
+    obs, memories = jax.random.normal(KEY, (3, 2, 16)), [policy.initial_memory(3) for policy in policies]
+    team = MixedTeam(policies, (0, 0))
+    memory = team.initial_memory(3)
+    both = jnp.array([*itertools.product(range(4), repeat=2)])
+
+    @jax.jit
+    @jax.vmap
+    def act(seats: jax.Array, memory: Any) -> Any:
+        return dataclasses.replace(team, seats=seats).act(obs, memory, KEY)
+
+    memory = jax.tree.map(lambda x: jnp.stack([x] * 16), memory)
+    actions = jnp.zeros(())
+    for _ in range(2):
+        own = [policy.act(obs, now, KEY) for policy, now in zip(policies, memories, strict=True)]
+        memories = [now for _, now in own]
+        actions, memory = act(both, memory)
+        for (first, second), action in zip(both.tolist(), actions, strict=True):
+            expected = jnp.stack([own[first][0][:, 0], own[second][0][:, 1]], axis=1)
+            np.testing.assert_allclose(action, expected, atol=1e-5)
+    assert len({np.asarray(action).tobytes() for action in actions}) == 16
+
+
+def simple(*forward: float) -> SimplePolicy:
+    """A policy of the fake task, in which each robot moves by a tenth of a metre times its number a step."""
+    action = jnp.array(forward)[:, None] * jnp.array([1.0, 0.0, 0.0])
+    return SimplePolicy("fake", 2, lambda obs, key: jnp.tile(action, (len(obs), 1, 1)))
+
+
+def test_success_is_that_of_the_places_and_one_program_serves_all_teams() -> None:
+    """The fake task succeeds if both robots move; the program of a row is traced once."""
+    traced = []
+
+    def sometimes(obs: jax.Array, key: jax.Array) -> jax.Array:
+        traced.append(1)
+        return jnp.tile((jax.random.uniform(key, (len(obs), 1, 1)) < 0.24).astype(float), (1, 2, 3))
+
+    batch: Any = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 64)
+    policies = {"both": simple(1, 1), "first": simple(1, 0), "none": simple(0, 0)}
+    policies["sometimes"] = SimplePolicy("fake", 2, sometimes)
+    rates = cross_play(batch, policies, 64, KEY)
+    assert rates[:3, :3].tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 0]]
+    chances = rates[[0, 1, 3], [3, 3, 0]]
+    assert np.all((0.1 < chances) & (chances < 0.7)) and len(set(chances)) > 1
+    assert len(traced) <= 4  # both seats, and a trace of shapes
+
+
+def test_tables_are_80_columns_wide_and_have_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(games, "_SAMPLES", 50)
+    names = tuple(f"runs/{'x' * 60}{i}" for i in range(21))
+    success = np.random.default_rng(0).integers(0, 17, size=(21, 21)) / 16
+    results = np.zeros((21, 21, 3), int)
+    results[np.triu_indices(21, 1)] = [8, 0, 0]
+    shown = CrossPlay("go1gate", names[:19], ("scripted", "idle"), 16, success)
+    standings = Standings("go1tug", names, results, rate(results, 20))
+    for text in (repr(shown), repr(standings)):
+        assert max(map(len, text.splitlines())) <= 80
+    assert f"{Estimate(*Rate.of(success[3, 20], 16)).text()}" in repr(shown)
+    found, pairs = shown.to_dict(), list(itertools.permutations(range(19), 2))
+    assert found["worst"]["value"] == min(success[pair] for pair in pairs)
+    assert found["cross"]["value"] == pytest.approx(np.mean([success[pair] for pair in pairs]))
+    assert "100 (100 to 100)" in repr(standings) and "cycles: 0 " in repr(standings)
+
+
+def test_a_cooperative_task_is_played_by_mixed_teams(tmp_path: Path, capfd: Any) -> None:
+    words = ["--impl", "c", "--set", "episode_length=0.1", "--control", "position", "--episodes", "2"]
+    assert cli.main(["tournament", "go1gate", "random", *words, "-o", str(tmp_path), "--json"]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found["policies"] == ["random"] and found["references"] == ["idle"] and found["worst"] is None
+    assert np.shape(found["success"]["value"]) == (2, 2)
+    rows = (tmp_path / "tournament.csv").read_text().splitlines()
+    assert rows[2].startswith("random,idle,2,0.0000,0.0000,0.6") and len(rows) == 5
+    assert (tmp_path / "tournament.png").stat().st_size > 3000
+
+
+def test_a_task_of_one_agent_has_no_mates() -> None:
+    batch: Any = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 2)
+    batch.num_agents = 1
+    with pytest.raises(InputError, match=r"task: 'fake' .* one of a team of several agents"):
+        cross_play(batch, {"a": dataclasses.replace(simple(1), agents=1)}, 2, KEY)
