@@ -1,4 +1,4 @@
-"""Bad input as strategies of hypothesis: values that `mqe_jax.core.limits` refuses, hostile texts, damaged files.
+"""Bad input: what a refusal is, and strategies of hypothesis for values beyond `mqe_jax.core.limits`, texts and files.
 
 `refused(kind)` of a kind of numbers is outside its bounds or no such number; nothing of it may be accepted. Texts and
 damaged files may be accepted where they happen to be valid.
@@ -7,14 +7,16 @@ damaged files may be accepted where they happen to be valid.
 import json
 import struct
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from mqe_jax.cli.arguments import COMMANDS
 from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import hints_of, is_record
 from mqe_jax.envs import TASKS
 from mqe_jax.study.sweep import Sweep
@@ -40,6 +42,17 @@ TEXTS = (
     "%s%n", "9" * 400, "a" * 5000,
 )  # fmt: skip
 """Hostile texts for flags and YAML."""
+
+
+LONGEST = 1200  # characters of a message: what is allowed may be a list of names
+
+
+def refuses(said: str, call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
+    """Asserts that a call raises an InputError of one line in which the pattern `said` is found."""
+    with pytest.raises(InputError, match=said) as error:
+        call(*arguments, **named)
+    text = str(error.value)
+    assert "\n" not in text and len(text) <= LONGEST, text
 
 
 # -- settings ----------------------------------------------------------------------------------------------------------

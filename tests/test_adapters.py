@@ -22,6 +22,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.policies import SimplePolicy
+from tests.inputs import refuses
 
 COUNT, STEPS, ENDS = 3, 14, 5
 SEED = 7
@@ -114,8 +115,7 @@ def test_disabled_autoreset_and_time_limit() -> None:
     for step in range(ENDS):
         truncated = vector.step(zero)[3]
         assert truncated.all() == (step == ENDS - 1)
-    with pytest.raises(InputError, match=r"reset environments \[0 1 2\]"):
-        vector.step(zero)
+    refuses(r"reset environments \[0 1 2\]", vector.step, zero)
     vector.reset()
     assert not vector.step(zero)[3].any()
 
@@ -145,27 +145,20 @@ def test_render_returns_images() -> None:
     ],
 )
 def test_bad_settings_are_named(settings: dict[str, Any], told: str) -> None:
-    with pytest.raises(InputError, match=told):
-        VectorEnv("go1gate", **{"num_envs": 2, "impl": "c", **settings})
+    refuses(told, VectorEnv, "go1gate", **{"num_envs": 2, "impl": "c", **settings})
 
 
 def test_bad_calls_are_named() -> None:
     vector: Any = VectorEnv("go1gate", COUNT, impl="c", **SHORT)
     action = np.zeros(vector.action_space.shape, np.float32)
-    with pytest.raises(InputError, match="reset the environment first"):
-        vector.step(action)
+    refuses("reset the environment first", vector.step, action)
     vector.reset(seed=SEED)
-    with pytest.raises(InputError, match=r"action: shape \(2, 2, 3\); expected \(3, 2, 3\)"):
-        vector.step(action[:2])
-    with pytest.raises(InputError, match="NaN or infinity"):
-        vector.step(action * np.nan)
+    refuses(r"action: shape \(2, 2, 3\); expected \(3, 2, 3\)", vector.step, action[:2])
+    refuses("NaN or infinity", vector.step, action * np.nan)
     for seed in ([1, 2], 1.5, "abc"):
-        with pytest.raises(InputError, match=r"seed: .*3 integers"):
-            vector.reset(seed=seed)
-    with pytest.raises(InputError, match=r"seed: 4294967296 is not allowed"):
-        vector.reset(seed=2**32)
-    with pytest.raises(InputError, match="reset_mask"):
-        vector.reset(options={"reset_mask": np.zeros(COUNT, bool)})
+        refuses(r"seed: .*3 integers", vector.reset, seed=seed)
+    refuses(r"seed: 4294967296 is not allowed", vector.reset, seed=2**32)
+    refuses("reset_mask", vector.reset, options={"reset_mask": np.zeros(COUNT, bool)})
 
 
 def test_every_task_is_registered() -> None:
@@ -251,8 +244,7 @@ def test_bad_opponents_are_named() -> None:
     env = match()
     with pytest.raises(InputError, match="opponent: go1gate is not a match; omit the opponent"):
         task_env("go1gate", opponent="idle", impl="c", control="position")
-    with pytest.raises(InputError, match="opponent: unknown 'scriptd'"):
-        task_env(env, opponent="scriptd")
+    refuses("opponent: unknown 'scriptd'", task_env, env, opponent="scriptd")
     with pytest.raises(InputError, match=r"opponent: .* needs task 'go1tug'; the environment has 'go1wrestling'"):
         task_env(env, opponent=counting("go1tug"))
     team = TeamEnv(env, "idle")

@@ -18,6 +18,7 @@ import pytest
 import mqe_jax
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
+from tests.inputs import refuses
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
@@ -72,10 +73,8 @@ def test_brax_rollout(task: str) -> None:
 def test_brax_wrap_names_what_it_does_not_take() -> None:
     brax = adapter("brax")
     vectorised = importlib.import_module("brax.envs.wrappers.training").VmapWrapper(brax.Env(task_env("go1gate")))
-    with pytest.raises(InputError, match="randomization_fn: not supported"):
-        brax.wrap(vectorised, randomization_fn=lambda system: system)
-    with pytest.raises(InputError, match="env: object is not"):
-        brax.wrap(type("Foreign", (), {"unwrapped": object()})())  # type: ignore[arg-type]
+    refuses("randomization_fn: not supported", brax.wrap, vectorised, randomization_fn=lambda system: system)
+    refuses("env: object is not", brax.wrap, type("Foreign", (), {"unwrapped": object()})())
 
 
 def test_brax_names_wrong_arguments() -> None:
@@ -92,8 +91,7 @@ def test_brax_names_wrong_arguments() -> None:
         "state: None is not allowed": lambda: wrapped.step(None, jnp.zeros((COUNT, 6))),
         r"action: shape \(6,\); expected \(3, 6\)": lambda: jax.eval_shape(wrapped.step, states, jnp.zeros(6)),
     }.items():
-        with pytest.raises(InputError, match=name):
-            call()
+        refuses(name, call)
 
 
 def test_jaxmarl_names_wrong_arguments() -> None:
@@ -120,8 +118,7 @@ def test_jaxmarl_names_wrong_arguments() -> None:
         "agent: 'robot_2'": lambda: env.action_space("robot_2"),
         r"agent: \[\]": lambda: env.observation_space([]),
     }.items():
-        with pytest.raises(InputError, match=name):
-            call()
+        refuses(name, call)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -163,8 +160,7 @@ def test_without_the_library_the_extra_is_named(library: str, monkeypatch: pytes
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(sys.modules, f"mqe_jax.adapters.{library}", raising=False)
-    with pytest.raises(InputError, match=rf"pip install 'mqe-jax\[{library}\]'"):
-        importlib.import_module(f"mqe_jax.adapters.{library}")
+    refuses(rf"pip install 'mqe-jax\[{library}\]'", importlib.import_module, f"mqe_jax.adapters.{library}")
 
 
 def test_brax_knows_the_tasks_by_name() -> None:
@@ -295,16 +291,11 @@ def test_a_copy_is_a_new_environment_with_the_same_settings(zoo: Any) -> None:
 
 def test_bad_input_is_named(zoo: Any) -> None:
     env = zoo.parallel_env("go1gate", **SHORT)
-    with pytest.raises(InputError, match="reset the environment first"):
-        env.state()
+    refuses("reset the environment first", env.state)
     env.reset(seed=0)
-    with pytest.raises(InputError, match=GIVEN):
-        env.step({"robot_0": np.zeros(3, np.float32)})
-    with pytest.raises(InputError, match="render_mode: 'human'"):
-        zoo.parallel_env(render_mode="human")
+    refuses(GIVEN, env.step, {"robot_0": np.zeros(3, np.float32)})
+    refuses("render_mode: 'human'", zoo.parallel_env, render_mode="human")
     with pytest.raises(InputError, match=r"max_cycles: -1 is not allowed; .* greater than 0"):
         zoo.parallel_env("go1gate", max_cycles=-1, impl="c", control="position")
-    with pytest.raises(InputError, match="episode_length: give either this or max_cycles"):
-        zoo.parallel_env("go1gate", max_cycles=4, **SHORT)
-    with pytest.raises(InputError, match="need the id of a task"):
-        zoo.parallel_env(env.task, max_cycles=4)
+    refuses("episode_length: give either this or max_cycles", zoo.parallel_env, "go1gate", max_cycles=4, **SHORT)
+    refuses("need the id of a task", zoo.parallel_env, env.task, max_cycles=4)

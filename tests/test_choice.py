@@ -24,6 +24,7 @@ from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import make as make_skill
 from mqe_jax.skills.choice import HOLD
 from mqe_jax.train.policy import TrainedPolicy, save_policy
+from tests.inputs import refuses
 
 BOTH = ("walk", "agile")
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
@@ -125,8 +126,7 @@ def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(name: str, 
 def test_a_gait_is_of_the_skill_that_has_it(policies: Any) -> None:
     env = make(TASK, impl="c", num_envs=1, skill=BOTH, command_ranges=WIDE, gait="pace")
     assert isinstance(load_as("policy", policies["agile"], env), Translated)
-    with pytest.raises(InputError, match=r"policy: .* needs gait 'trot'; the environment has 'pace'"):
-        load_as("policy", policies["walk"], env)
+    refuses(r"policy: .* needs gait 'trot'; the environment has 'pace'", load_as, "policy", policies["walk"], env)
 
 
 @pytest.mark.parametrize("skill", ["walk", BOTH])
@@ -176,8 +176,7 @@ def test_commands_seat_them(policies: Any, tmp_path: Path) -> None:
     ],
 )
 def test_what_several_skills_do_not_allow_is_named(parameters: Any, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        make("go1plane", impl="c", num_envs=1, **parameters)
+    refuses(said, make, "go1plane", impl="c", num_envs=1, **parameters)
 
 
 def test_ranges_for_which_no_skill_is_trained_warn() -> None:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from mqe_jax.core import devices
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.train.config import PPO, TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.rollout import minibatches
+from tests.inputs import refuses
 
 KEY = jax.random.PRNGKey(3)
 
@@ -52,8 +52,7 @@ def test_processes_of_different_settings_are_refused(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(processes, "gather", lambda numbers: np.array([numbers, numbers]))
     processes.check_equal("settings")
     monkeypatch.setattr(processes, "gather", lambda numbers: np.array([numbers, [numbers[0] + 1]]))
-    with pytest.raises(InputError, match="processes have different settings"):
-        processes.check_equal("settings")
+    refuses("processes have different settings", processes.check_equal, "settings")
 
 
 def test_random_numbers_belong_to_the_environment() -> None:
@@ -131,5 +130,4 @@ def test_two_shares_are_one_batch(network: str) -> None:
 def test_groups_that_do_not_fit(count: int, groups: int, said: str) -> None:
     config = build(TrainConfig, {"num_envs": 4, "rollout_steps": 4, "ppo": {"minibatches": 2, "groups": groups}})
     env = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4 // count if count == 2 else 4)
-    with pytest.raises(InputError, match=said):
-        make_learner(env, config, processes=2 if count == 2 else 1)
+    refuses(said, make_learner, env, config, processes=2 if count == 2 else 1)

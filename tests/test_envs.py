@@ -18,6 +18,7 @@ from mqe_jax.envs.observation import Block, ObservationLayout, by_entity, entiti
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.registry import SHIPPED
 from tests import engines
+from tests.inputs import refuses
 from tests.states import ending, initial, made, placed, stepper
 
 Array = jax.Array
@@ -177,8 +178,7 @@ def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate
     ],
 )
 def test_bad_parameters_are_named(call: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        call()
+    refuses(message, call)
 
 
 def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:
@@ -186,25 +186,19 @@ def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:
         def scene(self) -> Any:
             return dataclasses.replace(super().scene(), timestep=0.004)
 
-    with pytest.raises(InputError, match=r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s"):
-        Fast(impl="c")
+    refuses(r"Scene.timestep: 0.004 s x 4 substeps is 0.016 s; .* 0.02 s", Fast, impl="c")
     assert Fast(impl="c", control="position").dt == pytest.approx(0.016)
 
 
 def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
     state = fresh
-    with pytest.raises(ValueError, match=r"action: shape \(2, 3\); expected \(2, 12\)"):
-        gate.step(state, jnp.zeros((2, 3)))
-    with pytest.raises(ValueError, match=r"action: dtype int32"):
-        gate.step(state, jnp.zeros((2, 12), jnp.int32))
+    refuses(r"action: shape \(2, 3\); expected \(2, 12\)", gate.step, state, jnp.zeros((2, 3)))
+    refuses(r"action: dtype int32", gate.step, state, jnp.zeros((2, 12), jnp.int32))
     for nothing in (None, "go"):
-        with pytest.raises(InputError, match=r"action: .* must be an array of numbers"):
-            gate.step(state, nothing)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"action: contains NaN"):
-        gate.step(state, jnp.full((2, 12), jnp.nan))
+        refuses(r"action: .* must be an array of numbers", gate.step, state, nothing)
+    refuses(r"action: contains NaN", gate.step, state, jnp.full((2, 12), jnp.nan))
     for count, allowed in ((0, "greater than 0"), (1.5, "a valid integer")):
-        with pytest.raises(InputError, match=f"num_envs: {count} is not allowed; .*{allowed}"):
-            VectorEnv(gate, count)  # type: ignore[arg-type]
+        refuses(f"num_envs: {count} is not allowed; .*{allowed}", VectorEnv, gate, count)
     state = jax.tree.map(lambda x: jnp.stack([x] * 3), state)
     for shape in ((2, 2, 12), (3, 12)):  # another number of environments, no axis of agents
         with pytest.raises(InputError, match=r"action: shape .*; expected \(3, 2, 12\) \(environments, agents"):
@@ -221,11 +215,9 @@ def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any
 def test_a_taken_or_missing_id_is_refused() -> None:
     with pytest.raises(ValueError, match="the id 'go1gate' is already registered by Go1Gate"):
         register_task(type("Other", (TASKS["go1plane"],), {"name": "go1gate"}))
-    with pytest.raises(ValueError, match="its `name` is empty"):
-        register_task(type("Nameless", (TASKS["go1plane"],), {"name": ""}))
+    refuses("its `name` is empty", register_task, type("Nameless", (TASKS["go1plane"],), {"name": ""}))
     for other in (3, int):
-        with pytest.raises(ValueError, match="must be a class derived from QuadrupedEnv"):
-            register_task(other)  # pyright: ignore[reportArgumentType]
+        refuses("must be a class derived from QuadrupedEnv", register_task, other)
     assert [task.name for task in TASKS.values()] == list(TASKS)
 
 
@@ -321,13 +313,10 @@ def test_a_mistake_in_a_task_names_the_method(mistake: str) -> None:
 
 
 def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: Any) -> None:
-    with pytest.raises(InputError, match=r"none.npz: cannot be read"):
-        replay.load_recording(tmp_path / "none.npz")
+    refuses(r"none.npz: cannot be read", replay.load_recording, tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("nothing")
-    with pytest.raises(InputError, match=r"text.npz: damaged, or not a recording"):
-        replay.load_recording(tmp_path / "text.npz")
+    refuses(r"text.npz: damaged, or not a recording", replay.load_recording, tmp_path / "text.npz")
     states = trajectory(gate, fresh, jnp.zeros((2, 2, 12)))
     replay.save_recording(tmp_path / "gate.npz", gate, states, jnp.zeros((2, 2, 12)))
     recording = replay.load_recording(tmp_path / "gate.npz")
-    with pytest.raises(InputError, match=r"go1seesaw .* does not fit a recording of go1gate"):
-        replay.replay(recording, made("go1seesaw"))
+    refuses(r"go1seesaw .* does not fit a recording of go1gate", replay.replay, recording, made("go1seesaw"))

@@ -25,6 +25,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Rate, evaluate_batch
 from mqe_jax.train.runner import Training
 from mqe_jax.train.stages import Stages
+from tests.inputs import refuses
 from tests.training import assert_same
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
@@ -76,8 +77,7 @@ def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixtur
     assert_same(run.policy.arrays, again.policy.arrays)
     assert again.config == run.config and again.evaluations == [] and repr(again) == repr(run)
     np.testing.assert_allclose(again.metrics["loss/value"], run.metrics["loss/value"], rtol=1e-7)
-    with pytest.raises(InputError, match=r"run_dir: saved holds config.yaml, .* but no checkpoint"):
-        run.save("saved")
+    refuses(r"run_dir: saved holds config.yaml, .* but no checkpoint", run.save, "saved")
     with pytest.raises(InputError, match=r"run_dir: saved holds config.yaml, .* but no checkpoint"):
         mqe_jax.learn("fake", FEW, run_dir="saved", resume=True)
     assert mqe_jax.learn("fake", FEW | {"start": "saved"}).finished
@@ -132,8 +132,7 @@ def test_an_own_algorithm_is_trained_and_resumed() -> None:
     done = mqe_jax.learn("fake", FEW, run_dir="run", resume=True, stages=Still)
     assert done.finished
     assert_same(done.policy.params, halfway.policy.params)
-    with pytest.raises(InputError, match=r"stages: .* must be a subclass of"):
-        mqe_jax.learn("fake", FEW, stages=object)  # type: ignore
+    refuses(r"stages: .* must be a subclass of", mqe_jax.learn, "fake", FEW, stages=object)
 
 
 def test_seeds_are_trained_in_one_program_into_their_folders() -> None:
@@ -172,17 +171,14 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
     ],
 )
 def test_what_cannot_be_trained_is_named(task: Any, arguments: dict[str, Any], said: str, capfd: Any) -> None:
-    with pytest.raises(InputError, match=said):
-        mqe_jax.learn(task, **arguments)
+    refuses(said, mqe_jax.learn, task, **arguments)
     assert "".join(capfd.readouterr()) == ""
 
 
 @pytest.mark.parametrize("seeds", [5, [], [1.5], "ab", range(65), [1, 1]])
 def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
-    with pytest.raises(InputError, match=r"seeds.* is not allowed"):
-        mqe_jax.learn_seeds("fake", FEW, seeds=seeds)
-    with pytest.raises(InputError, match=r"seeds: .* is not allowed"):
-        mqe_jax.make_learner("fake", FEW, seeds=0 if seeds == 5 else seeds)
+    refuses(r"seeds.* is not allowed", mqe_jax.learn_seeds, "fake", FEW, seeds=seeds)
+    refuses(r"seeds: .* is not allowed", mqe_jax.make_learner, "fake", FEW, seeds=0 if seeds == 5 else seeds)
 
 
 @pytest.mark.parametrize(
@@ -196,8 +192,7 @@ def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
 )
 def test_what_cannot_be_evaluated_is_named(task: Any, arguments: dict[str, Any], said: str, monkeypatch: Any) -> None:
     monkeypatch.setenv("HOME", "/nowhere")
-    with pytest.raises(InputError, match=said):
-        mqe_jax.evaluate(task, "idle", **arguments)
+    refuses(said, mqe_jax.evaluate, task, "idle", **arguments)
 
 
 def test_a_run_of_other_parts_is_named(run: mqe_jax.Run) -> None:
@@ -207,8 +202,7 @@ def test_a_run_of_other_parts_is_named(run: mqe_jax.Run) -> None:
     wrong = {"policy": [{}], "metrics": [[], *tables], "absolute": [[], *points], "evaluations": [{}, [3], points[1:]]}
     for name, values in wrong.items():
         for value in (*values, 3, "idle"):
-            with pytest.raises(InputError, match=f"^{name}.*: "):
-                dataclasses.replace(run, **{name: value})
+            refuses(f"^{name}.*: ", dataclasses.replace, run, **{name: value})
     weights = jax.tree.map(lambda x: x * np.nan, run.policy.params)
     with pytest.raises(NonFiniteError, match="params"):
         dataclasses.replace(run, policy=dataclasses.replace(run.policy, params=weights)).save("broken")
@@ -241,8 +235,7 @@ def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     result = mqe_jax.evaluate("fake", "forward", episodes=4)
     wrong: Any = ((None, 4), (-1, 4), (1.5, 4), (0.5, 0), (0.5, 1.5))
     for value, episodes in wrong:
-        with pytest.raises(InputError, match=r"^(value|episodes): "):
-            Rate.of(value, episodes)
+        refuses(r"^(value|episodes): ", Rate.of, value, episodes)
     assert result.success == Rate.of(1.0, 4) and result.win is None
     assert "success_rate                 100.0% (51.0 to 100.0%)" in str(result).splitlines()
     assert "<tr><td>success_rate</td><td>100.0% (51.0 to 100.0%)</td></tr>" in result._repr_html_()
@@ -303,11 +296,8 @@ def test_a_clip_shows_itself_and_is_saved(monkeypatch: pytest.MonkeyPatch) -> No
     assert clip.save("clip.gif") == "matplotlib" and Path("clip.gif").stat().st_size > 500
     page = clip._repr_html_()
     assert page.startswith(("<video", "<img")) and ";base64," in page
-    with pytest.raises(InputError, match=r"clip.avi.*\.mp4, \.webp, \.gif, \.png"):
-        clip.save("clip.avi")
+    refuses(r"clip.avi.*\.mp4, \.webp, \.gif, \.png", clip.save, "clip.avi")
     for name in ("env", "episodes", "about", "look"):
         for value in (None, 3, [], [3]):
-            with pytest.raises(InputError, match=f"^{name}.*: "):
-                dataclasses.replace(clip, **{name: value})
-    with pytest.raises(InputError, match=r"^look"):
-        dataclasses.replace(clip, look={"speeds": 1.0})
+            refuses(f"^{name}.*: ", dataclasses.replace, clip, **{name: value})
+    refuses(r"^look", dataclasses.replace, clip, look={"speeds": 1.0})

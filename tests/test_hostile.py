@@ -48,6 +48,7 @@ from mqe_jax.train.runner import train
 from mqe_jax.viz import clips, curves, recording, render
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
+from tests.inputs import refuses
 
 KEY, NAN = jax.random.PRNGKey(0), math.nan
 LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3))
@@ -281,19 +282,16 @@ def test_every_kind_has_both_bounds(name: str) -> None:
     step = 1 if whole else 1e-9
     outside = (low - max(step, step * abs(low)), high + max(step, step * abs(high)))
     for value in (*outside, NAN, math.inf, -math.inf, True, "x", None, [], *([low + 0.5] if whole else [])):
-        with pytest.raises(InputError, match=r"^x: "):
-            check("x", value, kind)
+        refuses(r"^x: ", check, "x", value, kind)
 
 
 def test_memory_is_compared_before_it_is_allocated(made: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     assert 2**26 < memory.free_memory() < 2**50
     monkeypatch.setattr(memory, "free_memory", lambda: 2.0**30)
-    with pytest.raises(InputError, match=r"num_envs: 131072 needs .* GB or more; at most 0\.5 GB may be used"):
-        VectorEnv(made["task"], 2**17)
+    refuses(r"num_envs: 131072 needs .* GB or more; at most 0\.5 GB may be used", VectorEnv, made["task"], 2**17)
     config = override(made["config"], {"rollout_steps": 10_000, "num_envs": 100_000})
     batch = fake_env.FakeVectorEnv(made["fake"], 100_000)
-    with pytest.raises(InputError, match="rollout_steps: 10000 needs"):
-        train(batch, config, "run")
+    refuses("rollout_steps: 10000 needs", train, batch, config, "run")
 
 
 LONGEST = 1200  # characters of a message: what is allowed may be a list of names

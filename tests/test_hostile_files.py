@@ -31,6 +31,7 @@ from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
 from tests import training as probes
 from tests.archives import module, named, tensor, zipped
+from tests.inputs import refuses
 from tests.test_train_run import settings as run_settings
 from tests.training import Probe
 
@@ -72,8 +73,7 @@ def test_bad_yaml(case: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[" * 33 + "]" * 33, "9" * 5000, "{", '{"a": 1} x', ""])
 def test_bad_json(text: str) -> None:
-    with pytest.raises(InputError, match=r"^x: damaged, or not JSON"):
-        parse_json(text, "x")
+    refuses(r"^x: damaged, or not JSON", parse_json, text, "x")
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,7 @@ def test_bad_json(text: str) -> None:
 )
 def test_evaluations_of_another_form(content: Any, tmp_path: Path) -> None:
     (tmp_path / "evaluations.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"evaluations\.json"):
-        read_evaluations(tmp_path)
+    refuses(r"evaluations\.json", read_evaluations, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -101,8 +100,7 @@ def test_evaluations_of_another_form(content: Any, tmp_path: Path) -> None:
 def test_bad_metrics(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"metrics\.csv"):
-        read_curve(path)
+    refuses(r"metrics\.csv", read_curve, path)
 
 
 def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
@@ -115,11 +113,9 @@ def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
         path = tmp_path / "huge"
         with path.open("wb") as file:
             file.truncate(limit + 1)
-        with pytest.raises(InputError, match=f"has {limit + 1} bytes; it must have at most {limit}"):
-            read(path)
+        refuses(f"has {limit + 1} bytes; it must have at most {limit}", read, path)
     for path in (Path("/dev/zero"), tmp_path):
-        with pytest.raises(InputError, match="not a regular file"):
-            list(read_rows(path))
+        refuses("not a regular file", list, read_rows(path))
     assert peak() < before + 2**27
 
 
@@ -136,10 +132,8 @@ def tensors(dtype: str, size: int, metadata: dict[str, str] | None = None) -> by
 def test_weights_of_types_that_are_not_floating_point(dtype: str, size: int, tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
     path.write_bytes(tensors(dtype, size))
-    with pytest.raises(InputError, match=rf"^weights {path}: damaged, or not a safetensors file"):
-        read_tensors(path, "weights")
-    with pytest.raises(InputError, match=r"w\.safetensors"):
-        read_policy(path)
+    refuses(rf"^weights {path}: damaged, or not a safetensors file", read_tensors, path, "weights")
+    refuses(r"w\.safetensors", read_policy, path)
 
 
 SIZES = {"agents": 1, "observation": 1, "privileged": 1, "action": 1, "values": 1}
@@ -159,8 +153,7 @@ def test_policies_with_metadata_of_another_type(metadata: str, tmp_path: Path) -
     header = {"kind": "policy", "version": str(checkpoint.VERSION), "metadata": metadata}
     header["checksum"] = checkpoint._checksum(arrays, metadata)  # pyright: ignore[reportPrivateUsage]
     path.write_bytes(save(arrays, {checkpoint.FORMAT: json.dumps(header)}))
-    with pytest.raises(InputError, match=r"policy\.safetensors: "):
-        read_policy(path)
+    refuses(r"policy\.safetensors: ", read_policy, path)
 
 
 def archived(data: bytes, storage: bytes = bytes(4)) -> bytes:
@@ -213,19 +206,16 @@ def test_a_small_archive_is_read(tmp_path: Path) -> None:
 def test_a_recording_whose_parameters_are_none(name: str, tmp_path: Path) -> None:
     about = {"task": "go1plane", "params": {name: 1}, "impl": "c", "control": "position"}
     np.savez(tmp_path / "a.npz", about=json.dumps(about), actions=np.zeros((1, 1, 12)))
-    with pytest.raises(InputError, match=name):
-        load_recording(tmp_path / "a.npz")
+    refuses(name, load_recording, tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("case", ARCHIVES)
 def test_bad_archives(case: str, tmp_path: Path) -> None:
     path, before = tmp_path / "bad.jit", peak()
     path.write_bytes(ARCHIVES[case]())
-    with pytest.raises(InputError, match=r"bad\.jit: damaged, or not a TorchScript Sequential"):
-        read_torchscript(path)
+    refuses(r"bad\.jit: damaged, or not a TorchScript Sequential", read_torchscript, path)
     assert peak() < before + 2**29
-    with pytest.raises(InputError, match=r"bad\.jit"):
-        load_recording(path)
+    refuses(r"bad\.jit", load_recording, path)
 
 
 # -- impossible content, whose checksum is right -----------------------------------------------------------------------
@@ -266,8 +256,7 @@ def rewrite(path: Path, kind: str, name: str, value: Any, metadata: dict[str, An
 def test_a_policy_of_impossible_numbers(name: str, value: float, trained: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(trained / "policy.safetensors", tmp_path))
     rewrite(path, "policy", name, value)
-    with pytest.raises(InputError, match=rf"policy\.safetensors: {name}.* holds .*; a number from "):
-        read_policy(path)
+    refuses(rf"policy\.safetensors: {name}.* holds .*; a number from ", read_policy, path)
 
 
 @pytest.mark.parametrize(
@@ -300,8 +289,7 @@ def test_a_pool_of_impossible_numbers(name: str, tmp_path: Path) -> None:
     members: Any = pool.new_pool({"params": np.ones(2, np.float32)}, 3)
     tree = {"extra": {"pool": members._replace(**{name: np.array([0, 0, -2], getattr(members, name).dtype)})}}
     checkpoint.save_tree(tmp_path / "a", tree, {}, kind="checkpoint")
-    with pytest.raises(InputError, match=rf"a: extra/pool/{name} holds -2"):
-        checkpoint.load_tree(tmp_path / "a", tree, kind="checkpoint")
+    refuses(rf"a: extra/pool/{name} holds -2", checkpoint.load_tree, tmp_path / "a", tree, kind="checkpoint")
     with pytest.raises(InputError, match=rf"a: extra/pool/{name} holds -2"):
         checkpoint.load_tree(tmp_path / "a", members, kind="checkpoint", part="extra/pool/")
 
@@ -320,8 +308,7 @@ def test_a_checkpoint_of_impossible_metadata(
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     path = checkpoint.list_checkpoints(run)[-1]
     rewrite(path, "checkpoint", "learning_rate", 1e-3, metadata)
-    with pytest.raises(InputError, match=said):
-        train(PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
+    refuses(said, train, PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -331,8 +318,7 @@ def test_a_checkpoint_of_impossible_metadata(
 def test_a_policy_of_impossible_metadata(metadata: dict[str, Any], said: str, trained: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(trained / "policy.safetensors", tmp_path))
     rewrite(path, "policy", "normalizer/samples", 1.0, metadata)
-    with pytest.raises(InputError, match=rf"policy\.safetensors: its settings cannot be read \({said}"):
-        read_policy(path)
+    refuses(rf"policy\.safetensors: its settings cannot be read \({said}", read_policy, path)
 
 
 def test_weights_that_no_network_has() -> None:
@@ -344,8 +330,7 @@ def test_weights_that_no_network_has() -> None:
 @pytest.mark.parametrize("steps", ["16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16"])
 def test_steps_that_do_not_increase(steps: str, tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("env_steps,average_step_reward\n" + steps.replace("\n", ",1\n") + ",1\n")
-    with pytest.raises(InputError, match=r"metrics\.csv: its env_steps must be positive and increase"):
-        read_curve(tmp_path / "metrics.csv")
+    refuses(r"metrics\.csv: its env_steps must be positive and increase", read_curve, tmp_path / "metrics.csv")
 
 
 def test_a_finished_run_whose_rows_end_earlier(trained: Path, tmp_path: Path) -> None:
@@ -353,5 +338,4 @@ def test_a_finished_run_whose_rows_end_earlier(trained: Path, tmp_path: Path) ->
     assert read_runs(tmp_path)[0].curve["env_steps"][-1] == 32
     rows = (run / "metrics.csv").read_text().splitlines(keepends=True)
     (run / "metrics.csv").write_text("".join(rows[:-1]))
-    with pytest.raises(InputError, match=r"metrics\.csv: ends after 16 steps; the finished run has 32"):
-        read_runs(tmp_path)
+    refuses(r"metrics\.csv: ends after 16 steps; the finished run has 32", read_runs, tmp_path)

@@ -23,6 +23,7 @@ from mqe_jax.cli.arguments import parse
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.train.checkpoint import list_checkpoints
+from tests.inputs import refuses
 from tests.test_interrupts import updates, wait_for
 from tests.training import rows, without_progress
 
@@ -302,8 +303,7 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SLURM_PROCID", "5")
     monkeypatch.setenv("SLURM_LOCALID", "1")
     assert members() == [{launch.MEMBER: "auto"}]
-    with pytest.raises(InputError, match="devices: '1' is not allowed; it must be left out"):
-        members("--devices", "1")
+    refuses("devices: '1' is not allowed; it must be left out", members, "--devices", "1")
     cells = launch.Launch(command=("sweep", "sweep.yaml"))
     assert cells._members() == [{**alone, device: "5"}]
     monkeypatch.setenv(device, "2")  # srun --gpus-per-task=1

@@ -33,6 +33,7 @@ from mqe_jax.view.session import Session
 from mqe_jax.walk import network as walk_network  # registers it
 from mqe_jax.walk_policy import OBSERVATION_SIZE
 from tests import training as probes
+from tests.inputs import refuses
 from tests.training import Probe, assert_same
 
 ALGORITHMS = ("mappo", "jrpo", "mat", "ippo", "dual-clip")
@@ -106,10 +107,8 @@ def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
 
 
 def test_unknown_names_get_the_nearest() -> None:
-    with pytest.raises(InputError, match=r"algorithm: 'mapo'.*did you mean 'mappo'"):
-        base_config("go1gate", "demo", "mapo")
-    with pytest.raises(InputError, match=r"config: unknown name 'deno' \(did you mean 'demo'"):
-        base_config("go1gate", "deno")
+    refuses(r"algorithm: 'mapo'.*did you mean 'mappo'", base_config, "go1gate", "demo", "mapo")
+    refuses(r"config: unknown name 'deno' \(did you mean 'demo'", base_config, "go1gate", "deno")
 
 
 # -- the multi-agent transformer: sequential acting, parallel evaluation, deviation ----------------------------------
@@ -179,10 +178,8 @@ def test_a_free_deviation_beyond_its_bounds_gets_the_gradient_that_leads_back() 
 
 
 def test_settings_that_do_not_fit_are_named() -> None:
-    with pytest.raises(InputError, match="heads: 3"):
-        Mat(heads=3)
-    with pytest.raises(InputError, match=r"ppo\.value"):
-        Mat().build(dims(3)._replace(values=1))
+    refuses("heads: 3", Mat, heads=3)
+    refuses(r"ppo\.value", Mat().build, dims(3)._replace(values=1))
 
 
 # -- every registered network in every use -----------------------------------------------------------------------------

@@ -10,13 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.core.errors import InputError
 from mqe_jax.envs import Moment, VectorEnv, make
 from mqe_jax.npc import defend, flock
 from mqe_jax.physics import objects
 from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.terrain import Plane, SpawnArea, Track
+from tests.inputs import refuses
 from tests.states import angles, initial, made, placed, terms_of, with_object
 
 STEP = 0.02
@@ -213,5 +213,4 @@ def test_objects_that_engines_cannot_step_are_refused(add: Any, message: str) ->
         def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
             add(spec, name)
 
-    with pytest.raises(InputError, match=message):
-        plain(thing=Own())
+    refuses(message, plain, thing=Own())

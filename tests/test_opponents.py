@@ -26,6 +26,7 @@ from mqe_jax.train.monitor import score
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy
+from tests.inputs import refuses
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
@@ -61,8 +62,7 @@ def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **se
 def test_teams_may_see_different_groups_of_observations() -> None:
     task = matches("go1tug", 2).env
     plain = VectorEnv(task, 2)
-    with pytest.raises(InputError, match="group: 'smell' is not allowed; it must be one of go1tug: policy, proprio"):
-        plain.with_groups(["smell"])
+    refuses("group: 'smell' is not allowed; it must be one of go1tug: policy, proprio", plain.with_groups, ["smell"])
     env = plain.with_groups(["proprioception"])
     seeing, blind = (new_policy(versus(env, ["idle"]), group=group) for group in ("policy", "proprioception"))
     assert (seeing.dims.observation, blind.dims.observation) == (env.observation_size, 27)
@@ -75,8 +75,7 @@ def test_teams_may_see_different_groups_of_observations() -> None:
     action, _ = both.act(observations(state), memory, KEY)
     own, _ = blind.act(state.groups["proprioception"][:, 1:], memory[1], keys[1])
     np.testing.assert_array_equal(action[:, 1:], own)
-    with pytest.raises(InputError, match="group: 'proprioception' is missing in the state"):
-        both.act(observations(less), memory, KEY)
+    refuses("group: 'proprioception' is missing in the state", both.act, observations(less), memory, KEY)
     config = build(TrainConfig, {**SETTINGS, "num_envs": 2, "group": "proprioception"})
     config = override(config, {"network.critic_input": "own"})
     learner = make_learner(Versus(env, [seeing]), config)
@@ -165,20 +164,16 @@ def test_an_opponents_memory_starts_anew_with_its_episode(policies: list[Trained
 
 
 def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: VectorEnv) -> None:
-    with pytest.raises(InputError, match="opponents: 3 is not allowed"):
-        versus(door, ["idle"] * 3)
+    refuses("opponents: 3 is not allowed", versus, door, ["idle"] * 3)
     with pytest.raises(InputError, match=r"opponents: 4 is not allowed; it must be a divisor .* of a process, 2"):
         versus(door, ["idle"] * 4).share(2)
-    with pytest.raises(InputError, match="go1plane is not a match"):
-        versus(matches("go1plane"), ["idle"])
+    refuses("go1plane is not a match", versus, matches("go1plane"), ["idle"])
     with pytest.raises(InputError, match=r"opponents: .* needs task 'go1revolvingdoor'; the environment has 'go1tug'"):
         versus(matches("go1tug"), [policies[0]])
     env = versus(door, ["idle", policies[0]])
-    with pytest.raises(InputError, match="block 0 is fixed"):
-        env.change(env.reset(KEY), 0, policies[0])
+    refuses("block 0 is fixed", env.change, env.reset(KEY), 0, policies[0])
     other = new_policy(versus(door, ["idle"]), network={"hidden_sizes": [16]})
-    with pytest.raises(InputError, match="another architecture"):
-        env.change(env.reset(KEY), 1, other)
+    refuses("another architecture", env.change, env.reset(KEY), 1, other)
 
 
 @pytest.mark.parametrize("kind", ["versus", "mirror"])

@@ -19,6 +19,7 @@ from mqe_jax.physics.engines.mjx_step import MarginStep
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
+from tests.inputs import refuses
 from tests.states import initial, made
 
 NEEDS_GPU = pytest.mark.gpu
@@ -200,8 +201,7 @@ def test_a_new_engine_is_one_class_and_one_line(monkeypatch: pytest.MonkeyPatch)
 
 def test_an_engine_that_cannot_run_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(private, "warp_is_installed", lambda: False)
-    with pytest.raises(ValueError, match=r"impl 'warp' needs the package warp-lang"):
-        engines.resolve("warp")
+    refuses(r"impl 'warp' needs the package warp-lang", engines.resolve, "warp")
 
 
 # -- crowds: numbers of contacts against the sizes of Warp's buffers ------------------------------------------------

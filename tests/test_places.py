@@ -10,11 +10,11 @@ import pytest
 from fake_env import SMALL
 
 from mqe_jax.cli.arguments import parse
-from mqe_jax.core.errors import InputError
 from mqe_jax.envs import TASKS
 from mqe_jax.policies import load_policy, zoo
 from mqe_jax.runs.presets import named_config
 from mqe_jax.train.policy import save_policy
+from tests.inputs import refuses
 
 TESTS = Path(__file__).parent
 NO_POSIX = """
@@ -110,5 +110,4 @@ def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert list(work.iterdir()) == []
     monkeypatch.delenv("HOME")
     monkeypatch.setitem(sys.modules, "pwd", None)
-    with pytest.raises(InputError, match="source: '~/policies' is not allowed; it must be a path without ~"):
-        load_policy("~/policies")
+    refuses("source: '~/policies' is not allowed; it must be a path without ~", load_policy, "~/policies")

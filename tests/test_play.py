@@ -25,6 +25,7 @@ from mqe_jax import cli
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import PLANNERS
 from mqe_jax.export import libraries
+from tests.inputs import refuses
 
 pytest.importorskip("jax2onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -186,10 +187,8 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     assert (second.name, list(second.policies)) == ("go1wrestling-2", ["small", "scripted"])
     assert first.env.params.ring_radius == 1.7 and second.env.params.ring_radius == 1.5
     assert second.env.params.randomization.push == 0  # the page has none
-    with pytest.raises(InputError, match="did you mean 'go1gate'"):
-        entries(["go1gaet"])
-    with pytest.raises(InputError, match="position"):
-        TaskFunctions(SimpleNamespace(control="position"))  # type: ignore[arg-type]
+    refuses("did you mean 'go1gate'", entries, ["go1gaet"])
+    refuses("position", TaskFunctions, SimpleNamespace(control="position"))
 
 
 def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
@@ -197,11 +196,9 @@ def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch,
     folder = tmp_path / "mqe_jax" / "play"
     folder.mkdir(parents=True)
     (folder / "mujoco-mujoco-3.14.0.tgz").write_bytes(b"something else")
-    with pytest.raises(InputError, match=r"@mujoco/mujoco@3.14.0.*SHA-256"):
-        libraries.add_libraries(tmp_path / "lib")
+    refuses(r"@mujoco/mujoco@3.14.0.*SHA-256", libraries.add_libraries, tmp_path / "lib")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(InputError, match="npm is not installed"):
-        libraries.add_libraries(tmp_path / "lib")
+    refuses("npm is not installed", libraries.add_libraries, tmp_path / "lib")
     assert cli.main(["play-site", "go1gate", "-o", str(tmp_path / "o"), "--libraries", str(tmp_path)]) == 2
     assert "has no mujoco.js" in capsys.readouterr().err
 

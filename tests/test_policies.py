@@ -32,6 +32,7 @@ from mqe_jax.skills import SKILLS, Command, Skill
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
+from tests.inputs import refuses
 
 AGILE = Path(__file__).parents[1] / "results" / "agile"
 POSITION = {"control": "position", "position_scale": 2.0}
@@ -99,8 +100,7 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
 
 
 def test_a_task_without_a_shipped_policy_has_no_card() -> None:
-    with pytest.raises(InputError, match=r"none is shipped for 'go1plane'"):
-        zoo.card("go1plane")
+    refuses(r"none is shipped for 'go1plane'", zoo.card, "go1plane")
 
 
 @pytest.mark.parametrize("file", sorted(AGILE.glob("*.safetensors")), ids=lambda file: file.stem)
@@ -219,8 +219,7 @@ def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> Non
     assert set(TASKS) - set(PLANNERS) == {"go1plane"}
     for task in PLANNERS:
         assert planner_of(task).__module__.startswith("mqe_jax.policies.scripted.")
-    with pytest.raises(InputError, match=r"go1plane has no scripted policy; allowed for: go1gate, "):
-        planner_of("go1plane")
+    refuses(r"go1plane has no scripted policy; allowed for: go1gate, ", planner_of, "go1plane")
 
 
 def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,10 +233,8 @@ def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeyp
     np.testing.assert_allclose(action[:, 0], [[0.7, 0, 0]] * 2, atol=1e-6)
     with pytest.raises(InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge"):
         load_policy("ahead", make("go1tug", impl="c", num_envs=1))
-    with pytest.raises(InputError, match="already registered for go1wrestling"):
-        register_planner("go1wrestling", "ahead", lambda obs: obs["base"])
-    with pytest.raises(InputError, match="unknown task 'go1sumo'"):
-        register_planner("go1sumo", "ahead", ahead)
+    refuses("already registered for go1wrestling", register_planner, "go1wrestling", "ahead", lambda obs: obs["base"])
+    refuses("unknown task 'go1sumo'", register_planner, "go1sumo", "ahead", ahead)
 
 
 # -- skills ------------------------------------------------------------------------------------------------------------
@@ -339,8 +336,7 @@ def test_actions_change_commands_around_the_defaults_within_limits_and_are_mirro
     ],
 )
 def test_parameters_that_the_skill_does_not_know_are_named(params: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make("go1plane", **{"impl": "c", **params})
+    refuses(message, make, "go1plane", **{"impl": "c", **params})
 
 
 def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -348,8 +344,7 @@ def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     env, _, policy, _ = players(**Eval(target="go1gate", impl="c").playing)
     assert env.name == "go1gate" and isinstance(policy, TrainedPolicy)
-    with pytest.raises(InputError, match="go1gate"):
-        players(**Eval(target="./go1gate", impl="c").playing)
+    refuses("go1gate", players, **Eval(target="./go1gate", impl="c").playing)
 
 
 def test_what_a_user_makes_says_what_it_is() -> None:
@@ -376,8 +371,7 @@ def test_a_name_is_registered_once() -> None:
         name = "walk"
 
     assert skills.register(WalkPolicy) is WalkPolicy
-    with pytest.raises(InputError, match="skill: the name 'walk' is already registered"):
-        skills.register(Other)
+    refuses("skill: the name 'walk' is already registered", skills.register, Other)
 
 
 @pytest.mark.parametrize("name", ["walk", "lean", "stand"])

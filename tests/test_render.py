@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from fake_env import FakeEnv
 
-from mqe_jax.core.errors import InputError
 from mqe_jax.envs import TASKS
 from mqe_jax.policies import load_policy
 from mqe_jax.viz import cameras, framing, geometry, recording, render
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.recording import Episode
+from tests.inputs import refuses
 from tests.states import initial, made, placed
 
 env = pytest.fixture(scope="module")(lambda: FakeEnv())
@@ -61,8 +61,7 @@ def test_the_side_view_follows_the_first_robot(env: Any, episode: recording.Epis
     camera = cameras.cameras(model, episode, "side", 1.5)[-1]
     geometry.pose(model, data, episode, len(episode) - 1)
     assert camera.lookat[:2] == pytest.approx(data.xpos[geometry.robot_bases(model)[0]][:2], abs=0.1)
-    with pytest.raises(InputError, match=r"view: unknown name .*side"):
-        cameras.cameras(model, episode, "sid", 1.5)
+    refuses(r"view: unknown name .*side", cameras.cameras, model, episode, "sid", 1.5)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4"])

@@ -26,6 +26,7 @@ from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
+from tests.inputs import refuses
 from tests.training import Probe
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
@@ -70,8 +71,7 @@ def test_a_folder_that_is_lost_while_a_file_is_written_gets_none(tmp_path: Path)
     with lock(folder):
         with pytest.raises(InputError, match="run_dir"), replacing(folder / "file"):
             replace(folder)
-        with pytest.raises(InputError, match="run_dir"):
-            write_atomically(folder / "file", b"1")
+        refuses("run_dir", write_atomically, folder / "file", b"1")
     write_atomically(folder / "file", b"2")  # the lock has ended
     assert (folder / "file").read_bytes() == b"2"
 
@@ -97,8 +97,7 @@ def test_a_training_writes_and_removes_nothing_through_links(name: str, tmp_path
     other.mkdir()
     (other / "step_000000000001.safetensors").touch()
     (run / name).symlink_to(other)
-    with pytest.raises(InputError, match=f"{name} is a symbolic link"):
-        train(PROBE, SETTINGS, run, resume=True)
+    refuses(f"{name} is a symbolic link", train, PROBE, SETTINGS, run, resume=True)
     assert [path.name for path in other.iterdir()] == ["step_000000000001.safetensors"]
     (tmp_path / "metrics.csv").symlink_to(tmp_path / "foreign.csv")
     with pytest.raises(OSError, match=r"metrics\.csv"):
@@ -244,8 +243,7 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
 
 
 def test_evaluation_needs_environments(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"evaluation\.every"):
-        train(PROBE, seeded(0, evaluation__every=2), tmp_path)
+    refuses(r"evaluation\.every", train, PROBE, seeded(0, evaluation__every=2), tmp_path)
 
 
 def test_a_compiled_program_is_stored_whole_or_not_at_all(tmp_path: Path) -> None:

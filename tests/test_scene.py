@@ -20,6 +20,7 @@ from mqe_jax.physics.robots.index import foot_positions, knee_positions
 from mqe_jax.physics.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
+from tests.inputs import refuses
 from tests.states import made
 
 PLANE = Track(blocks=(Plane(4.0),), walled=False, num_robots=1)
@@ -153,14 +154,11 @@ def test_collision_sets_are_swapped_as_data() -> None:
 
 
 def test_wrong_data_is_refused_by_name() -> None:
-    with pytest.raises(InputError, match=r"Robot\.torque_limit: shape \(3,\); expected \(12,\)"):
-        dataclasses.replace(GO1, torque_limit=np.ones(3))
-    with pytest.raises(InputError, match=r"Robot\.default_joints"):
-        dataclasses.replace(GO1, default_joints=np.zeros(12))
+    refuses(r"Robot\.torque_limit: shape \(3,\); expected \(12,\)", dataclasses.replace, GO1, torque_limit=np.ones(3))
+    refuses(r"Robot\.default_joints", dataclasses.replace, GO1, default_joints=np.zeros(12))
     with pytest.raises(InputError, match=r"Robot\.collision: duplicate names foot"):
         dataclasses.replace(GO1, collision=(*GO1.collision, GO1.collision[-1]))
-    with pytest.raises(InputError, match=r"unknown part 'tail'"):
-        CollisionShape("tail", sphere(0.02))
+    refuses(r"unknown part 'tail'", CollisionShape, "tail", sphere(0.02))
 
 
 def test_missing_walk_weights_say_how_to_make_them() -> None:

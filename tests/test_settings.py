@@ -27,6 +27,7 @@ from mqe_jax.core.settings import (
 )
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.train.config import TrainConfig
+from tests.inputs import refuses
 
 
 @record
@@ -124,10 +125,8 @@ def test_refused_in_one_line(way: Callable[..., Any], values: dict[str, Any], me
 
 
 def test_keywords_and_replacement_are_validated_too() -> None:
-    with pytest.raises(InputError, match=r"^clip: 0 is not allowed"):
-        Inner(clip=0)
-    with pytest.raises(InputError, match=r"^count: 0 is not allowed"):
-        dataclasses.replace(Outer(), count=0)
+    refuses(r"^clip: 0 is not allowed", Inner, clip=0)
+    refuses(r"^count: 0 is not allowed", dataclasses.replace, Outer(), count=0)
 
 
 def test_overriding_merges_nested_records_and_free_mappings() -> None:
@@ -167,8 +166,7 @@ def test_the_second_of_two_mappings_replaces_only_what_it_names(first: Any, seco
 
 
 def test_names_of_a_thousand_dots_are_refused() -> None:
-    with pytest.raises(InputError, match=r"^a: .* is not allowed; it must be nested at most 32 deep"):
-        build(Outer, {"free": {"a" + ".a" * 1000: 1}})
+    refuses(r"^a: .* is not allowed; it must be nested at most 32 deep", build, Outer, {"free": {"a" + ".a" * 1000: 1}})
 
 
 def test_to_a_mapping_and_back(tmp_path: Path) -> None:
@@ -177,8 +175,7 @@ def test_to_a_mapping_and_back(tmp_path: Path) -> None:
     assert mapping["free"] == {"range": [0, 1.0]}
     assert mapping["inner"] == {"clip": 0.2, "dual": 3.0, "gamma": 0.99, "kind": "agent"}
     assert to_mapping(build(Derived, mapping)) == mapping
-    with pytest.raises(InputError, match="Outer: <object"):
-        to_mapping(Outer(free={"x": object()}))
+    refuses("Outer: <object", to_mapping, Outer(free={"x": object()}))
 
 
 def test_files(tmp_path: Path) -> None:
@@ -198,8 +195,7 @@ def test_files(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message) as error:
             load_yaml(path)
         assert "\n" not in str(error.value)
-    with pytest.raises(InputError, match=r"missing\.yaml: cannot be read"):
-        load_yaml(tmp_path / "missing.yaml")
+    refuses(r"missing\.yaml: cannot be read", load_yaml, tmp_path / "missing.yaml")
 
 
 # -- settings of a training -------------------------------------------------------------------------------------------
@@ -230,5 +226,4 @@ def test_parameters_in_training_change_those_that_they_name() -> None:
 )
 @pytest.mark.parametrize("way", [build, lambda kind, values: override(kind(), values)], ids=["build", "override"])
 def test_mistakes_name_field_value_and_what_is_allowed(way: Any, values: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=f"^{message}"):
-        way(TrainConfig, values)
+    refuses(f"^{message}", way, TrainConfig, values)

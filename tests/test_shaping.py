@@ -14,6 +14,7 @@ from mqe_jax.core.settings import build
 from mqe_jax.envs import Moment, State, make
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.train.config import TrainConfig
+from tests.inputs import refuses
 from tests.states import terms_of
 
 BOX, BALL, DUEL, SUMO = "go1pushbox", "go1football-defender", "go1football-1vs1", "go1wrestling"
@@ -57,8 +58,7 @@ def test_box_and_robots_start_further_by_the_same_distance() -> None:
 
 
 def test_a_box_does_not_start_inside_the_gate() -> None:
-    with pytest.raises(InputError, match=r"head_start: 1.0 .* at most 0.95"):
-        make(BOX, impl="c", head_start=1.0)
+    refuses(r"head_start: 1.0 .* at most 0.95", make, BOX, impl="c", head_start=1.0)
     assert make(BOX, impl="c", num_envs=1, box_x=4.5).params.head_start == 0  # where there is no room for any
 
 
@@ -91,8 +91,7 @@ def test_wrestlers_start_nearer_to_the_edge() -> None:
     moved = (states.data.qpos - plain.data.qpos)[:, env.index.base_qpos[:, 1]]
     np.testing.assert_allclose(moved[:, 0], moved[:, 1], atol=1e-6)
     assert -0.5 <= moved.min() < -0.4 and 0.4 < moved.max() <= 0.5
-    with pytest.raises(InputError, match=r"head_start: 0.7 .* at most 0.60"):
-        make(SUMO, impl="c", head_start=0.7)
+    refuses(r"head_start: 0.7 .* at most 0.60", make, SUMO, impl="c", head_start=0.7)
 
 
 def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, float]:
@@ -203,8 +202,7 @@ class Bending:
 
 def test_a_demonstrator_needs_episodes_of_sixteen_steps() -> None:
     task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.2)
-    with pytest.raises(InputError, match=r"episode_length: 0\.2 .*at least 16 steps with a demonstrator"):
-        Demonstrated(task, N, Bending())
+    refuses(r"episode_length: 0\.2 .*at least 16 steps with a demonstrator", Demonstrated, task, N, Bending())
 
 
 def test_thousands_of_environments_have_a_demonstrator() -> None:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mqe_jax.core.errors import InputError
 from mqe_jax.study import statistics
 from mqe_jax.study.estimates import band, evaluated, group, score_matrices
 from mqe_jax.study.report import write_report
 from mqe_jax.study.runs import REWARD, Cell, Reference, Run
+from tests.inputs import refuses
 
 REFERENCE = Reference(label="theirs", values={"plain": {"go1gate": {"mappo": 2.75}}}, tasks={"go1sheep-hard": "Hard"})
 
@@ -185,8 +185,7 @@ def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> N
 
 @pytest.mark.parametrize("scores", [np.zeros(3), np.zeros((0, 2)), np.array([[np.nan]])])
 def test_bad_scores_are_refused(scores: np.ndarray) -> None:
-    with pytest.raises(InputError, match="scores"):
-        statistics.bootstrap_interval([scores], statistics.interquartile_mean, np.random.default_rng(0))
+    refuses("scores", statistics.bootstrap_interval, [scores], statistics.interquartile_mean, np.random.default_rng(0))
 
 
 def test_normalized_scores_are_fractions_of_a_tasks_range() -> None:

@@ -27,6 +27,7 @@ from mqe_jax.study.runs import read_runs
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.config import TrainConfig
 from tests import training as probes
+from tests.inputs import refuses
 from tests.training import Probe
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
@@ -133,8 +134,7 @@ def test_variants_override_the_settings(tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        build(Sweep, {"tasks": ["go1gate"], **change})
+    refuses(message, build, Sweep, {"tasks": ["go1gate"], **change})
 
 
 def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) -> None:
@@ -169,8 +169,7 @@ def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) ->
 )
 def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, tmp_path: Path) -> None:
     sweep = load(tmp_path, text if text.startswith("tasks") else "tasks: [go1gate]\n" + text)
-    with pytest.raises(InputError, match=message):
-        sweeps.plan(sweep, tmp_path, config_of, check=setup.check_start)
+    refuses(message, sweeps.plan, sweep, tmp_path, config_of, check=setup.check_start)
 
 
 @pytest.mark.parametrize(
@@ -279,8 +278,7 @@ def test_one_file_may_hold_several_sweeps(tmp_path: Path) -> None:
     path = tmp_path / "sweeps.yaml"
     path.write_text("first: {tasks: [go1gate]}\nsecond: {tasks: [go1tug]}")
     assert sweeps.load_sweep(path, "second").tasks == ("go1tug",)
-    with pytest.raises(InputError, match=r"has no part 'secnd' \(did you mean 'second'\?\); it has: first, second"):
-        sweeps.load_sweep(path, "secnd")
+    refuses(r"has no part 'secnd' \(did you mean 'second'\?\); it has: first, second", sweeps.load_sweep, path, "secnd")
 
 
 MEASURES = """

@@ -18,6 +18,7 @@ from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.stages import Stages
 from tests import training as probes
+from tests.inputs import refuses
 from tests.training import Probe, assert_same
 
 
@@ -90,8 +91,7 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
 
 def test_an_environment_of_two_teams_is_refused() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=32, teams=((1,), (0,)))
-    with pytest.raises(ValueError, match="probe has 2 teams"):
-        make_learner(env, small())
+    refuses("probe has 2 teams", make_learner, env, small())
 
 
 def test_memory_carries_a_sign_through_an_episode() -> None:
@@ -192,8 +192,7 @@ def test_settings_must_fit_the_environment() -> None:
         ),
         ({"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"}, "network.critic_input: 'own'"),
     ):
-        with pytest.raises(InputError, match=f"^{message}"):
-            make_learner(env, small(**values))
+        refuses(f"^{message}", make_learner, env, small(**values))
 
 
 class WrongSize(Probe):
@@ -204,8 +203,7 @@ class WrongSize(Probe):
 
 def test_a_wrong_observation_size_is_named() -> None:
     env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
-    with pytest.raises(InputError, match=r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)"):
-        make_learner(env, small(num_envs=4))
+    refuses(r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)", make_learner, env, small(num_envs=4))
 
 
 def test_a_policy_of_another_task_is_not_evaluated() -> None:

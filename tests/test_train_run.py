@@ -30,6 +30,7 @@ from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train
 from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
+from tests.inputs import refuses
 from tests.training import Probe, assert_same
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
@@ -100,14 +101,11 @@ def test_a_killed_training_resumes_as_if_never_stopped(
 def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path, TrainState]) -> None:
     run_dir, expected = straight
     assert_same(train(PROBE, settings(), run_dir, resume=True), expected)
-    with pytest.raises(ValueError, match="already holds a run"):
-        train(PROBE, settings(), run_dir)
-    with pytest.raises(ValueError, match=r"ppo.gamma: 0\.5 differs from the run"):
-        train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
+    refuses("already holds a run", train, PROBE, settings(), run_dir)
+    refuses(r"ppo.gamma: 0\.5 differs from the run", train, PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
     with pytest.raises(ValueError, match=f"its settings are in {run_dir / 'config.yaml'}"):
         train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
-    with pytest.raises(ValueError, match=r"total_steps: 16 .* at least"):
-        train(PROBE, settings(total_steps=16), run_dir, resume=True)
+    refuses(r"total_steps: 16 .* at least", train, PROBE, settings(total_steps=16), run_dir, resume=True)
     assert load_run_config(run_dir) == settings()
 
 
@@ -115,8 +113,7 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path
 def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> None:
     config = settings(env={"width": 0.7} if "other" in before else {})
     lost = "env.other: None differs from the run in x, which has 1" if "other" in before else "env.width: None differs"
-    with pytest.raises(InputError, match=lost):
-        check_same(Path("x"), {**to_mapping(config), "env": before}, config)
+    refuses(lost, check_same, Path("x"), {**to_mapping(config), "env": before}, config)
     check_same(Path("x"), to_mapping(config), config)
 
 
@@ -132,8 +129,7 @@ def test_environments_with_other_parameters_than_the_settings_are_refused(
     values: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
     batch = VectorEnv(make("go1gate", num_envs=4, gate_width=0.7), 4)
-    with pytest.raises(InputError, match=said):
-        train(batch, settings(**values), tmp_path / "run")
+    refuses(said, train, batch, settings(**values), tmp_path / "run")
     assert not (tmp_path / "run").exists()
     for same in ({}, {"task": "go1gate", "env": {"gate_width": 0.7}}):
         check_parameters(batch, settings(**same), settings(**same).env)
@@ -145,8 +141,7 @@ def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: 
     (tmp_path / left).write_text("a user's work")
     (tmp_path / "checkpoints").mkdir()  # of a training that was killed at its start
     (tmp_path / "nohup.out").touch()
-    with pytest.raises(InputError, match=f"{left}.*name another folder"):
-        train(PROBE, settings(), tmp_path, resume=resume)
+    refuses(f"{left}.*name another folder", train, PROBE, settings(), tmp_path, resume=resume)
     assert {path.name for path in tmp_path.iterdir()} == {left, "checkpoints", "nohup.out"}
     assert (tmp_path / left).read_text() == "a user's work"
 
@@ -154,8 +149,7 @@ def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: 
 def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path) -> None:
     def again(state: TrainState, row: dict[str, float]) -> None:
         for resume in (False, True):
-            with pytest.raises(InputError, match=r"already holds a run|in use by another process"):
-                train(PROBE, settings(), tmp_path, resume=resume)
+            refuses(r"already holds a run|in use by another process", train, PROBE, settings(), tmp_path, resume=resume)
         raise Killed
 
     with pytest.raises(Killed):
@@ -262,10 +256,8 @@ def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainStat
     assert newest is not None
     spoil(newest, "checkpoint")
     spoil(run_dir / "policy.safetensors", "policy")
-    with pytest.raises(InputError, match=r"policy.safetensors: .*weight holds nan"):
-        read_policy(run_dir)
-    with pytest.raises(InputError, match=r"step_000000000080.safetensors: .*weight holds nan"):
-        train(PROBE, settings(), run_dir, resume=True)
+    refuses(r"policy.safetensors: .*weight holds nan", read_policy, run_dir)
+    refuses(r"step_000000000080.safetensors: .*weight holds nan", train, PROBE, settings(), run_dir, resume=True)
     policy = read_policy(straight[0])
     broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * jnp.nan, policy.params))
     with pytest.raises(NonFiniteError):
@@ -285,8 +277,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     np.testing.assert_allclose(mean[0], single, atol=1e-6)
     assert jax.tree.leaves(single_memory)[0].shape == (2, 4)
     assert policy.task == "probe"
-    with pytest.raises(ValueError, match=r"obs: shape \(3, 3, 2\)"):
-        policy.act(np.zeros((3, 3, 2)), memory)
+    refuses(r"obs: shape \(3, 3, 2\)", policy.act, np.zeros((3, 3, 2)), memory)
     result = evaluate_batch(PROBE, policy, 8, jax.random.PRNGKey(0))
     assert result.episodes == 8 and result.episode_length == 4.0
 
@@ -314,9 +305,7 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
 
 
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"policy.safetensors: no such file"):
-        read_policy(tmp_path)
+    refuses(r"policy.safetensors: no such file", read_policy, tmp_path)
     newest = latest(straight[0])
     assert newest is not None
-    with pytest.raises(ValueError, match="holds a checkpoint; a policy is needed"):
-        read_policy(newest)
+    refuses("holds a checkpoint; a policy is needed", read_policy, newest)

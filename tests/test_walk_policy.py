@@ -16,7 +16,6 @@ import pytest
 from safetensors.numpy import save_file
 
 from mqe_jax import cli, make, skills, walk_policy
-from mqe_jax.core.errors import InputError
 from mqe_jax.physics import actuators
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
@@ -27,6 +26,7 @@ from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES
 from tests import archives
 from tests.archives import module, named
+from tests.inputs import refuses
 
 DOWN = jnp.array([0.0, 0.0, -1.0])
 SKILL = skills.make("walk", GO1)
@@ -121,8 +121,7 @@ def test_converted_weights_are_rounded_to_float16_only_on_request(tmp_path: path
 def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
     text = tmp_path / "text.jit"
     text.write_text("hello")
-    with pytest.raises(ValueError, match=r"text\.jit: damaged, or not a TorchScript Sequential"):
-        torchscript.read_torchscript(text)
+    refuses(r"text\.jit: damaged, or not a TorchScript Sequential", torchscript.read_torchscript, text)
     write_torchscript(tmp_path / "small.jit", random_layers((10, 5, 2), 0))
     with pytest.raises(ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"):
         torchscript.convert(tmp_path / "small.jit", tmp_path / "small.jit")
@@ -145,8 +144,7 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
 )
 def test_other_networks_are_refused_by_name(network: dict[str, Any], message: str, tmp_path: pathlib.Path) -> None:
     write_torchscript(tmp_path / "a.jit", random_layers((6, 5, 4, 3, 2), 0), **network)
-    with pytest.raises(InputError, match=rf"a\.jit: .*{re.escape(message)}"):
-        torchscript.read_torchscript(tmp_path / "a.jit")
+    refuses(rf"a\.jit: .*{re.escape(message)}", torchscript.read_torchscript, tmp_path / "a.jit")
 
 
 @pytest.mark.parametrize("read", [functools.partial(walk_policy.load_params, GO1), actuators.load_actuator_network])
@@ -165,8 +163,7 @@ def test_weights_with_other_names_or_shapes_are_refused(read: Any, tmp_path: pat
     }
     for message, wrong in changed.items():
         save_file(wrong, file)
-        with pytest.raises(InputError, match=rf"weights\.safetensors: {re.escape(message)}.*; expected"):
-            read(file)
+        refuses(rf"weights\.safetensors: {re.escape(message)}.*; expected", read, file)
 
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from mqe_jax import cli, walk_policy
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory
 from mqe_jax.physics.robots.go1 import GO1
@@ -21,6 +20,7 @@ from mqe_jax.train.networks import EnvDims
 from mqe_jax.walk.network import WALK_FORM, WalkNetwork, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
+from tests.inputs import refuses
 from tests.training import Probe, random_params
 
 ALL = np.arange(walk_policy.HISTORY)
@@ -125,8 +125,7 @@ def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
     walk_policy.save_params(start, file)
     params = WalkNetwork(weights=str(file)).build(DIMS).init(jax.random.PRNGKey(0))
     jax.tree.map(np.testing.assert_array_equal, params["policy"], start)
-    with pytest.raises(InputError, match=r"network.name: 'walk' is not allowed"):
-        WalkNetwork().build(DIMS._replace(agents=2))
+    refuses(r"network.name: 'walk' is not allowed", WalkNetwork().build, DIMS._replace(agents=2))
 
 
 @pytest.mark.soak
