@@ -71,17 +71,8 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The task `fake` in addition to the real ones, for `mqe`, and an empty working folder."""
     import fake_env
 
-    from mqe_jax.envs import TASKS
-    from mqe_jax.runs import build
-
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(TASKS, "fake", fake_env.FakeEnv)  # pyright: ignore[reportArgumentType]
-    real = build.make_env
-
-    def make_env(task: str, *arguments: Any, **named: Any) -> Any:
-        return (fake_env.make_env if task == "fake" else real)(task, *arguments, **named)
-
-    monkeypatch.setattr(build, "make_env", make_env)
+    fake_env.install(monkeypatch)
 
 
 @functools.cache

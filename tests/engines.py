@@ -81,7 +81,6 @@ def played(task: str, num_envs: int, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def ahead(obs: jax.Array) -> jax.Array:
-    """Walks ahead."""
     return jnp.zeros((len(obs), 3)).at[:, 0].set(0.5)
 
 
@@ -152,7 +151,6 @@ def covering() -> list[tuple[str, str, str]]:
 
 
 def main() -> None:
-    """Prints one JSON object a task."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("record", "agree"))
     parser.add_argument("folder", type=pathlib.Path)

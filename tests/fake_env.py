@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.cli import launch, main
+from mqe_jax.cli import demo, launch, main
 from mqe_jax.core import devices
 from mqe_jax.core.types import Outcome
 from mqe_jax.envs import TASKS, EnvironmentState
@@ -110,8 +110,6 @@ class FakeEnv:
 
 
 class FakeVectorEnv:
-    """`num_envs` of `FakeEnv` with automatic reset."""
-
     def __init__(self, env: Any, num_envs: int) -> None:
         self.env, self.num_envs = env, num_envs
         self.name = env.name
@@ -142,11 +140,6 @@ class FakeVectorEnv:
         return jax.vmap(one)(state, action)
 
 
-def make_env(task: str, impl: str, overrides: dict[str, Any], num_envs: int, *_: Any, final: Any = ()) -> Any:
-    """Replaces `mqe_jax.runs.build.make_env`."""
-    return made(num_envs)
-
-
 @functools.cache
 def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
     """The task and a batch of it, made once, so that programs are shared (see the fixture `shared_programs`)."""
@@ -155,8 +148,14 @@ def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
 
 
 def install(patch: pytest.MonkeyPatch) -> None:
-    """Lets `mqe` know this task, in place of all others."""
-    patch.setattr(build, "make_env", make_env)
+    """Lets `mqe` know this task, besides the others."""
+    real = build.make_env
+
+    def make_env(task: str, *arguments: Any, **named: Any) -> Any:
+        return made(arguments[2]) if task == "fake" else real(task, *arguments, **named)
+
+    for module in (build, demo):
+        patch.setattr(module, "make_env", make_env)
     patch.setitem(TASKS, "fake", FakeEnv)  # pyright: ignore[reportArgumentType]
 
 

@@ -66,7 +66,6 @@ def records() -> dict[str, Any]:
 
 
 def numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the dotted names and kinds of a record's numbers, those of nested records too."""
     for name, hint in hints_of(record).items():
         if (kind := number_in(hint)) is not None:
             yield prefix + name, kind
@@ -83,7 +82,6 @@ def number_in(hint: Any) -> Any:
 
 
 def refused(kind: Any) -> Strategy:
-    """Values that a kind of numbers refuses."""
     low, high = limits.bounds(kind)
     beyond = [st.floats(max_value=low, exclude_max=True), st.floats(min_value=high, exclude_min=True)]
     others: list[Strategy] = [st.just(float("nan")), st.booleans(), st.sampled_from(NO_NUMBERS)]

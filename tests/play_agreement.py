@@ -90,7 +90,6 @@ def differences(env: Any, rollouts: list[Rollout], found: list[Any], steps: int)
 
 
 def measure(folder: Path, entry: Entry, count: int, episodes: int) -> dict[str, Any]:
-    """Returns the report of one task."""
     rollouts = [record(entry, max(STEPS), seed) for seed in range(count)]
     found = run_page(folder, entry.name, rollouts, episodes)
     apart = functools.partial(differences, entry.env, rollouts, found["rollouts"])
@@ -157,7 +156,6 @@ environment step, for each episode its end and outcome, and environment steps pe
 
 
 def main() -> int:
-    """Prints the report, and writes it where asked to."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="site of `mqe play-site` without arguments")
     parser.add_argument("--tasks", nargs="*", default=[], help="all by default")

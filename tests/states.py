@@ -25,7 +25,6 @@ def made(task: str) -> Any:
 
 @functools.cache
 def stepper(task: str) -> Any:
-    """The compiled step of `made(task)`."""
     return jax.jit(made(task).step)
 
 
@@ -125,7 +124,6 @@ def observation(env: QuadrupedEnv, state: State) -> np.ndarray:
 
 
 def moment(env: QuadrupedEnv, state: State) -> Moment:
-    """A state with its robots' states."""
     return _programs(env)[1](state)
 
 
@@ -135,5 +133,4 @@ def terms_of(env: QuadrupedEnv, before: State, after: State) -> tuple[dict[str, 
 
 
 def still(env: QuadrupedEnv) -> jax.Array:
-    """The zero action of all agents."""
     return jnp.zeros((env.num_agents, env.action_size))

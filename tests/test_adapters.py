@@ -180,7 +180,6 @@ def match(task: str = "go1wrestling", **settings: Any) -> Any:
 
 
 def counting(task: str, act: float = 0.5) -> SimplePolicy:
-    """A policy that outputs one number everywhere."""
     return SimplePolicy(task, 1, lambda obs, key: jnp.full((len(obs), 1, 12), act))
 
 

@@ -226,7 +226,6 @@ zoo = pytest.fixture(lambda: adapter("pettingzoo"))
 
 
 def own_test(name: str) -> Any:
-    """One of PettingZoo's own tests."""
     return getattr(importlib.import_module("pettingzoo.test"), name)
 
 

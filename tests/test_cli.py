@@ -30,7 +30,6 @@ pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
 
 @pytest.fixture(scope="module")
 def run_folder(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of a tiny training run."""
     folder = tmp_path_factory.mktemp("run") / "fake"
     with pytest.MonkeyPatch.context() as patch:
         fake_env.install(patch)
@@ -64,18 +63,13 @@ def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest
     assert {"success_rate", "average_step_reward", "terms"} <= set(result)
 
 
-def test_a_simple_policy_is_measured_on_a_task(capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval", "fake", "--json", "--policy", "forward", "--episodes", "2"]) == 0
-    result = json.loads(capfd.readouterr().out)
-    assert result["success_rate"] == 1.0 and result["policy"] == "forward" and not {"actions", "opponent"} & set(result)
-    assert result["average_step_reward"] == pytest.approx(0.05)
-
-
-def test_dropped_contacts_are_counted_and_warned_of(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_simple_policy_is_measured_and_dropped_contacts_are_counted(capfd: pytest.CaptureFixture[str]) -> None:
     command = ["eval", "fake", "--json", "--episodes", "2", "--policy"]
     assert cli.main([*command, "forward"]) == 0  # two steps of each episode beyond x = 1.21 m
     out, err = capfd.readouterr()
-    assert json.loads(out)["overflow"] == 4
+    result = json.loads(out)
+    assert result["success_rate"] == 1.0 and result["policy"] == "forward" and not {"actions", "opponent"} & set(result)
+    assert result["average_step_reward"] == pytest.approx(0.05) and result["overflow"] == 4
     assert [line for line in err.splitlines() if "dropped contacts in 4 environment steps" in line]
     assert cli.main([*command, "idle"]) == 0
     out, err = capfd.readouterr()
@@ -101,20 +95,9 @@ def test_a_divergence_is_recorded_and_replayed(tmp_path: Path, monkeypatch: Any,
 def test_a_divergence_in_training_is_recorded(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)  # in the second step
     (tmp_path / "small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
-    command = [
-        "train",
-        "go1revolvingdoor",
-        "--impl",
-        "c",
-        "--control",
-        "position",
-        "--run-dir",
-        "run",
-        "--config",
-        "small.yaml",
-    ]
-    command += ["--num-envs", "4", "--rollout-steps", "2", "--total-steps", "4", "--ppo.minibatches", "1"]
-    assert cli.main([*command, "--dump-diverged", "dump"]) == 0
+    command = "train go1revolvingdoor --impl c --control position --run-dir run --config small.yaml --num-envs 4"
+    command += " --rollout-steps 2 --total-steps 4 --ppo.minibatches 1 --dump-diverged dump"
+    assert cli.main(command.split()) == 0
     assert "recorded 2 divergences" in capfd.readouterr().err
     for file in ("diverged_0000.npz", "diverged_0001.npz"):
         recording = load_recording(tmp_path / "dump" / file)
@@ -249,7 +232,6 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
 
 def test_the_demo_resumes_only_what_has_begun(capfd: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
     monkeypatch.setattr(demo, "DEMO_TASK", "fake")
-    monkeypatch.setattr(demo, "make_env", fake_env.make_env)
     small = "task: fake\nnum_envs: 4\nrollout_steps: 8\ntotal_steps: 64\ncheckpoint: {every: 1}\n"
     Path("small.yaml").write_text(small)
     for _ in range(2):

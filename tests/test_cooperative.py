@@ -138,7 +138,6 @@ def on_plank(x: float, height: float = 0.31) -> list[float]:
 
 
 def angle(env: Any, state: State) -> float:
-    """Of the plank, rad."""
     return float(state.data.qpos[env.objects["seesaw"].qpos[0]])
 
 

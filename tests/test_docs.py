@@ -42,7 +42,6 @@ def read(page: str) -> str:
 
 
 def blocks(text: str, language: str) -> list[str]:
-    """The fenced blocks of a language in a text."""
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
@@ -264,7 +263,6 @@ def run(path: Path) -> list[dict[str, Any]]:
 
 
 def check(outputs: list[dict[str, Any]], name: str) -> None:
-    """Clips are inline, and plots are there."""
     pages = [str(data["text/html"]) for data in outputs if "text/html" in data]
     clips = [page for page in pages if "data:video/mp4;base64," in page or "data:image/gif;base64," in page]
     assert len(clips) == CLIPS[name] and all(len(clip) > 2000 for clip in clips)

@@ -1,6 +1,5 @@
 """Exported policies: equal outputs in onnxruntime and in JAX, and refused exports."""
 
-import functools
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +21,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
-from tests.training import random_params
+from tests.training import export_error, random_params
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("jax2onnx")
@@ -30,7 +29,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 
 from mqe_jax.export import translate  # noqa: E402
 from mqe_jax.export.check import errors, record_actions  # noqa: E402
-from mqe_jax.export.policy import input_shapes, policy_step, shapes, to_onnx  # noqa: E402
+from mqe_jax.export.policy import input_shapes, shapes, to_onnx  # noqa: E402
 
 GATE = zoo.file_of("go1gate")
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
@@ -48,17 +47,6 @@ def new_policy(env: Any, control: str = "command", **network: Any) -> TrainedPol
     params = jax.tree.map(lambda x: x + 0.1, net.policy_params(random_params(net)))
     mean, spread = (jax.random.normal(key, (env.observation_size,)) for key in keys[1:])
     return TrainedPolicy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), needs, config, {})
-
-
-def error_on_random_inputs(policy: TrainedPolicy, env: Any) -> float:
-    """The largest error of the graph, for random observations and recurrent states of five environments at once."""
-    random, shapes = np.random.default_rng(0), input_shapes(policy, env)
-    inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
-    step = functools.partial(policy_step, policy, env)
-    expected = jax.device_get(jax.jit(jax.vmap(step))(inputs))
-    found = errors(translate.translate(step, shapes, "test"), inputs, expected)
-    assert found.keys() == expected.keys()
-    return max(found.values())
 
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
@@ -117,7 +105,7 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
 def test_networks_memories_and_controls_agree(task: str, control: str, network: dict[str, Any]) -> None:
     params = {"position_scale": 2.0} if control == "position" else {}
     env = make(task, impl="c", control=control, num_envs=1, **params)
-    assert error_on_random_inputs(new_policy(env, control, **network), env) < 2e-5
+    assert export_error(new_policy(env, control, **network), env) < 2e-5
 
 
 @pytest.mark.parametrize(
@@ -132,18 +120,17 @@ def test_a_graph_holds_the_skill_of_the_task(
     env = make("go1gate", impl="c", num_envs=1, skill=skill, commands=commands)
     policy = new_policy(env, recurrent=False)
     assert memory.items() <= input_shapes(policy, env).items()
-    assert error_on_random_inputs(policy, env) < 2e-5
+    assert export_error(policy, env) < 2e-5
 
 
 def stub_env(agents: int) -> Any:
-    """What `policy_step` reads of a task in `torque` control."""
     sizes = {"num_agents": agents, "observation_size": 7, "privileged_observation_size": 0, "action_size": 12}
     return SimpleNamespace(name="none", control="torque", robot=GO1, reset=None, step=None, **sizes)
 
 
 def test_agents_of_mat_act_one_after_another() -> None:
     env = stub_env(2)
-    assert error_on_random_inputs(new_policy(env, "torque", name="mat", heads=2, blocks=2), env) < 2e-5
+    assert export_error(new_policy(env, "torque", name="mat", heads=2, blocks=2), env) < 2e-5
 
 
 @pytest.mark.soak

@@ -21,14 +21,12 @@ envs = pytest.fixture(scope="module")(lambda: {task: made(task) for task in TASK
 
 @pytest.fixture(scope="module")
 def drawn(envs: dict[str, Any]) -> dict[str, State]:
-    """64 initial states of every task."""
     keys = jax.random.split(jax.random.PRNGKey(0), 64)
     return {task: jax.jit(jax.vmap(env.reset))(keys) for task, env in envs.items()}
 
 
 @pytest.fixture(scope="module")
 def fresh(drawn: dict[str, State]) -> dict[str, State]:
-    """An initial state of every task."""
     return {task: jax.tree.map(lambda x: x[0], states) for task, states in drawn.items()}
 
 
@@ -113,7 +111,6 @@ PLACES = [(4.2, 0.7, 0.3), (9.1, -1.2, 2.8), (8.4, 2.2, -2.0), (10.6, 0.4, 3.0)]
 
 
 def turned(places: Any) -> np.ndarray:
-    """Poses x, y, yaw after a half turn about the field's middle."""
     return np.array([(14 - x, -y, yaw + np.pi) for x, y, yaw in places])
 
 
@@ -276,6 +273,3 @@ def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> Non
     # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the side.
     np.testing.assert_allclose(commands[:2], [0.5, 0.5], atol=1e-6)
     np.testing.assert_array_equal(commands[3:], rest[3:])
-
-
-# -- the whole --------------------------------------------------------------------------------------------------------

@@ -119,8 +119,6 @@ def test_an_interrupt_returns_the_run_so_far(monkeypatch: Any, capfd: Any) -> No
 
 
 class Still(Stages):
-    """An algorithm that learns nothing."""
-
     def update(self, carry: Any, batch: Any, now: Any, key: Any) -> Any:
         return carry, super().update(carry, batch, now, key)[1]
 
@@ -141,8 +139,9 @@ def test_seeds_are_trained_in_one_program_into_their_folders() -> None:
         [run.config.seed for run in runs] == [1, 3] == [mqe_jax.load_run(f"runs/seed{n}").config.seed for n in (1, 3)]
     )
     alone = mqe_jax.learn("fake", FEW, seed=3)
-    for one, other in zip(jax.tree.leaves(runs[1].policy.params), jax.tree.leaves(alone.policy.params), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+    columns = [{k: v for k, v in run.metrics.items() if k not in ("seconds", "fps")} for run in (runs[1], alone)]
+    close = lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)  # noqa: E731
+    jax.tree.map(close, (runs[1].policy.params, columns[0]), (alone.policy.params, columns[1]))
 
 
 def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
@@ -181,18 +180,12 @@ def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
     refuses(r"seeds: .* is not allowed", mqe_jax.make_learner, "fake", FEW, seeds=0 if seeds == 5 else seeds)
 
 
-@pytest.mark.parametrize(
-    ("task", "arguments", "said"),
-    [
-        (None, {}, "task: None is not allowed"),
-        ("fake", {"env": "x"}, "env: 'x' is not allowed"),
-        ("fake", {"env": 5}, "env: 5 is not allowed"),
-        ("~/none", {}, "run: '/nowhere/none' has no policy"),
-    ],
-)
-def test_what_cannot_be_evaluated_is_named(task: Any, arguments: dict[str, Any], said: str, monkeypatch: Any) -> None:
+def test_what_cannot_be_evaluated_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/nowhere")
-    refuses(said, mqe_jax.evaluate, task, "idle", **arguments)
+    refuses("task: None is not allowed", mqe_jax.evaluate, None, "idle")
+    refuses("env: 'x' is not allowed", mqe_jax.evaluate, "fake", "idle", env="x")
+    refuses("env: 5 is not allowed", mqe_jax.evaluate, "fake", "idle", env=5)
+    refuses("run: '/nowhere/none' has no policy", mqe_jax.evaluate, "~/none", "idle")
 
 
 def test_a_run_of_other_parts_is_named(run: mqe_jax.Run) -> None:

@@ -32,12 +32,10 @@ from tests import inputs
 from tests import training as probes
 from tests.archives import module, named, tensor, zipped
 from tests.inputs import refuses
-from tests.test_train_run import settings as run_settings
-from tests.training import Probe
+from tests.training import Probe, settings
 
 
 def peak() -> int:
-    """Returns the largest resident memory of this process so far, bytes."""
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
@@ -120,7 +118,6 @@ def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
 
 
 def tensors(dtype: str, size: int, metadata: dict[str, str] | None = None) -> bytes:
-    """Returns a safetensors file of one tensor `a`."""
     about: dict[str, Any] = {"a": {"dtype": dtype, "shape": [1], "data_offsets": [0, size]}}
     header = json.dumps(about | ({} if metadata is None else {"__metadata__": metadata})).encode()
     return struct.pack("<Q", len(header)) + header + bytes(size)
@@ -221,29 +218,33 @@ def test_bad_archives(case: str, tmp_path: Path) -> None:
 # -- impossible content, whose checksum is right -----------------------------------------------------------------------
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
-SETTINGS = run_settings(normalization__observations=True, ppo__epochs=1, ppo__minibatches=1, total_steps=32)
+SETTINGS = settings(normalization__observations=True, ppo__epochs=1, ppo__minibatches=1, total_steps=32)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a short run."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     train(PROBE, SETTINGS, folder)
     return folder
 
 
-def rewrite(path: Path, kind: str, name: str, value: Any, metadata: dict[str, Any] | None = None) -> None:
-    """Writes a file anew with a value in the last place of the first array whose name starts so."""
+def refuses_rewritten(said: str, kind: str, run: Path, name: str, value: Any, metadata: dict[str, Any]) -> None:
+    """Asserts that a run is refused with a value in the last place of the first array whose name starts so."""
+    path = run / "policy.safetensors" if kind == "policy" else checkpoint.list_checkpoints(run)[-1]
     arrays, about = checkpoint._read(path, kind)
     name = next(other for other in arrays if other.startswith(name))
     changed = np.array(arrays[name])
     changed[(-1,) * changed.ndim] = value
-    checkpoint.save_tree(path, {**arrays, name: changed}, {**about, **(metadata or {})}, kind=kind)
+    checkpoint.save_tree(path, {**arrays, name: changed}, {**about, **metadata}, kind=kind)
+    said = rf"{path.name}: {said}"
+    if kind == "policy":
+        refuses(said, read_policy, path)
+    else:
+        refuses(said, train, PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+NUMBERS = {
+    "policy": (
         ("normalizer/variance", -1.0),
         ("normalizer/variance", math.nan),
         ("normalizer/samples", -1.0),
@@ -251,17 +252,8 @@ def rewrite(path: Path, kind: str, name: str, value: Any, metadata: dict[str, An
         ("params/log_std", 1e5),
         ("params/actor", 1e30),
         ("params/actor", math.nan),
-    ],
-)
-def test_a_policy_of_impossible_numbers(name: str, value: float, trained: Path, tmp_path: Path) -> None:
-    path = Path(shutil.copy(trained / "policy.safetensors", tmp_path))
-    rewrite(path, "policy", name, value)
-    refuses(rf"policy\.safetensors: {name}.* holds .*; a number from ", read_policy, path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+    ),
+    "checkpoint": (
         ("updates", -1),
         ("updates", 10**6),
         ("learning_rate", -1e-3),
@@ -273,15 +265,31 @@ def test_a_policy_of_impossible_numbers(name: str, value: float, trained: Path, 
         ("rollout/memory/actor", math.nan),
         ("rollout/episode_steps", -1),
         ("rollout/env_state/obs", math.nan),
+    ),
+}
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), [(kind, *row) for kind, rows in NUMBERS.items() for row in rows])
+def test_impossible_numbers(kind: str, name: str, value: float, trained: Path, tmp_path: Path) -> None:
+    """The updates of a checkpoint are those of its name: a run that seems to be finished is not, however untrained."""
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    refuses_rewritten(rf"({name}.* holds .*; a number from|holds 1000000 updates)", kind, run, name, value, {})
+
+
+@pytest.mark.parametrize(
+    ("kind", "metadata", "said"),
+    [
+        ("checkpoint", {"seconds": -1.0}, "its settings or its seconds"),
+        ("checkpoint", {"seconds": math.nan}, "its settings or its seconds"),
+        ("checkpoint", {"task": ["probe"]}, ".*belongs to task"),
+        ("policy", {"env_steps": -1}, r"its settings cannot be read \(env_steps"),
+        ("policy", {"env_steps": "many"}, r"its settings cannot be read \(env_steps"),
+        ("policy", {"needs": {"task": ["probe"]}}, r"its settings cannot be read \(task"),
     ],
 )
-def test_a_checkpoint_of_impossible_numbers(name: str, value: float, trained: Path, tmp_path: Path) -> None:
-    """Its updates are those of its name: a run that seems to be finished is not, however untrained."""
-    run = Path(shutil.copytree(trained, tmp_path / "run"))
-    path = checkpoint.list_checkpoints(run)[-1]
-    rewrite(path, "checkpoint", name, value)
-    with pytest.raises(InputError, match=rf"{path.name}: ({name}.* holds .*; a number from|holds 1000000 updates)"):
-        train(PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
+def test_impossible_metadata(kind: str, metadata: Any, said: str, trained: Path, tmp_path: Path) -> None:
+    name = "learning_rate" if kind == "checkpoint" else "normalizer/samples"
+    refuses_rewritten(said, kind, Path(shutil.copytree(trained, tmp_path / "run")), name, 1e-3, metadata)
 
 
 @pytest.mark.parametrize("name", ["games", "score", "born"])
@@ -292,33 +300,6 @@ def test_a_pool_of_impossible_numbers(name: str, tmp_path: Path) -> None:
     refuses(rf"a: extra/pool/{name} holds -2", checkpoint.load_tree, tmp_path / "a", tree, kind="checkpoint")
     with pytest.raises(InputError, match=rf"a: extra/pool/{name} holds -2"):
         checkpoint.load_tree(tmp_path / "a", members, kind="checkpoint", part="extra/pool/")
-
-
-@pytest.mark.parametrize(
-    ("metadata", "said"),
-    [
-        ({"seconds": -1.0}, "its settings or its seconds"),
-        ({"seconds": math.nan}, "its settings or its seconds"),
-        ({"task": ["probe"]}, "belongs to task"),
-    ],
-)
-def test_a_checkpoint_of_impossible_metadata(
-    metadata: dict[str, Any], said: str, trained: Path, tmp_path: Path
-) -> None:
-    run = Path(shutil.copytree(trained, tmp_path / "run"))
-    path = checkpoint.list_checkpoints(run)[-1]
-    rewrite(path, "checkpoint", "learning_rate", 1e-3, metadata)
-    refuses(said, train, PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
-
-
-@pytest.mark.parametrize(
-    ("metadata", "said"),
-    [({"env_steps": -1}, "env_steps"), ({"env_steps": "many"}, "env_steps"), ({"needs": {"task": ["probe"]}}, "task")],
-)
-def test_a_policy_of_impossible_metadata(metadata: dict[str, Any], said: str, trained: Path, tmp_path: Path) -> None:
-    path = Path(shutil.copy(trained / "policy.safetensors", tmp_path))
-    rewrite(path, "policy", "normalizer/samples", 1.0, metadata)
-    refuses(rf"policy\.safetensors: its settings cannot be read \({said}", read_policy, path)
 
 
 def test_weights_that_no_network_has() -> None:

@@ -1,6 +1,5 @@
 """SIGINT and SIGTERM: one line, exit code 130 or 143; SIGKILL too leaves a run that resumes exactly."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -50,7 +49,6 @@ def handles(process: subprocess.Popen[str], number: int) -> bool:
 
 
 def end(process: subprocess.Popen[str], number: signal.Signals, seconds: float = 10) -> list[str]:
-    """Sends a signal; returns the lines on standard error but for the progress."""
     process.send_signal(number)
     try:
         _, said = process.communicate(timeout=seconds)
@@ -164,27 +162,17 @@ def test_an_ignored_signal_stays_ignored(tmp_path: Path) -> None:
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "True\n"
 
 
-STEPS, ENVS, ROLLOUT = 12, 4, 8
-
-
-def start_training(run_dir: Path, *flags: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
-    command += ["--run-dir", str(run_dir), "--num-envs", str(ENVS), "--rollout-steps", str(ROLLOUT)]
-    command += ["--total-steps", str(STEPS * ENVS * ROLLOUT), "--ppo.minibatches", "2", "--checkpoint.every", "1"]
-    return subprocess.Popen([*command, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
-
-
 @pytest.mark.soak
 def test_sigkill_and_resume_changes_nothing(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    assert start_training(whole).wait(300) == 0
-    process = start_training(killed)
-    deadline = time.monotonic() + 300
-    while len(list_checkpoints(killed)) < 2 and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.002)
-    process.send_signal(signal.SIGKILL)
+    command = [*GATE, "--total-steps", str(12 * 32), "--checkpoint.every", "1", "--run-dir"]
+    process = start([*command, str(killed)])
+    wait_for(lambda: len(list_checkpoints(killed)) >= 2, process)
+    process.kill()
     assert process.wait(60) == -signal.SIGKILL, "the training ended before it could be killed"
-    assert start_training(killed, "--resume").wait(300) == 0
-
+    for words in ([str(killed), "--resume"], [str(whole)]):
+        process = start([*command, *words])
+        process.communicate(timeout=300)
+        assert process.returncode == 0
     assert_same_run(whole, killed)
-    assert [updates(run) for run in (whole, killed)] == [STEPS, STEPS]
+    assert [updates(run) for run in (whole, killed)] == [12, 12]

@@ -18,42 +18,23 @@ from mqe_jax.envs import make
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.runs import build as setup
 from mqe_jax.runs.build import base_config
-from mqe_jax.selfplay.league import pool, tournament
+from mqe_jax.selfplay.league import tournament
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.selfplay.opponents import versus
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.learner import TrainState
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.policy import policy_of, save_policy
 from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
-from tests.training import assert_same_run, content
+from tests.training import assert_same_run, content, updated
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 SOURCES = ("newest", "older", "uniform", "idle")
 SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}
-
-
-def filled(*games: tuple[float, float]) -> pool.Pool:
-    """A pool of one place more than given members, with the learner's score and games against each."""
-    result = pool.new_pool({"x": jnp.zeros(2)}, len(games) + 1)
-    score, count = jnp.array([*games, (0.0, 0.0)]).T
-    born = jnp.array([*range(len(games)), -1])
-    return result._replace(born=born, score=score, games=count)
-
-
-def test_a_new_member_takes_a_free_place_then_that_of_the_member_beaten_most() -> None:
-    new, nobody = {"x": jnp.ones(2)}, jnp.zeros(3, bool)
-    now = pool.add(filled((1.0, 9.0), (9.0, 9.0)), new, jnp.int32(7), jnp.float32(50.0), nobody)
-    assert now.born.tolist() == [0, 1, 7] and now.rating.tolist() == [0, 0, 50]
-    np.testing.assert_array_equal(now.arrays["x"], [[0, 0], [0, 0], [1, 1]])
-    full = pool.add(now, new, jnp.int32(8), jnp.float32(60.0), nobody)
-    assert full.born.tolist() == [0, 8, 7] and full.games.tolist() == [9, 0, 0]
-    busy = pool.add(now, new, jnp.int32(8), jnp.float32(60.0), nobody.at[1].set(True))
-    assert busy.born.tolist() == [0, 1, 8]
 
 
 def config_of(sources: tuple[str, ...] = SOURCES, **settings: Any) -> TrainConfig:
@@ -66,11 +47,7 @@ def history() -> list[TrainState]:
     """States of a training after each update; episodes have ten steps, a rollout four, a snapshot is due every one."""
     config = config_of()
     league = League(matches(num_envs=8), SOURCES, config)
-    learner = make_learner(league.env, config, league=league)
-    update, states = jax.jit(learner.update), [jax.jit(learner.init)(KEY)]
-    for _ in range(9):
-        states.append(update(states[-1])[0])
-    return jax.block_until_ready(states)  # while the environment exists
+    return updated(league.env, config, 9, league=league)[0]
 
 
 def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainState]) -> None:
@@ -87,31 +64,27 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
             jax.tree.map(np.testing.assert_array_equal, opponent.arrays, of_pool)
 
 
-def test_a_league_that_starts_from_a_policy_begins_with_it(history: list[TrainState], tmp_path: Path) -> None:
-    config, state = config_of(start=str(tmp_path)), history[9]
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_league_begins_with_the_policy_it_starts_from_or_its_members(
+    resumed: bool, history: list[TrainState], tmp_path: Path
+) -> None:
+    """From a policy, or resumed without environments."""
+    start: dict[str, Any] = {} if resumed else {"start": str(tmp_path)}
+    config, state, file = config_of(**start), history[9], None
     league = League(matches(num_envs=8), SOURCES, config)
-    save_policy(tmp_path, policy_of(state, league.env, config, env_steps=0))
+    if resumed:
+        metadata = {"task": league.env.name, "config": to_mapping(config), "environments": False}
+        file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
+    else:
+        save_policy(tmp_path, policy_of(state, league.env, config, env_steps=0))
     learner, processes = own_learner(league.env, config, league)
-    begun, _ = first_state(league.env, learner, processes, config, None, SeedBatch(learner.init, 1).shared, league)
+    begun, _ = first_state(league.env, learner, processes, config, file, SeedBatch(learner.init, 1).shared, league)
+    seats, before = ([seat.arrays for seat in each.rollout.env_state.opponents] for each in (begun, state))
     mine = league._own(begun)
     jax.tree.map(np.testing.assert_array_equal, mine.params, league._own(state).params)
-    for arrays in (
-        jax.tree.map(lambda x: x[0], begun.extra.pool.arrays),
-        *(o.arrays for o in begun.rollout.env_state.opponents[:3]),
-    ):
-        jax.tree.map(np.testing.assert_array_equal, arrays, mine)
-
-
-def test_a_league_resumed_without_environments_plays_its_members(history: list[TrainState], tmp_path: Path) -> None:
-    config, state = config_of(), history[9]
-    league = League(matches(num_envs=8), SOURCES, config)
-    metadata = {"task": league.env.name, "config": to_mapping(config), "environments": False}
-    file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
-    learner, processes = own_learner(league.env, config, league)
-    resumed, _ = first_state(league.env, learner, processes, config, file, SeedBatch(learner.init, 1).shared, league)
-    seats = zip(resumed.rollout.env_state.opponents, state.rollout.env_state.opponents, strict=True)
-    for now, before in seats:
-        jax.tree.map(np.testing.assert_array_equal, now.arrays, before.arrays)
+    jax.tree.map(np.testing.assert_array_equal, seats, before if resumed else [mine] * 3 + seats[3:])
+    if not resumed:
+        jax.tree.map(lambda x, own: np.testing.assert_array_equal(x[0], own), begun.extra.pool.arrays, mine)
 
 
 def test_a_block_plays_another_member_after_its_episodes(history: list[TrainState]) -> None:
@@ -122,38 +95,6 @@ def test_a_block_plays_another_member_after_its_episodes(history: list[TrainStat
     games = [float(jnp.sum(state.extra.pool.games)) for state in history]
     assert games[2] == 0 and games[3] == pytest.approx(4) and games[8] > games[5]
     assert all(not bool(o.outcomes.any()) for state in history[1:] for o in state.rollout.env_state.opponents)
-
-
-def test_a_block_keeps_its_member_while_episodes_against_the_last_one_run(history: list[TrainState]) -> None:
-    rules = League(matches(num_envs=8), SOURCES, config_of())
-
-    @jax.jit
-    def members(state: TrainState) -> jax.Array:
-        """Members of the blocks after an update, for 16 random keys (16, K); all have played enough."""
-
-        def one(key: jax.Array) -> jax.Array:
-            league = state.extra._replace(key=key, played=jnp.full_like(state.extra.played, 5))
-            return rules.after(dataclasses.replace(state, extra=league))[0].extra.member
-
-        return jax.vmap(one)(jax.random.split(KEY, 16))
-
-    waiting, free = members(history[3]), members(history[5])
-    np.testing.assert_array_equal(waiting, np.tile(history[3].extra.member, (16, 1)))
-    assert [len(set(of_block.tolist())) > 1 for of_block in free.T] == [False, True, True, False]
-
-
-@pytest.mark.parametrize(("win_rate", "snapshots"), [(1.0, [0, 0, 0, 8]), (0.4, [0, 2, 7, 8])])
-def test_a_winning_policy_joins_early_but_not_at_once(
-    history: list[TrainState], win_rate: float, snapshots: list[int]
-) -> None:
-    league = {**SMALL, "snapshot_steps": 256, "snapshot_win_rate": win_rate}
-    rules, state = League(matches(num_envs=8), SOURCES, config_of(league=league)), history[1]
-    state = dataclasses.replace(state, extra=state.extra._replace(snapshot=jnp.int32(0)))
-
-    def last(updates: jax.Array) -> jax.Array:
-        return rules.after(dataclasses.replace(state, updates=updates))[0].extra.snapshot
-
-    assert jax.jit(jax.vmap(last))(jnp.array([1, 2, 7, 8], jnp.int32)).tolist() == snapshots
 
 
 def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:

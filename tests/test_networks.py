@@ -15,72 +15,48 @@ import pytest
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, override
-from mqe_jax.core.types import NetworkMemory, Params, VectorEnv
-from mqe_jax.export import translate
-from mqe_jax.export.check import errors
-from mqe_jax.export.policy import input_shapes, policy_step
+from mqe_jax.core.types import NetworkMemory, Params
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.runs.presets import base_config, preset
 from mqe_jax.skills.agile import FRAME_SIZE, NOW_SIZE
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.learner import make_learner
 from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import NETWORKS, ActorCritic, EnvDims, Network
-from mqe_jax.train.policy import TrainedPolicy, read_policy
+from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train_seeds
 from mqe_jax.view.session import Session
 from mqe_jax.walk import network as walk_network  # registers it
 from mqe_jax.walk_policy import OBSERVATION_SIZE
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, assert_same
+from tests.training import FAST, Probe, assert_same, export_error, settings, updated
 
 ALGORITHMS = ("mappo", "jrpo", "mat", "ippo", "dual-clip")
-SMALL = {
-    "num_envs": 32,
-    "total_steps": 100_000,
-    "rollout_steps": 8,
-    "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
-    "optimizer": {"learning_rate": 1e-2},
-}
-PLAIN = {"network": {"recurrent": False, "hidden_sizes": [16], "log_std_init": -1.0}}
+PLAIN = {"network": FAST["network"]}
 
 
-def settings(algorithm: str, *changes: dict[str, Any]) -> TrainConfig:
-    """An algorithm's preset with settings that learn a probe in seconds."""
-    config = override(override(TrainConfig(), SMALL), preset(algorithm))
+def learn(algorithm: str, pay: Any, updates: int, *changes: dict[str, Any]) -> np.ndarray:
+    """Trains by an algorithm's preset and returns the mean rewards per step of all updates."""
+    config = override(settings({**FAST, "network": {}}), preset(algorithm))
     for change in changes:
         config = override(config, change)
-    return config
-
-
-def learn(env: VectorEnv, config: TrainConfig, updates: int, last: int) -> float:
-    """Trains and returns the mean reward per step over the last updates."""
-    learner = make_learner(env, config)
-    state = jax.jit(learner.init)(jax.random.PRNGKey(1))
-    update = jax.jit(learner.update)
-    rewards = []
-    for _ in range(updates):
-        state, metrics = update(state)
-        rewards.append(float(metrics["average_step_reward"]))
-    return float(np.mean(rewards[-last:]))
+    metrics = updated(Probe(probes.show_hidden, pay, num_envs=32), config, updates, seed=1)[1]
+    return np.array([float(row["average_step_reward"]) for row in metrics])
 
 
 @pytest.mark.parametrize(("algorithm", "cooperates"), [("jrpo", True), ("ippo", False)])
 def test_only_the_joint_ratio_cooperates_for_a_public_good(algorithm: str, cooperates: bool) -> None:
     """Individual ratios converge to the Nash equilibrium, -0.5 each; the joint ratio contributes all, +0.5 each."""
-    env = Probe(probes.show_hidden, probes.pay_public_good, num_envs=32)
-    reward = learn(env, settings(algorithm, PLAIN), 50, 5)
+    reward = learn(algorithm, probes.pay_public_good, 50, PLAIN)[-5:].mean()
     assert reward >= 0.45 if cooperates else reward <= -0.45
 
 
 def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
     log_std = -1.2
     fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}
-    env = Probe(probes.show_hidden, probes.pay_meeting, num_envs=32)
     small = {"network": {"width": 16, "deviation": "free"}, "optimizer": {"learning_rate": 3e-3}}
-    assert -learn(env, settings("mat", small, fixed), 100, 20) / math.exp(2 * log_std) <= 1.2
+    assert -learn("mat", probes.pay_meeting, 100, small, fixed)[-20:].mean() / math.exp(2 * log_std) <= 1.2
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -118,7 +94,6 @@ NO_MEMORY = NetworkMemory((), ())
 
 
 def dims(agents: int) -> EnvDims:
-    """Sizes with 5 observations and 2 actions per agent."""
     return EnvDims(agents=agents, observation=5, privileged=1, action=2, values=agents)
 
 
@@ -130,7 +105,6 @@ def made(agents: int, **settings: Any) -> tuple[Network, Params, jax.Array]:
 
 
 def log_probs(network: Network, params: Params, obs: jax.Array, action: jax.Array) -> np.ndarray:
-    """Parallel log-probabilities (N, A, D)."""
     first = jnp.zeros(obs.shape[:1], bool)
     return np.asarray(network.evaluate(params, NO_MEMORY, first, obs, obs[..., 0, :1], action).log_prob)
 
@@ -208,7 +182,6 @@ CASES = [
 
 
 def pay_each(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Reward of each agent, maximal if its actions are half the sign."""
     return -jnp.mean(jnp.square(action - 0.5 * hidden[:, None, None]), axis=-1)
 
 
@@ -270,16 +243,6 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
     for _ in range(4):
         session.advance()
     assert session.episodes.tolist() == [1] * 4 and np.all(np.isfinite(session.rewards))
-    assert export_error(policy, env) < 2e-5
-
-
-def export_error(policy: TrainedPolicy, env: Any) -> float:
-    """The largest error of the exported graph for random inputs of five environments."""
-    described: Any = SimpleNamespace(
-        name="probe", control=env.control, robot=env.robot, observation_size=policy.dims[1]
-    )
-    random, shapes = np.random.default_rng(0), input_shapes(policy, described)
-    inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
-    step = functools.partial(policy_step, policy, described)
-    expected = jax.device_get(jax.jit(jax.vmap(step))(inputs))
-    return max(errors(translate.translate(step, shapes, "probe"), inputs, expected).values())
+    sizes = {"observation_size": policy.dims[1]}
+    described: Any = SimpleNamespace(name="probe", control=env.control, robot=env.robot, **sizes)
+    assert export_error(policy, described) < 2e-5

@@ -1,7 +1,6 @@
 """Objects and NPCs: motion of boxes, balls, sheep and the defender, and the tasks with objects and sheep."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.envs import Moment, VectorEnv, make
-from mqe_jax.npc import defend, flock
+from mqe_jax.npc import defend
 from mqe_jax.physics import objects
 from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.policies.scripted import scripted_policy
@@ -28,18 +27,6 @@ herd = pytest.fixture(scope="module")(lambda: made("go1sheep-hard"))
 
 def plain(**objects: objects.Object) -> Any:
     return compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
-
-
-def test_the_law_of_the_flock_by_hand() -> None:
-    """One sheep at rest 0.5 m from a robot: q = 0.25, 0.2 * 0.5 / 0.25^1.4 = 0.6964 m/s, minus 0.0981 m/s friction."""
-    key, sheep, still = jax.random.PRNGKey(0), jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2))
-    velocity = flock(key, sheep, still, jnp.array([[0.5, 0.0]]), restlessness=0.0, step=STEP)
-    np.testing.assert_allclose(velocity, [[0.2 * 0.5 / 0.25**1.4 - 0.0981, 0.0]], atol=1e-4)
-    fast = flock(key, sheep, still, jnp.array([[0.9, 0.0]]), restlessness=0.0, step=STEP)
-    np.testing.assert_allclose(fast, [[2.0 - 0.0981, 0.0]], atol=1e-4)  # the top speed
-    law = functools.partial(flock, key, sheep, still, restlessness=0.0, step=STEP, friction=0.0)
-    seen, beyond = (float(law(jnp.array([[1.0 - apart, 0.0]]))[0, 0]) for apart in (2.9, 3.1))
-    assert seen == pytest.approx(0.2 * 2.9 / 2.9**2.8, rel=1e-4) and beyond == 0.0
 
 
 @pytest.mark.parametrize(

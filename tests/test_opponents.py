@@ -50,7 +50,6 @@ def matches(task: str = "go1revolvingdoor", num_envs: int = 4, **params: Any) ->
 
 
 def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **settings: Any) -> TrainedPolicy:
-    """An untrained policy of a team."""
     own = {"task": env.name, "env": {"control": env.env.control, **params}, "num_envs": env.num_envs}
     config = build(TrainConfig, {**SETTINGS, **own, **settings})
     needs = needs_of(env, config)

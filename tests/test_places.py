@@ -39,10 +39,8 @@ import sys
 from mqe_jax.cli import main
 assert main({bad!r}) == 2  # imports MuJoCo, as every command that runs
 sys.path.insert(0, {tests!r})
-import fake_env
-fake_env.build.make_env = fake_env.make_env
-from mqe_jax.envs import TASKS
-TASKS["fake"] = fake_env.FakeEnv
+import fake_env, pytest
+fake_env.install(pytest.MonkeyPatch())
 for line in {lines!r}:
     sys.argv = ["mqe", *line]
     assert main() == 0, line

@@ -32,7 +32,6 @@ DRAWN |= {"observation_noise": 0.05, "push": 0.4, "push_period": 0.1}
 
 @pytest.fixture(scope="module")
 def box() -> Any:
-    """Push Box with everything drawn that can be."""
     params: dict[str, Any] = {"joint_mechanics": True, "gate_random": (0.3, 0.5), "spawn_joint_scale": (0.5, 2.5)}
     return make("go1pushbox", impl="c", control="position", num_envs=1, randomization=DRAWN, **params)
 
@@ -130,8 +129,6 @@ def test_randomised_parameters_reach_their_fields_of_the_model(box: Any, resets:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Speeds:
-    """A physics state of velocities alone."""
-
     qvel: jax.Array
 
     def replace(self, **values: Any) -> Speeds:

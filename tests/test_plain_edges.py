@@ -18,7 +18,6 @@ from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.selfplay.league import league, pool
 from mqe_jax.terrain import Gate, Track
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.learner import make_learner
 from mqe_jax.train.logs import row_of
 from mqe_jax.train.normalize import RunningStatistics, running_normalize
 from mqe_jax.train.optim import adam
@@ -26,7 +25,7 @@ from mqe_jax.train.rollout import _means, _sums
 from tests import training as probes
 from tests.inputs import refuses
 from tests.states import made
-from tests.training import Probe
+from tests.training import Probe, settings, updated
 
 KEY = jax.random.PRNGKey(0)
 
@@ -127,15 +126,7 @@ def test_points_that_coincide_give_finite_numbers() -> None:
 
 
 def test_rewards_that_are_always_zero_leave_everything_finite() -> None:
-    config = build(
-        TrainConfig,
-        {
-            **{"num_envs": 4, "rollout_steps": 4, "total_steps": 160, "network": {"recurrent": False}},
-            "ppo": {"epochs": 1},
-        },
-    )
-    env = Probe(probes.show_hidden, lambda hidden, action: 0.0 * hidden, 4)
-    learner = make_learner(env, config)
-    state, metrics = jax.jit(learner.update)(jax.jit(learner.init)(KEY))
+    config = settings(ppo={"epochs": 1, "minibatches": 2}, network__recurrent=False)
+    (_, state), (metrics,) = updated(Probe(probes.show_hidden, lambda hidden, action: 0.0 * hidden, 4), config, 1)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state.params)) and float(metrics["value_mean"]) == 0.0
     assert np.isfinite(float(metrics["explained_variance"]))

@@ -186,21 +186,20 @@ def test_a_compiled_robot_has_the_constants_of_its_data(name: str) -> None:
 
 
 def test_the_flock_is_that_of_a_plain_implementation() -> None:
-    random = np.random.default_rng(0)
-    sheep, speed, dogs = random.normal(size=(5, 2)), random.normal(size=(5, 2)), 1.5 * random.normal(size=(3, 2))
-    arrays = [jnp.asarray(x, jnp.float32) for x in (sheep, speed, dogs)]
-    law = lambda key, s: flock(key, *arrays, restlessness=s, step=0.1, friction=0.8)  # noqa: E731
-    half = 0.8 * GRAVITY * 0.1 / 2
+    """Five sheep and three robots; one of each, near (at the top speed) and about as far as a sheep sees."""
+    random, half = np.random.default_rng(0), 0.8 * GRAVITY * 0.1 / 2
+    several = random.normal(size=(5, 2)), random.normal(size=(5, 2)), 1.5 * random.normal(size=(3, 2))
+    pairs = [(np.zeros((1, 2)), np.zeros((1, 2)), np.array([[-apart, 0.0]])) for apart in (0.1, 0.5, 2.9, 3.1)]
 
     def slowed(v: np.ndarray) -> np.ndarray:
-        return v * max(1 - half / np.linalg.norm(v), 0.0)
+        return v * max(1 - half / max(np.linalg.norm(v), 1e-9), 0.0)
 
-    def plain(s: float, noise: np.ndarray) -> np.ndarray:
-        result = np.zeros((5, 2))
-        for i in range(5):
+    def plain(sheep: np.ndarray, speed: np.ndarray, dogs: np.ndarray, s: float) -> np.ndarray:
+        result, noise = np.zeros_like(sheep), np.asarray(jax.random.normal(KEY, sheep.shape))
+        for i in range(len(sheep)):
             v = slowed(speed[i]) + 2 * s * noise[i]
             inward = sheep.mean(0) - sheep[i]
-            v = v + s / 1.5 * inward / np.linalg.norm(inward)
+            v = v + s / 1.5 * inward / max(np.linalg.norm(inward), 1e-9)
             for dog in dogs:
                 away = sheep[i] - dog
                 near = math.hypot(*(away**2))
@@ -208,9 +207,10 @@ def test_the_flock_is_that_of_a_plain_implementation() -> None:
             result[i] = slowed(np.clip(v, -2, 2))
         return result
 
-    np.testing.assert_allclose(law(KEY, 0.0), plain(0.0, np.zeros((5, 2))), atol=1e-4)
-    noise = np.asarray(jax.random.normal(KEY, (5, 2)))
-    np.testing.assert_allclose(law(KEY, 0.3), plain(0.3, noise), atol=1e-4)
+    for numbers, s in ((several, 0.0), (several, 0.3), *((pair, 0.0) for pair in pairs)):
+        arrays = [jnp.asarray(x, jnp.float32) for x in numbers]
+        found = flock(KEY, *arrays, restlessness=s, step=0.1, friction=0.8)
+        np.testing.assert_allclose(found, plain(*numbers, s), atol=1e-4)
 
 
 def test_objects_have_the_masses_and_inertias_of_their_shapes() -> None:

@@ -25,7 +25,7 @@ from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests import training as probes
-from tests.training import Probe
+from tests.training import Probe, updated
 
 KEY = jax.random.PRNGKey(0)
 N = 4
@@ -66,11 +66,10 @@ class Help:
 def test_environments_get_the_assistance_of_the_schedule() -> None:
     values: dict[str, Any] = {"num_envs": N, "rollout_steps": 2, "total_steps": 80, "ppo": {"epochs": 1}}
     values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5}}
-    learner = make_learner(Help(), build(TrainConfig, {**values, "network": {"recurrent": False}}))
-    state, update = jax.jit(learner.init)(KEY), jax.jit(learner.update)
-    for assistance in (0.8, 0.64, 0.48, 0.32, 0.16, 0.0):  # annealed to 0 within 5 of 10 updates
-        state, metrics = update(state)
-        assert float(metrics["pay"]) == pytest.approx(assistance, abs=1e-6) == float(metrics["assistance"])
+    config = build(TrainConfig, {**values, "network": {"recurrent": False}})
+    rows = updated(Help(), config, 6)[1]
+    for row, assistance in zip(rows, (0.8, 0.64, 0.48, 0.32, 0.16, 0.0), strict=True):  # to 0 in 5 of 10 updates
+        assert float(row["pay"]) == pytest.approx(assistance, abs=1e-6) == float(row["assistance"])
 
 
 def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp_path: Path) -> None:
@@ -130,23 +129,26 @@ def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> N
 # -- leagues and tournaments -------------------------------------------------------------------------------------------
 
 
-def test_a_member_joins_with_the_learners_rating_and_weights() -> None:
+def test_a_member_joins_in_a_free_place_or_that_of_the_member_beaten_most() -> None:
+    """Every fourth update, or the next one at a win rate; with the learner's rating and weights."""
     env: Any = object.__new__(league.League)
-    env._roster, env._members = league.Roster(("older", "idle")), 2
-    settings = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=1.0)
-    env._config = SimpleNamespace(league=settings, steps_per_update=4)
-    full = pool.new_pool({"x": jnp.zeros(1)}, 2)._replace(born=jnp.array([0, 1]), score=jnp.array([9.0, 5.0]))
-    full = full._replace(games=jnp.full(2, 9.0), rating=jnp.array([1.0, 2.0]))
-    for member, place in (([1, 0], 0), ([0, 1], 1)):
-        blocks = jnp.array(member, jnp.int32)
+    env._roster, env._members = league.Roster(("older", "idle")), 3
+    full = pool.new_pool({"x": jnp.zeros(1)}, 3)._replace(score=jnp.array([9.0, 5.0, 1.0]))
+    full = full._replace(games=jnp.full(3, 9.0), rating=jnp.array([1.0, 2.0, 3.0]))
+    for born, member, place in (([0, 1, 2], [1, 0], 0), ([0, 1, 2], [0, 1], 1), ([0, 1, -1], [1, 0], 2)):
+        full, blocks = full._replace(born=jnp.array(born)), jnp.array(member, jnp.int32)
         state = league.LeagueState(full, blocks, blocks, jnp.float32(55.0), jnp.int32(2), jnp.zeros((2, 3)), KEY)
-        assert env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(5)).pool.born.tolist() == [0, 1]
-        after = env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(6))
-        assert int(after.snapshot) == int(after.pool.born[place]) == 6
-        assert float(after.pool.rating[place]) == 55.0 and float(after.pool.arrays["x"][place, 0]) == 1.0
-        other = 1 - place
-        assert [float(x[other]) for x in (after.pool.rating, after.pool.games)] == [1.0 + other, 9.0]
-        assert float(after.pool.games[place]) == float(after.pool.score[place]) == 0.0
+        for win_rate, due in ((1.0, 6), (0.4, 3)):
+            settings = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=win_rate)
+            env._config = SimpleNamespace(league=settings, steps_per_update=4)
+            before, after = (env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(now)) for now in (due - 1, due))
+            assert before.pool.born.tolist() == born and int(before.snapshot) == 2
+            assert int(after.snapshot) == int(after.pool.born[place]) == due
+            assert float(after.pool.rating[place]) == 55.0 and float(after.pool.arrays["x"][place, 0]) == 1.0
+            assert float(after.pool.games[place]) == float(after.pool.score[place]) == 0.0
+            for other in {0, 1, 2} - {place}:
+                found = [float(x[other]) for x in (after.pool.rating, after.pool.games, after.pool.arrays["x"][:, 0])]
+                assert found == [1.0 + other, 9.0, 0.0] and int(after.pool.born[other]) == born[other]
 
 
 class Matches:

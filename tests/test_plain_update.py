@@ -64,8 +64,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 class Teacher:
-    """A policy that acts by two of the numbers that an agent observes."""
-
     def initial_memory(self, num_envs: int) -> tuple[()]:
         return ()
 
@@ -287,7 +285,6 @@ class Plain:
         return jnp.where(jnp.abs(x) < delta, 0.5 * x**2, delta * jnp.abs(x) - 0.5 * delta**2)
 
     def learn(self, minibatches: np.ndarray) -> tuple[Any, float, list[Any], float]:
-        """Parameters, learning rate, Adam's moments and the schedule's factor; see also `metrics`."""
         optimizer, state = self.config.optimizer, self.state
         params, moments, count = state.params, [state.optimizer.mean, state.optimizer.square], 3
         factor = 1.0

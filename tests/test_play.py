@@ -43,7 +43,6 @@ TASK = "go1sheep-easy"
 
 
 def write(task: str, folder: Path) -> SimpleNamespace:
-    """Writes the page of a task, without libraries; returns its entry, its settings, their folder and the page's."""
     (entry,) = entries([task])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(site, "add_libraries", lambda folder, source: None)
@@ -228,8 +227,6 @@ def test_the_page_in_webassembly_agrees_with_the_environment(page: Path, built: 
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
-    """A file server that prints nothing."""
-
     def log_message(self, format: str, *args: Any) -> None:
         pass
 

@@ -81,7 +81,6 @@ def test_a_shipped_policy_does_what_its_card_says() -> None:
 
 
 def policy_of(target: str, **options: Any) -> Any:
-    """The policy of all agents of `mqe eval TARGET`."""
     return players(**override(Eval(target=target, impl="c"), options).playing).policy
 
 

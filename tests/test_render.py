@@ -153,7 +153,6 @@ def longest(flags: np.ndarray) -> int:
 
 
 def check(env: Any, episode: Episode, view: str = "follow") -> None:
-    """Checks that the cameras of a view show all targets and the goal, unhidden, and move smoothly."""
     model = geometry.rendering_model(env.mj_model, episode)
     views = cameras.cameras(model, episode, view, ASPECT)
     assert in_frame(model, episode, views).all(axis=1).mean() >= 0.95

@@ -40,7 +40,6 @@ def tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
 
 @pytest.fixture
 def lifted() -> Iterator[Robot]:
-    """A registered variant: a Go1 that is heavier and stands higher."""
     trunk = dataclasses.replace(GO1.trunk, mass=6.0)
     joints = GO1.default_joints.reshape(4, 3) * [1.0, 0.8, 0.8]
     robot = dataclasses.replace(
@@ -53,6 +52,16 @@ def lifted() -> Iterator[Robot]:
 @pytest.mark.parametrize(("name", "mass"), [("go1", 11.31), ("go2", 15.21)])
 def test_mass_is_the_published_one(name: str, mass: float) -> None:
     assert compiled(robots.get(name)).model.body_mass.sum() == pytest.approx(mass, abs=0.05)
+
+
+def test_parts_have_the_masses_and_inertias_of_a_go1() -> None:
+    model = compiled(GO1).model
+    assert model.body("robot0/trunk").mass[0] == pytest.approx(4.8)
+    np.testing.assert_allclose(tensor(model, "trunk"), GO1.trunk.matrix(), atol=1e-6)
+    np.testing.assert_allclose(model.body("robot0/FL_thigh").ipos, [-0.0035, -0.0189, -0.0327])
+    calf = model.body("robot0/RL_calf")
+    assert calf.mass[0] == pytest.approx(0.158 + 0.06)
+    assert calf.ipos[2] == pytest.approx((0.158 * -0.1223 + 0.06 * -0.213) / 0.218)
 
 
 @pytest.mark.parametrize("name", list(robots.ROBOTS))
@@ -172,6 +181,3 @@ def test_missing_walk_weights_say_how_to_make_them() -> None:
             make("go1gate", impl="c", robot="new", control=control)
     finally:
         del robots.ROBOTS["new"]
-
-
-# -- terrain -----------------------------------------------------------------------------------------------------------

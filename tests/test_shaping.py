@@ -29,7 +29,6 @@ def compiled(task: str, **params: Any) -> tuple[Any, Any]:
 
 
 def resets(task: str, assistance: float, **params: Any) -> tuple[Any, State]:
-    """64 initial states of a task with position control on the C engine."""
     env, reset = compiled(task, **params)
     return env, reset(jax.random.split(jax.random.PRNGKey(3), 64), assistance)
 
@@ -245,13 +244,11 @@ def test_episodes_start_in_demonstrated_states(rollout: Any) -> None:
 
 
 def test_without_assistance_episodes_start_as_the_task_does(rollout: Any) -> None:
-    """With assistance 0 no episode starts in a recorded state."""
     _, (step, _, done) = rollout[1]["none"]
     assert np.asarray(done).any() and not np.asarray(step)[np.asarray(done)].any()
 
 
 def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> None:
-    """30% of the starts."""
     demonstrations, (_, qpos, done) = rollout[1]["few"]
     moments = {tuple(np.asarray(q)) for q in demonstrations["data"]["qpos"]}
     starts = [tuple(np.asarray(qpos[t, i])) in moments for t, i in np.argwhere(np.asarray(done))]

@@ -54,7 +54,6 @@ def config_of(task: str, algorithm: str) -> TrainConfig:
 
 
 def of_train(task: str, algorithm: str) -> TrainConfig:
-    """The settings of `mqe train TASK`."""
     return setup.for_task(setup.base_config(task, None), task)
 
 

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train_run import settings
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
@@ -25,7 +24,7 @@ from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
 from tests.inputs import refuses
 from tests.test_opponents import matches
-from tests.training import Probe, content, differences
+from tests.training import Probe, content, differences, settings
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4, max_episode_steps=6)  # none ends at first
 

@@ -1,8 +1,9 @@
 """The learner and evaluations on probe environments with known solutions."""
 
+import functools
 import runpy
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,42 +11,16 @@ import numpy as np
 import pytest
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import build, override
-from mqe_jax.core.types import Batch, VectorEnv
+from mqe_jax.core.types import Batch
 from mqe_jax.policies import SimplePolicy
-from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.stages import Stages
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, assert_same
+from tests.training import FAST, Probe, settings, updated
 
-
-def small(**values: Any) -> TrainConfig:
-    """Returns settings that learn a probe in seconds; a double underscore is a dot: `ppo__clip=0.1`."""
-    settings = {
-        "num_envs": 32,
-        "total_steps": 100_000,
-        "rollout_steps": 8,
-        "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
-        "optimizer.learning_rate": 1e-2,
-        "network": {"hidden_sizes": (16,), "gru_size": 8, "recurrent": False, "log_std_init": -1.0},
-    }
-    return override(build(TrainConfig, settings), {name.replace("__", "."): value for name, value in values.items()})
-
-
-def learn(
-    env: VectorEnv, config: TrainConfig, updates: int, stages: type[Stages] = Stages
-) -> tuple[TrainState, dict[str, jax.Array]]:
-    """Runs updates and returns the last state and metrics."""
-    learner = make_learner(env, config, stages=stages)
-    state = jax.jit(learner.init)(jax.random.PRNGKey(0))
-    update = jax.jit(learner.update)
-    metrics = {}
-    for _ in range(updates):
-        state, metrics = update(state)
-    return state, metrics
+small = functools.partial(settings, FAST)
 
 
 VARIANTS = {
@@ -79,7 +54,8 @@ class NotedHappo(Happo, Noted):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     env = Probe(probes.show_hidden, probes.pay_sum_and_difference, num_envs=32)
-    _, metrics = learn(env, small(**VARIANTS[variant]), 60, NotedHappo if variant == "happo" else Stages)
+    stages = NotedHappo if variant == "happo" else Stages
+    metrics = updated(env, small(**VARIANTS[variant]), 60, stages=stages)[1][-1]
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
     assert float(metrics["ended"]["episode_length"]) == 4.0
     if variant == "happo":
@@ -97,57 +73,27 @@ def test_an_environment_of_two_teams_is_refused() -> None:
 def test_memory_carries_a_sign_through_an_episode() -> None:
     env = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=32)
     config = small(network__recurrent=True, network__chunk_length=4, stagger_episodes=True)
-    _, metrics = learn(env, config, 50)
+    metrics = updated(env, config, 50)[1][-1]
     assert float(metrics["average_step_reward"]) > -0.06  # without a recurrent state at best -0.19
 
 
-class CountingProbe(Probe):
-    """A probe that counts how often its step is traced."""
-
-    traces = 0
-
-    def step(self, state: probes.ProbeState, action: jax.Array) -> probes.ProbeState:
-        CountingProbe.traces += 1
-        return super().step(state, action)
-
-
-class OnePass(NamedTuple):
-    """What updates of a single gradient step gave."""
-
-    traces: list[int]
-    states: list[TrainState]
-    metrics: list[dict[str, jax.Array]]
-    first_again: dict[str, jax.Array]
-
-
 @pytest.fixture(scope="module")
-def one_pass() -> OnePass:
+def one_pass() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
     """Runs updates of one epoch over one batch, with a recurrent network; odd environments have longer episodes."""
-    env = CountingProbe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
-    learner = make_learner(
-        env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo={"epochs": 1, "minibatches": 1})
-    )
-    update = jax.jit(learner.update)
-    states, all_metrics, traces = [jax.jit(learner.init)(jax.random.PRNGKey(0))], [], []
-    for _ in range(3):
-        state, metrics = update(states[-1])
-        states.append(state)
-        all_metrics.append(metrics)
-        traces.append(CountingProbe.traces)
-    return OnePass(traces, states, all_metrics, update(states[0])[1])
+    env = Probe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
+    once = {"epochs": 1, "minibatches": 1}
+    return updated(env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo=once), 3)
 
 
-def test_a_chunk_repeats_the_rollout(one_pass: OnePass) -> None:
-    for metrics in one_pass.metrics:
+def test_a_chunk_repeats_the_rollout(one_pass: Any) -> None:
+    for metrics in one_pass[1]:
         assert abs(float(metrics["approx_kl"])) < 1e-6
         assert float(metrics["clip_fraction"]) == 0.0
 
 
-def test_update_is_traced_once_and_pure(one_pass: OnePass) -> None:
-    assert len(set(one_pass.traces)) == 1
-    assert [int(state.updates) for state in one_pass.states] == [0, 1, 2, 3]
-    assert len({tuple(state.key.tolist()) for state in one_pass.states}) == 4, "a random key is used again"
-    assert_same(one_pass.metrics[0], one_pass.first_again)
+def test_updates_are_counted_and_take_new_random_keys(one_pass: Any) -> None:
+    assert [int(state.updates) for state in one_pass[0]] == [0, 1, 2, 3]
+    assert len({tuple(state.key.tolist()) for state in one_pass[0]}) == 4
 
 
 def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,8 +115,6 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
 
 
 class Recurrent:
-    """A teacher with a recurrent state."""
-
     act = None
 
     def initial_memory(self, num_envs: int) -> Any:

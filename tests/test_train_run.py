@@ -1,7 +1,6 @@
 """A complete training run: run folder, resuming, failures to write, evaluation, loaded policies."""
 
 import contextlib
-import csv
 import dataclasses
 import resource
 import shutil
@@ -16,12 +15,11 @@ import pytest
 from safetensors.numpy import load_file
 
 from mqe_jax.core.errors import InputError, NonFiniteError
-from mqe_jax.core.settings import build, override, to_mapping
+from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
-from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
@@ -31,35 +29,15 @@ from mqe_jax.train.runner import train
 from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, assert_same
+from tests.training import Probe, assert_same, assert_same_run, rows, settings
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 KEY = jax.random.PRNGKey(0)
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 
 
-def settings(**values: Any) -> TrainConfig:
-    defaults = {
-        "num_envs": 4,
-        "total_steps": 5 * 16,
-        "rollout_steps": 4,
-        "ppo": {"epochs": 2, "minibatches": 2},
-        "network": {"hidden_sizes": (4,), "gru_size": 4},
-        "normalization": {"observations": True},
-        "optimizer": {"schedule": "linear"},
-        "checkpoint": {"every": 2},
-    }
-    return override(build(TrainConfig, defaults), {name.replace("__", "."): value for name, value in values.items()})
-
-
-def rows(run_dir: Path) -> list[dict[str, str]]:
-    with (run_dir / "metrics.csv").open() as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture(scope="module")
 def straight(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
-    """A complete training run: its folder and its last state."""
     run_dir = tmp_path_factory.mktemp("runs") / "straight"
     return run_dir, train(PROBE, settings(), run_dir)
 
@@ -86,15 +64,9 @@ def test_a_killed_training_resumes_as_if_never_stopped(
     capsys.readouterr()
     state = train(PROBE, settings(), run_dir, resume=True)
     assert_same(state, expected)
-    policies = {(folder / "policy.safetensors").read_bytes() for folder in (run_dir, straight_dir)}
-    assert len(policies) == 1
     told = capsys.readouterr()
     assert told.out == "" and "80 of 80 steps, reward" in told.err
-    timed = {"seconds", "fps"}
-    for row, expected_row in zip(rows(run_dir), rows(straight_dir), strict=True):
-        assert {k: v for k, v in row.items() if k not in timed} == {
-            k: v for k, v in expected_row.items() if k not in timed
-        }
+    assert_same_run(straight_dir, run_dir)
     assert [int(row["env_steps"]) for row in rows(run_dir)] == [16, 32, 48, 64, 80]
 
 
@@ -243,7 +215,6 @@ def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path)
 
 
 def spoil(path: Path, kind: str) -> None:
-    """Writes NaN into the first weight of a saved file."""
     arrays, metadata = checkpoints._read(path, kind)
     arrays[next(name for name in arrays if name.endswith("weight"))][0] = np.nan
     save_tree(path, arrays, metadata, kind=kind)

@@ -27,7 +27,6 @@ from mqe_jax.view.server import authorities, open_server, refusal
 
 @pytest.fixture(scope="module")
 def shown() -> Iterator[SimpleNamespace]:
-    """The panel of two environments with two robots each, without a scene."""
     server = open_server("127.0.0.1", free_port(), "test")
     run = session(Driven())
     panel = Panel(server, run, ("robot 1", "robot 2"), lambda: None)

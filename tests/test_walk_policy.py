@@ -258,7 +258,6 @@ def test_slope_turns_gravity() -> None:
 
 
 def test_shipped_policy_walks() -> None:
-    """Three seconds at 0.8 m/s: the robot does not fall and tracks its speed."""
     from mqe_jax.walk.evaluation import Scenario, measure
 
     task = WalkTask(randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6)

@@ -15,13 +15,13 @@ from mqe_jax.core.types import NetworkMemory
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import JOINT_NAMES
-from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.learner import TrainState
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.walk.network import WALK_FORM, WalkNetwork, windows
 from mqe_jax.walk.training import WALK
 from mqe_jax.walk_policy import WalkMemory
 from tests.inputs import refuses
-from tests.training import Probe, random_params
+from tests.training import Probe, random_params, updated
 
 ALL = np.arange(walk_policy.HISTORY)
 DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, values=1)
@@ -69,13 +69,7 @@ def settings(**changes: Any) -> Any:
 def history() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
     """States and metrics of four updates of one gradient step, the first two of the critic alone."""
     config = settings(total_steps=4 * 48, ppo={"epochs": 1, "minibatches": 1, "critic_warmup": 0.5})
-    learner = make_learner(probe(), config)
-    update, states, rows = jax.jit(learner.update), [jax.jit(learner.init)(jax.random.PRNGKey(0))], []
-    for _ in range(4):
-        state, metrics = update(states[-1])
-        states.append(state)
-        rows.append(metrics)
-    return states, rows
+    return updated(probe(), config, 4)
 
 
 def test_a_chunk_repeats_the_rollout(history: Any) -> None:

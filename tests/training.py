@@ -1,4 +1,4 @@
-"""For tests of training: physics-free environments with known solutions; comparisons of trees and of runs.
+"""For tests of training: physics-free environments with known solutions, settings, comparisons of trees and of runs.
 
 `python -m tests.training RUN_A RUN_B [--rename OLD=NEW ...]` compares two runs bit for bit: every metric but times, and
 every array of policy and last checkpoint. It exits with 1 and names the first difference of each kind. With `--rename`,
@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import argparse
 import csv
+import functools
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from safetensors.numpy import load_file
 
+from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Outcome, Params
 from mqe_jax.train.checkpoint import latest
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.networks import Network
 
 
@@ -121,7 +125,6 @@ class Probe:
 
 
 def show_hidden(hidden: jax.Array, step: jax.Array) -> jax.Array:
-    """Shows the sign in every step."""
     return hidden[:, None]
 
 
@@ -131,7 +134,6 @@ def show_hidden_first(hidden: jax.Array, step: jax.Array) -> jax.Array:
 
 
 def pay_one(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Reward 1 for every action."""
     return jnp.ones_like(hidden)
 
 
@@ -161,12 +163,74 @@ def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
     return -jnp.square(action[:, 0, 0] - action[:, 1, 0])
 
 
+SHORT = {
+    "num_envs": 4,
+    "total_steps": 5 * 16,
+    "rollout_steps": 4,
+    "ppo": {"epochs": 2, "minibatches": 2},
+    "network": {"hidden_sizes": (4,), "gru_size": 4},
+    "normalization": {"observations": True},
+    "optimizer": {"schedule": "linear"},
+    "checkpoint": {"every": 2},
+}
+"""Five updates."""
+FAST = {
+    "num_envs": 32,
+    "total_steps": 100_000,
+    "rollout_steps": 8,
+    "ppo": {"epochs": 4, "minibatches": 2, "entropy_coef": 0.0},
+    "optimizer": {"learning_rate": 1e-2},
+    "network": {"hidden_sizes": (16,), "gru_size": 8, "recurrent": False, "log_std_init": -1.0},
+}
+"""A probe is learned in seconds."""
+
+
+def settings(defaults: Mapping[str, Any] = SHORT, **values: Any) -> TrainConfig:
+    """Returns settings of a training; in a name a double underscore is a dot: `ppo__clip=0.1`."""
+    return override(build(TrainConfig, defaults), {name.replace("__", "."): value for name, value in values.items()})
+
+
+def updated(env: Any, config: TrainConfig, count: int, seed: int = 0, **options: Any) -> tuple[list[Any], list[Any]]:
+    """Returns the states of a training from the first one on, and the metrics of its updates; one trace, no effects."""
+    learner, traces = make_learner(env, config, **options), []
+
+    @jax.jit
+    def update(state: Any) -> Any:
+        traces.append(state)
+        return learner.update(state)
+
+    states, metrics = [jax.jit(learner.init)(jax.random.PRNGKey(seed))], []
+    first = update(states[0])[1]
+    for _ in range(count):
+        state, row = update(states[-1])
+        states.append(state)
+        metrics.append(row)
+    assert len(traces) == 1
+    assert_same(first, metrics[0])
+    return jax.block_until_ready(states), metrics  # while the environment exists
+
+
 def random_params(network: Network, seed: int = 0) -> Params:
     """Parameters of a network drawn by NumPy, matrices of gain 1; the network's `init` takes long to compile."""
     random = np.random.default_rng(seed)
     scale = lambda x: x.shape[-2] ** -0.5 if x.ndim > 1 else 0.1  # noqa: E731
     shapes = jax.eval_shape(network.init, jax.random.PRNGKey(0))
     return jax.tree.map(lambda x: jnp.asarray(scale(x) * random.normal(size=x.shape), x.dtype), shapes)
+
+
+def export_error(policy: Any, env: Any) -> float:
+    """Returns the largest error of the graph of a policy, for random inputs of five environments at once."""
+    from mqe_jax.export import translate
+    from mqe_jax.export.check import errors
+    from mqe_jax.export.policy import input_shapes, policy_step
+
+    random, shapes = np.random.default_rng(0), input_shapes(policy, env)
+    inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
+    step = functools.partial(policy_step, policy, env)
+    expected = jax.device_get(jax.jit(jax.vmap(step))(inputs))
+    found = errors(translate.translate(step, shapes, "test"), inputs, expected)
+    assert found.keys() == expected.keys()
+    return max(found.values())
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -201,7 +265,6 @@ def content(run: Path) -> dict[str, np.ndarray]:
 
 
 def differences(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> list[str]:
-    """Returns one line for each entry that differs."""
     found = [f"{name}: only in one run" for name in first.keys() ^ second.keys()]
     for name in first.keys() & second.keys():
         a, b = first[name], second[name]
@@ -222,7 +285,6 @@ def assert_same_run(one: Path, other: Path) -> None:
 
 
 def main() -> int:
-    """Prints the differences; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs=2, type=Path)
     parser.add_argument("--rename", nargs="*", default=[], metavar="OLD=NEW")

@@ -69,7 +69,6 @@ class Panel:
 
     @property
     def seconds(self) -> float:
-        """Simulated time, s."""
         return float(self.values["state"].split(" at ")[1].split(" s")[0])
 
 
