@@ -163,22 +163,6 @@ def test_commands_seat_them(policies: Any, tmp_path: Path) -> None:
     assert cli.main([*words, "-o", str(tmp_path / "t")]) == 0
 
 
-@pytest.mark.parametrize(
-    ("parameters", "said"),
-    [
-        ({"skill": ("walk", "agil")}, r"skill: unknown name 'agil' .did you mean 'agile'"),
-        ({"skill": ("walk", "walk")}, r"skill: \('walk', 'walk'\) is not allowed; .* several distinct names"),
-        ({"skill": ()}, r"skill: \(\) is not allowed"),
-        ({"skill": BOTH, "skill_weights": "x"}, r"skill_weights: 'x' is not allowed; of several skills"),
-        ({"skill": BOTH, "commands": ("vx", "skill")}, r"commands: \('vx', 'skill', 'skill'\) must be .*distinct"),
-        ({"skill": BOTH, "command_ranges": {"skill": (-0.5, 1)}}, r"command_ranges: unknown command 'skill'"),
-        ({"skill": BOTH, "gait": "canter"}, r"gait: unknown name 'canter'.*pace"),
-    ],
-)
-def test_what_several_skills_do_not_allow_is_named(parameters: Any, said: str) -> None:
-    refuses(said, make, "go1plane", impl="c", num_envs=1, **parameters)
-
-
 def test_ranges_for_which_no_skill_is_trained_warn() -> None:
     make("go1plane", impl="c", num_envs=1, skill=BOTH, command_ranges={"vx": (-1.5, 2.5)})
     with pytest.warns(

@@ -129,27 +129,6 @@ def test_graphs_of_tasks_need_the_skill_of_npc_robots(weights: str) -> None:
     refuses("skill: 'agile' is not allowed", TaskFunctions, env)
 
 
-@pytest.mark.parametrize(
-    ("ranges", "message"),
-    [
-        ({"vz": (-1, 1)}, r"command_ranges: unknown command 'vz' .did you mean 'v.'.*allowed: vx, vy, yaw_rate"),
-        ({"roll": (-0.1, 0.1)}, r"command_ranges: unknown command 'roll'.*allowed: vx, vy, yaw_rate"),
-        ({"vx": (0.5, 1.0)}, r"command_ranges.vx: \(0.5, 1.0\) .*lowest < highest, with the default 0 between"),
-        ({"vx": (-1.0, -0.5)}, r"command_ranges.vx: .*default 0 between"),
-        ({"vx": (0.0, 0.0)}, r"command_ranges.vx: .*lowest < highest"),
-        ({"vx": (1.0, -1.0)}, r"command_ranges.vx: .*\(lowest, highest\), in this order"),
-        ({"vx": (-1.0, float("inf"))}, r"command_ranges.vx"),
-        ({"vx": (True, 1.0)}, r"command_ranges.vx"),
-        ({"vx": 1.0}, r"command_ranges.vx: 1.0 is not allowed; it must be a list$"),
-        ({"vx": (1.0,)}, r"command_ranges.vx.1: is missing$"),
-        ({"vx": (-1.0, 0.5, 1.0)}, r"command_ranges.vx: .* at most 2 "),
-        ({"vy": (-0.2, 0.5)}, r"command_ranges.vy: \(-0.2, 0.5\) .*symmetric in go1revolvingdoor"),
-    ],
-)
-def test_bad_ranges_are_named(ranges: Any, message: str) -> None:
-    refuses(message, make, "go1revolvingdoor", impl="c", num_envs=1, command_ranges=ranges)
-
-
 def test_ranges_beyond_training_warn() -> None:
     with pytest.warns(UserWarning, match=r"'walk' was not trained for vx \[-1.5, 2\] outside \[-1.2, 1.2\]$") as found:
         make("go1gate", impl="c", num_envs=1, command_ranges={"vx": (-1.5, 2), "vy": (-0.6, 0.6)})

@@ -154,31 +154,60 @@ def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate
         assert np.abs(np.asarray(jax.jit(gate.reset)(key).data.qpos - after.data.qpos)).max() > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: make("go1gat"), r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\); allowed: go1plane, go1gate"),
-        (lambda: make("go1gate", impl="mjx"), r"impl: unknown engine 'mjx'.*allowed: auto, warp, c, jax"),
-        (lambda: make("go1gate", control="comand"), r"control: unknown mode 'comand' \(did you mean 'command'\?\)"),
-        (lambda: make("go1gate", gate_widht=1.0), r"gate_widht: unknown name .*did you mean 'gate_width'"),
-        (lambda: make("go1gate", gate_width=4.0), r"gate_width: 4.0 .* less than the width of the track, 3.0"),
-        (lambda: make("go1gate", gate_random=(0.5, -0.1)), r"gate_random: \(0.5, -0.1\)|gate_random.*-0.1"),
-        (lambda: make("go1gate", randomization={"payload": (-9, 1)}), r"randomization.payload: .*mass of the trunk"),
-        (
-            lambda: make("go1gate", control="torque", randomization={"motor_offset": 0.1}),
-            r"randomization.motor_offset: 0.1 .*0 with control torque",
-        ),
-        (lambda: make("go1plane", randomization={"joint_mechanics": (0.5, 2.0)}), "randomization.joint_mechanics"),
-        (lambda: make("go1seesaw", plank_start=-0.3), r"plank_start: -0.3 .*within \+-plank.limit"),
-        (lambda: make("go1revolvingdoor", gap=1.5), r"door.size: .*narrower than the gap, 1.5"),
-        (lambda: make("go1bridge", platform_x=(3.0, 4.0)), r"platform_x: .*more than a platform's length"),
-        (lambda: make("go1gate", num_agents=3), r"num_agents: 3; go1gate requires 2"),
-        (lambda: make("go1plane", gait="gallop"), r"gait: unknown name 'gallop'"),
-        (lambda: make("go1plane", skill_weights="/nowhere"), r"walk policy: no file /nowhere"),
-    ],
-)
-def test_bad_parameters_are_named(call: Any, message: str) -> None:
-    refuses(message, call)
+BOTH = ("walk", "agile")
+RANGES: list[tuple[dict[str, Any], str]] = [
+    ({"vz": (-1, 1)}, r"command_ranges: unknown command 'vz' .did you mean 'v.'.*allowed: vx, vy, yaw_rate"),
+    ({"roll": (-0.1, 0.1)}, r"command_ranges: unknown command 'roll'.*allowed: vx, vy, yaw_rate"),
+    ({"vx": (0.5, 1.0)}, r"command_ranges.vx: \(0.5, 1.0\) .*lowest < highest, with the default 0 between"),
+    ({"vx": (-1.0, -0.5)}, r"command_ranges.vx: .*default 0 between"),
+    ({"vx": (0.0, 0.0)}, r"command_ranges.vx: .*lowest < highest"),
+    ({"vx": (1.0, -1.0)}, r"command_ranges.vx: .*\(lowest, highest\), in this order"),
+    ({"vx": (-1.0, float("inf"))}, r"command_ranges.vx"),
+    ({"vx": (True, 1.0)}, r"command_ranges.vx"),
+    ({"vx": 1.0}, r"command_ranges.vx: 1.0 is not allowed; it must be a list$"),
+    ({"vx": (1.0,)}, r"command_ranges.vx.1: is missing$"),
+    ({"vx": (-1.0, 0.5, 1.0)}, r"command_ranges.vx: .* at most 2 "),
+    ({"vy": (-0.2, 0.5)}, r"command_ranges.vy: \(-0.2, 0.5\) .*symmetric in go1revolvingdoor"),
+]
+"""Command ranges of the revolving door that are refused, and what is said."""
+REFUSED: list[tuple[str, dict[str, Any], str]] = [
+    ("go1gat", {}, r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\); allowed: go1plane, go1gate"),
+    ("go1gate", {"impl": "mjx"}, r"impl: unknown engine 'mjx'.*allowed: auto, warp, c, jax"),
+    ("go1gate", {"control": "comand"}, r"control: unknown mode 'comand' \(did you mean 'command'\?\)"),
+    ("go1gate", {"gate_widht": 1.0}, r"gate_widht: unknown name .*did you mean 'gate_width'"),
+    ("go1gate", {"gate_width": 4.0}, r"gate_width: 4.0 .* less than the width of the track, 3.0"),
+    ("go1gate", {"gate_random": (0.5, -0.1)}, r"gate_random: \(0.5, -0.1\)|gate_random.*-0.1"),
+    ("go1gate", {"randomization": {"payload": (-9, 1)}}, r"randomization.payload: .*mass of the trunk"),
+    (
+        "go1gate",
+        {"control": "torque", "randomization": {"motor_offset": 0.1}},
+        r"randomization.motor_offset: 0.1 .*0 with control torque",
+    ),
+    ("go1plane", {"randomization": {"joint_mechanics": (0.5, 2.0)}}, "randomization.joint_mechanics"),
+    ("go1seesaw", {"plank_start": -0.3}, r"plank_start: -0.3 .*within \+-plank.limit"),
+    ("go1revolvingdoor", {"gap": 1.5}, r"door.size: .*narrower than the gap, 1.5"),
+    ("go1bridge", {"platform_x": (3.0, 4.0)}, r"platform_x: .*more than a platform's length"),
+    ("go1gate", {"num_agents": 3}, r"num_agents: 3; go1gate requires 2"),
+    ("go1plane", {"gait": "gallop"}, r"gait: unknown name 'gallop'"),
+    ("go1plane", {"skill_weights": "/nowhere"}, r"walk policy: no file /nowhere"),
+    ("go1plane", {"skill": ("walk", "agil")}, r"skill: unknown name 'agil' .did you mean 'agile'"),
+    ("go1plane", {"skill": ("walk", "walk")}, r"skill: \('walk', 'walk'\) is not allowed; .* several distinct names"),
+    ("go1plane", {"skill": ()}, r"skill: \(\) is not allowed"),
+    ("go1plane", {"skill": BOTH, "skill_weights": "x"}, r"skill_weights: 'x' is not allowed; of several skills"),
+    (
+        "go1plane",
+        {"skill": BOTH, "commands": ("vx", "skill")},
+        r"commands: \('vx', 'skill', 'skill'\) must be .*distinct",
+    ),
+    ("go1plane", {"skill": BOTH, "command_ranges": {"skill": (-0.5, 1)}}, r"command_ranges: unknown command 'skill'"),
+    ("go1plane", {"skill": BOTH, "gait": "canter"}, r"gait: unknown name 'canter'.*pace"),
+    *(("go1revolvingdoor", {"command_ranges": ranges}, said) for ranges, said in RANGES),
+]
+
+
+@pytest.mark.parametrize(("task", "parameters", "said"), REFUSED)
+def test_bad_parameters_are_named(task: str, parameters: dict[str, Any], said: str) -> None:
+    refuses(said, make, task, **parameters)
 
 
 def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -14,7 +13,6 @@ from test_policies import StandAndLean
 from mqe_jax import cli, load_policy, make
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
-from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.policies import zoo
 from mqe_jax.skills import SKILLS
 from mqe_jax.train.config import TrainConfig
@@ -100,6 +98,7 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
         ("go1revolvingdoor", "command", {"recurrent": True, "share_policy": False, "action_mean": "tanh"}),
         ("go1revolvingdoor", "position", {"recurrent": False, "activation": "elu", "hidden_sizes": [32, 16]}),
         ("go1gate", "torque", {"recurrent": True, "activation": "tanh", "gru_size": 24, "openrl_layers": True}),
+        ("go1gate", "torque", {"name": "mat", "heads": 2, "blocks": 2}),  # agents act one after another
     ],
 )
 def test_networks_memories_and_controls_agree(task: str, control: str, network: dict[str, Any]) -> None:
@@ -121,16 +120,6 @@ def test_a_graph_holds_the_skill_of_the_task(
     policy = new_policy(env, recurrent=False)
     assert memory.items() <= input_shapes(policy, env).items()
     assert export_error(policy, env) < 2e-5
-
-
-def stub_env(agents: int) -> Any:
-    sizes = {"num_agents": agents, "observation_size": 7, "privileged_observation_size": 0, "action_size": 12}
-    return SimpleNamespace(name="none", control="torque", robot=GO1, reset=None, step=None, **sizes)
-
-
-def test_agents_of_mat_act_one_after_another() -> None:
-    env = stub_env(2)
-    assert export_error(new_policy(env, "torque", name="mat", heads=2, blocks=2), env) < 2e-5
 
 
 @pytest.mark.soak

@@ -145,18 +145,13 @@ def test_commands_apply_what_a_shipped_policy_needs(tmp_path: Path, monkeypatch:
     assert "agile: vx -1.5 to 2.5" in capfd.readouterr().out
 
 
-def test_a_policy_is_shipped_with_its_card(tmp_path: Path) -> None:
-    card = override(zoo.card("go1gate"), {"mode": "deterministic"})
-    file = zoo.ship(load_policy("go1gate"), card, tmp_path)
-    assert file == tmp_path / "go1gate.safetensors"
-    assert load_policy(file).metadata["card"]["mode"] == "deterministic" and load_policy(file).deterministic
-
-
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_a_policy_file_holds_its_mode(deterministic: bool, tmp_path: Path) -> None:
-    policy = dataclasses.replace(load_policy("go1gate"), deterministic=deterministic)
-    file = save_policy(tmp_path / "new" / "folder", policy)
-    assert load_policy(file).deterministic is deterministic and load_policy(file, deterministic=True).deterministic
+def test_policy_files_hold_their_mode_and_card(tmp_path: Path) -> None:
+    policy = load_policy("go1gate")
+    file = zoo.ship(policy, override(zoo.card("go1gate"), {"mode": "deterministic"}), tmp_path)
+    assert file == tmp_path / "go1gate.safetensors" and load_policy(file).metadata["card"]["mode"] == "deterministic"
+    for written, deterministic in ((file, True), (save_policy(tmp_path / "new" / "folder", policy), False)):
+        assert load_policy(written).deterministic is deterministic
+        assert load_policy(written, deterministic=True).deterministic
 
 
 def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:

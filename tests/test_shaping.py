@@ -33,64 +33,52 @@ def resets(task: str, assistance: float, **params: Any) -> tuple[Any, State]:
     return env, reset(jax.random.split(jax.random.PRNGKey(3), 64), assistance)
 
 
-def object_xy(env: Any, states: State, name: str) -> np.ndarray:
-    return np.asarray(states.data.qpos)[:, env.objects[name].qpos[:2]]
+def moved(task: str, name: str, assistance: float, head_start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far assistance moves robots (64, R, 2) and an object (64, 2) at the reset, m, and where it is without."""
+    env, plain = resets(task, 0.0, head_start=head_start)
+    before, after = (np.asarray(x.data.qpos) for x in (plain, resets(task, assistance, head_start=head_start)[1]))
+    item = env.objects[name].qpos[:2]
+    return (after - before)[:, env.index.base_qpos[:, :2]], (after - before)[:, item], before[:, item]
 
 
-def robots_x(env: Any, states: State) -> np.ndarray:
-    return np.asarray(states.data.qpos)[:, env.index.base_qpos[: env.num_agents, 0]]
-
-
-@pytest.mark.parametrize("task", [BOX, BALL])
-def test_assistance_moves_nothing_without_a_head_start(task: str) -> None:
-    plain, assisted = (np.asarray(resets(task, a)[1].data.qpos) for a in (0.0, 1.0))
-    np.testing.assert_array_equal(plain, assisted)
+@pytest.mark.parametrize(("task", "name"), [(BOX, "box"), (BALL, "ball")])
+def test_assistance_moves_nothing_without_a_head_start(task: str, name: str) -> None:
+    robots, item, _ = moved(task, name, 1.0, 0.0)
+    assert not robots.any() and not item.any()
 
 
 def test_box_and_robots_start_further_by_the_same_distance() -> None:
-    env, states = resets(BOX, 0.5, head_start=0.9)
-    plain = resets(BOX, 0.0, head_start=0.9)[1]
-    moved = object_xy(env, states, "box") - object_xy(env, plain, "box")
-    np.testing.assert_allclose(robots_x(env, states) - robots_x(env, plain), np.tile(moved[:, :1], 2), atol=1e-6)
-    assert not moved[:, 1].any()
-    assert moved[:, 0].min() >= 0 and 0.4 < moved[:, 0].max() <= 0.45
+    robots, box, _ = moved(BOX, "box", 0.5, 0.9)
+    np.testing.assert_allclose(robots, np.stack([box, box], axis=1), atol=1e-6)
+    assert not box[:, 1].any() and box[:, 0].min() >= 0 and 0.4 < box[:, 0].max() <= 0.45
 
 
-def test_a_box_does_not_start_inside_the_gate() -> None:
+def test_head_starts_have_room() -> None:
     refuses(r"head_start: 1.0 .* at most 0.95", make, BOX, impl="c", head_start=1.0)
     assert make(BOX, impl="c", num_envs=1, box_x=4.5).params.head_start == 0  # where there is no room for any
+    refuses(r"head_start: 0.7 .* at most 0.60", make, SUMO, impl="c", head_start=0.7)
 
 
 def test_ball_and_robots_start_nearer_to_the_goal() -> None:
-    env, states = resets(BALL, 1.0, head_start=0.9)
-    plain = resets(BALL, 0.0, head_start=0.9)[1]
-    before, after = object_xy(env, plain, "ball"), object_xy(env, states, "ball")
-    share = (after - before)[:, 0] / (GOAL - before)[:, 0]
-    np.testing.assert_allclose(after, before + share[:, None] * (GOAL - before), atol=1e-5)
+    robots, ball, before = moved(BALL, "ball", 1.0, 0.9)
+    share = ball[:, :1] / (GOAL - before)[:, :1]
+    np.testing.assert_allclose(ball, share * (GOAL - before), atol=1e-5)
     assert share.min() >= 0 and 0.8 < share.max() <= 0.9
-    np.testing.assert_allclose(
-        robots_x(env, states) - robots_x(env, plain), np.tile((after - before)[:, :1], 2), atol=1e-5
-    )
-    defender = env.index.base_qpos[2]
-    np.testing.assert_array_equal(states.data.qpos[:, defender], plain.data.qpos[:, defender])
+    np.testing.assert_allclose(robots[:, :2, 0], np.tile(ball[:, :1], 2), atol=1e-5)
+    assert not robots[:, 2].any()  # the defender
 
 
 def test_ball_and_attackers_start_nearer_to_either_goal() -> None:
-    env, states = resets(DUEL, 1.0, head_start=0.8)
-    plain = resets(DUEL, 0.0, head_start=0.8)[1]
-    moved = (object_xy(env, states, "ball") - object_xy(env, plain, "ball"))[:, 0]
-    assert moved.min() < -3.0 and moved.max() > 3.0 and abs(moved).max() <= 4.0
-    expected = np.where(moved[:, None] > 0, [1.0, 0.0], [0.0, 1.0]) * moved[:, None]
-    np.testing.assert_allclose(robots_x(env, states) - robots_x(env, plain), expected, atol=1e-6)
+    robots, ball, _ = moved(DUEL, "ball", 1.0, 0.8)
+    way = ball[:, :1]
+    assert way.min() < -3.0 and way.max() > 3.0 and abs(way).max() <= 4.0
+    np.testing.assert_allclose(robots[..., 0], np.where(way > 0, [1.0, 0.0], [0.0, 1.0]) * way, atol=1e-6)
 
 
 def test_wrestlers_start_nearer_to_the_edge() -> None:
-    env, states = resets(SUMO, 1.0, head_start=0.5)
-    plain = resets(SUMO, 0.0, head_start=0.5)[1]
-    moved = (states.data.qpos - plain.data.qpos)[:, env.index.base_qpos[:, 1]]
-    np.testing.assert_allclose(moved[:, 0], moved[:, 1], atol=1e-6)
-    assert -0.5 <= moved.min() < -0.4 and 0.4 < moved.max() <= 0.5
-    refuses(r"head_start: 0.7 .* at most 0.60", make, SUMO, impl="c", head_start=0.7)
+    side = moved(SUMO, "platform", 1.0, 0.5)[0][..., 1]
+    np.testing.assert_allclose(side[:, 0], side[:, 1], atol=1e-6)
+    assert -0.5 <= side.min() < -0.4 and 0.4 < side.max() <= 0.5
 
 
 def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, float]:
