@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 import json
 import pathlib
+import pickle
 import time
 from typing import Any
 
@@ -84,30 +85,18 @@ def ahead(obs: jax.Array) -> jax.Array:
     return jnp.zeros((len(obs), 3)).at[:, 0].set(0.5)
 
 
-def record(task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int | None = None) -> dict[str, np.ndarray]:
+def record(task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int | None = None) -> dict[str, Any]:
     """Reference trajectories of the C engine under those actions: initial states, and qpos (T, 2 N, nq).
 
     The first half of the environments have standing robots, the others are in play.
     """
-    env, states = settled(task, num_envs, seed, solver_iterations)
-    twice = lambda x, y: jnp.concatenate([jnp.asarray(x), jnp.asarray(y, x.dtype)])  # noqa: E731
-    first = {name: getattr(states.data, name) for name in STATE_FIELDS}
-    data = {name: twice(first[name], field) for name, field in played(task, num_envs, seed).items()}
-    others = jax.tree.map(lambda x: twice(x, x), without_data(states))
-    base = jax.tree.map(lambda x: twice(x, x), states.data)
-    states = State(data=base.replace(**data), **others)
-    return {
-        **{f"data/{name}": np.asarray(field) for name, field in data.items()},
-        **{f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(others))},
-        "seed": np.array(seed),
-        "solver_iterations": np.array(env.params.solver_iterations),
-        "qpos": np.asarray(rolled(env, states, actions_of(env, 2 * num_envs, seed))[1]),
-    }
-
-
-def without_data(states: State) -> dict[str, Any]:
-    """The fields of states that are not the physics engine's."""
-    return {field.name: getattr(states, field.name) for field in dataclasses.fields(State) if field.name != "data"}
+    env, standing = settled(task, num_envs, seed, solver_iterations)
+    fields = {n: x.astype(getattr(standing.data, n).dtype) for n, x in played(task, num_envs, seed).items()}
+    both = standing, dataclasses.replace(standing, data=standing.data.replace(**fields))
+    states = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), *both)
+    qpos = rolled(env, states, actions_of(env, 2 * num_envs, seed))[1]
+    more = {"seed": seed, "solver_iterations": env.params.solver_iterations}
+    return {"states": jax.device_get(states), "qpos": np.asarray(qpos), **more}
 
 
 def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
@@ -118,19 +107,15 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
         quaternion or joint angle (rad) of robots and of objects; over environments, the maximum after one step, and
         median, 90% and 99% quantile and maximum after 20 steps.
     """
-    num_envs = len(reference["data/qpos"])
-    env = comparable(task, engine, num_envs, int(reference["solver_iterations"]))
+    states, num_envs = reference["states"], len(reference["states"].step)
+    env = comparable(task, engine, num_envs, reference["solver_iterations"])
     fresh = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
-    fields = {name: jnp.asarray(reference[f"data/{name}"]) for name in STATE_FIELDS}
+    fields = {name: jnp.asarray(getattr(states.data, name)) for name in STATE_FIELDS}
     if engine == "c":
         shift = jax.random.uniform(jax.random.PRNGKey(3), fields["qpos"].shape, minval=-1e-6, maxval=1e-6)
         fields["qpos"] = fields["qpos"] + shift
-    data = fresh.data.replace(**fields)
-    parts = without_data(fresh)
-    leaves = [jnp.asarray(reference[f"leaf/{i}"]) for i in range(len(jax.tree.leaves(parts)))]
-    states = dataclasses.replace(fresh, data=data, **jax.tree.unflatten(jax.tree.structure(parts), leaves))
-    actions = actions_of(env, num_envs, int(reference["seed"]))
-    apart = np.abs(np.asarray(rolled(env, states, actions)[1]) - reference["qpos"])
+    states = dataclasses.replace(states, data=fresh.data.replace(**fields))
+    apart = np.abs(np.asarray(rolled(env, states, actions_of(env, num_envs, reference["seed"]))[1]) - reference["qpos"])
     robots = np.concatenate([env.index.base_qpos, env.index.joint_qpos], axis=1).ravel()
     rest = np.setdiff1d(np.arange(apart.shape[-1]), robots)
     figures = {}
@@ -161,14 +146,14 @@ def main() -> None:
     parser.add_argument("--solver-iterations", type=int, help="default: those of the task")
     options = parser.parse_intermixed_args()
     for task in options.tasks:
-        began, file = time.perf_counter(), options.folder / f"{task}.npz"
+        began, file = time.perf_counter(), options.folder / f"{task}.pickle"
         figures: dict[str, Any] = {}
         if options.what == "record":
             file.parent.mkdir(parents=True, exist_ok=True)
-            states: dict[str, Any] = record(task, options.num_envs, options.seed, options.solver_iterations)
-            np.savez_compressed(file, **states)
+            states = record(task, options.num_envs, options.seed, options.solver_iterations)
+            file.write_bytes(pickle.dumps(states))
         else:
-            apart = disagreement(task, options.engine, np.load(file))
+            apart = disagreement(task, options.engine, pickle.loads(file.read_bytes()))
             figures = {name: float(f"{value:.4g}") for name, value in apart.items()}
         seconds = round(time.perf_counter() - began)
         print(json.dumps({"task": task, "engine": options.engine, **figures, "s": seconds}), flush=True)

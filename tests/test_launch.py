@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 import pytest
-from safetensors.numpy import load_file
 
 from mqe_jax import cli
 from mqe_jax.cli import launch
@@ -25,21 +23,12 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.train.checkpoint import list_checkpoints
 from tests.inputs import refuses
 from tests.test_interrupts import updates, wait_for
-from tests.training import rows, without_progress
+from tests.training import assert_same_run, without_progress
 
 MQE = [sys.executable, "-m", "mqe_jax.cli"]
 TRAIN = ["train", "go1gate", "--impl", "c", "--control", "position", "--num-envs", "4", "--rollout-steps", "4"]
 TRAIN += ["--ppo.minibatches", "2", "--ppo.epochs", "2", "--ppo.groups", "2", "--network.hidden-sizes", "8"]
 TRAIN += ["--network.no-recurrent", "--checkpoint.every", "1", "--normalization.observations"]
-
-
-def differences(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, float]:
-    """Returns the largest difference of each array, relative to 1 or its largest number."""
-    assert one.keys() == other.keys()
-    assert all(one[name].shape == other[name].shape for name in one)
-    size = {name: max(1.0, float(np.max(np.abs(x.astype(float)), initial=0.0))) for name, x in one.items()}
-    wide = {name: (x.astype(float), other[name].astype(float)) for name, x in one.items()}
-    return {name: float(np.max(np.abs(a - b), initial=0.0)) / size[name] for name, (a, b) in wide.items()}
 
 
 # -- bad settings ------------------------------------------------------------------------------------------------------
@@ -122,29 +111,12 @@ def lines(said: str) -> list[str]:
     return list(without_progress(said.splitlines()))
 
 
-def content(run_dir: Path) -> dict[str, np.ndarray]:
-    return load_file(list_checkpoints(run_dir)[-1])
-
-
-def metrics(run_dir: Path) -> list[dict[str, float]]:
-    return [{name: float(x) for name, x in row.items()} for row in rows(run_dir)]
-
-
-def assert_equal_runs(one: Path, other: Path, tolerance: float) -> None:
-    """Learned arrays and metrics within the tolerance; at 0 everything, states of environments too."""
-    wrong = differences(content(one), content(other))
-    wrong = {name: x for name, x in wrong.items() if tolerance == 0.0 or not name.startswith("rollout/")}
-    assert max(wrong.values()) <= tolerance, sorted(wrong.items(), key=lambda item: -item[1])[:5]
-    for a, b in zip(metrics(one), metrics(other), strict=True):
-        assert a == pytest.approx(b, abs=max(tolerance, 0.0), rel=tolerance, nan_ok=True)
-
-
 def test_two_processes_equal_one(tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     steps = ["--total-steps", "16"]
     mqe("launch", "--processes", "2", *TRAIN, *steps, "--run-dir", str(two))
     assert cli.main([*TRAIN, *steps, "--run-dir", str(one)]) == 0
-    assert_equal_runs(one, two, 1e-5)
+    assert_same_run(one, two, 1e-5)
     assert sorted(path.name for path in one.rglob("*")) == sorted(
         path.name if "tfevents" not in path.name else next(one.rglob("*tfevents*")).name for path in two.rglob("*")
     )
@@ -159,7 +131,7 @@ def test_a_run_resumes_on_another_number_of_processes(tmp_path: Path) -> None:
             words = [*TRAIN, "--total-steps", steps, "--run-dir", str(tmp_path / name), "--resume"]
             mqe("launch", "--processes", count, *words)
     for name in ("12", "21"):
-        assert_equal_runs(tmp_path / "1", tmp_path / name, 1e-4)
+        assert_same_run(tmp_path / "1", tmp_path / name, 1e-4)
 
 
 @pytest.mark.soak
@@ -232,7 +204,7 @@ def test_the_slurm_file_of_the_documentation(tmp_path: Path) -> None:
     words = ["sh", str(file), *TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "two")]
     subprocess.run(words, check=True, env=environment, timeout=300)
     assert cli.main([*TRAIN, "--total-steps", "16", "--run-dir", str(tmp_path / "one")]) == 0
-    assert_equal_runs(tmp_path / "one", tmp_path / "two", 1e-5)
+    assert_same_run(tmp_path / "one", tmp_path / "two", 1e-5)
 
 
 def test_on_one_host_nobody_else_can_join() -> None:
