@@ -3,8 +3,6 @@
 Its `mj_model` has two jointed boxes that rendering treats as robots, between a fixed wall and two moving ones.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import sys
@@ -120,11 +118,11 @@ class FakeVectorEnv:
     def reset(self, key: jax.Array) -> FakeState:
         return jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
 
-    def with_groups(self, names: set[str]) -> FakeVectorEnv:
+    def with_groups(self, names: set[str]) -> Any:
         assert names <= {"policy"}
         return self
 
-    def share(self, parts: int) -> FakeVectorEnv:
+    def share(self, parts: int) -> Any:
         return FakeVectorEnv(self.env, self.num_envs // parts)
 
     def step(self, state: FakeState, action: jax.Array) -> FakeState:

@@ -1,7 +1,5 @@
 """Choice of skills: which one acts, what each remembers, policies of different skills in one match, refusals."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Command ranges: from actions to commands, scripted policies under other ranges, NPC robots, refusals."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -15,6 +15,7 @@ from mqe_jax.train.config import PPO, TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.rollout import minibatches
 from tests.inputs import refuses
+from tests.training import settings
 
 KEY = jax.random.PRNGKey(3)
 
@@ -96,17 +97,10 @@ def test_one_group_is_one_permutation() -> None:
 
 @pytest.mark.parametrize("network", ["actor_critic", pytest.param("mat", marks=pytest.mark.soak)])
 def test_two_shares_are_one_batch(network: str) -> None:
-    values: dict[str, Any] = {
-        "num_envs": 8,
-        "rollout_steps": 8,
-        "total_steps": 640,
-        "ppo": {"epochs": 2, "minibatches": 2, "groups": 2},
-        "normalization": {"observations": True},
-        "optimizer": {"target_kl": 0.01},
-        "network": {"name": network}
-        | ({"hidden_sizes": (8,), "chunk_length": 4} if network != "mat" else {"width": 8}),
-    }
-    config = build(TrainConfig, values)
+    own = {"width": 8} if network == "mat" else {"hidden_sizes": (8,), "chunk_length": 4}
+    ppo = {"epochs": 2, "minibatches": 2, "groups": 2}
+    sizes = {"num_envs": 8, "rollout_steps": 8, "total_steps": 640, "ppo": ppo}
+    config = settings(**sizes, optimizer__target_kl=0.01, network={"name": network, **own})
     whole = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 8), config)
     share = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4), config, processes=2)
 

@@ -1,7 +1,5 @@
 """The Python API: `learn` is `mqe train`, `evaluate` is `mqe eval`, `render` draws; what they return."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +29,6 @@ from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content, updated
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 SOURCES = ("newest", "older", "uniform", "idle")
 SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}

@@ -1,7 +1,5 @@
 """The environment core against plain numpy: what is drawn, what is observed, who has fallen, what is rewarded."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -131,7 +129,7 @@ def test_randomised_parameters_reach_their_fields_of_the_model(box: Any, resets:
 class Speeds:
     qvel: jax.Array
 
-    def replace(self, **values: Any) -> Speeds:
+    def replace(self, **values: Any) -> Any:
         return dataclasses.replace(self, **values)
 
 

@@ -9,14 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.core.settings import build
 from mqe_jax.core.types import NetworkMemory
-from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import Needs
 from mqe_jax.train.networks import ActorCritic, EnvDims, Mat
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy
-from tests.training import random_params
+from tests.training import random_params, settings
 
 KEY = jax.random.PRNGKey(0)
 
@@ -146,14 +144,8 @@ def test_actions_are_drawn_from_the_distribution_they_are_weighed_by(kind: str) 
 
 def test_a_policy_normalises_scales_and_clips() -> None:
     dims = EnvDims(agents=2, observation=3, privileged=1, action=2, values=2)
-    config = build(
-        TrainConfig,
-        {
-            "action_scale": 0.5,
-            "normalization": {"observations": True},
-            "network": {"recurrent": False, "hidden_sizes": [4], "action_gain": 3.0, "log_std_init": -1.0},
-        },
-    )
+    network = {"recurrent": False, "action_gain": 3.0, "log_std_init": -1.0}
+    config = settings(action_scale=0.5, network=network)
     network = config.network.build(dims)
     params = network.policy_params(jax.jit(network.init)(KEY))
     statistics = RunningStatistics(jnp.full(3, 0.5), jnp.full(3, 4.0), jnp.float32(9.0))

@@ -25,7 +25,7 @@ from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests import training as probes
-from tests.training import Probe, updated
+from tests.training import Probe, settings, updated
 
 KEY = jax.random.PRNGKey(0)
 N = 4
@@ -74,8 +74,7 @@ def test_environments_get_the_assistance_of_the_schedule() -> None:
 
 def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp_path: Path) -> None:
     env = Probe(probes.show_hidden, probes.pay_one, N)
-    values: dict[str, Any] = {"num_envs": N, "rollout_steps": 4, "checkpoint": {"environments": False}}
-    config = build(TrainConfig, {**values, "network": {"recurrent": False}})
+    config = settings(checkpoint__environments=False, network__recurrent=False)
     learner, processes = own_learner(env, config)
     shared = SeedBatch(learner.init, 1).shared
     start, _ = first_state(env, learner, processes, config, None, shared)
@@ -94,15 +93,7 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
     env = Probe(probes.show_hidden, probes.pay_near_hidden, N)
     results = []
     for seed in (0, 1):
-        values: dict[str, Any] = {
-            "num_envs": N,
-            "seed": seed,
-            "evaluation": {"every": 1, "episodes": N},
-            "ppo": {"minibatches": 1},
-        }
-        config = build(
-            TrainConfig, {**values, "network": {"recurrent": False, "hidden_sizes": [4]}, "rollout_steps": 4}
-        )
+        config = settings(seed=seed, evaluation={"every": 1, "episodes": N}, network__recurrent=False)
         state = jax.jit(make_learner(env, config).init)(KEY)
         policy = policy_of(state, env, config)
         one, two = Monitor(env, config).evaluate([policy, policy], [3, 5], N)
@@ -139,8 +130,8 @@ def test_a_member_joins_in_a_free_place_or_that_of_the_member_beaten_most() -> N
         full, blocks = full._replace(born=jnp.array(born)), jnp.array(member, jnp.int32)
         state = league.LeagueState(full, blocks, blocks, jnp.float32(55.0), jnp.int32(2), jnp.zeros((2, 3)), KEY)
         for win_rate, due in ((1.0, 6), (0.4, 3)):
-            settings = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=win_rate)
-            env._config = SimpleNamespace(league=settings, steps_per_update=4)
+            rules = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=win_rate)
+            env._config = SimpleNamespace(league=rules, steps_per_update=4)
             before, after = (env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(now)) for now in (due - 1, due))
             assert before.pool.born.tolist() == born and int(before.snapshot) == 2
             assert int(after.snapshot) == int(after.pool.born[place]) == due

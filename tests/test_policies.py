@@ -1,7 +1,5 @@
 """Shipped and scripted policies, and skills: a new one is one class, for agents and NPC robots alike."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

@@ -4,8 +4,6 @@
 and last checkpoint. It exits with 1 and names the first difference of each kind.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import functools

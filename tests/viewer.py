@@ -1,7 +1,5 @@
 """For tests of viewer and docs/play: a page in Chromium, a session without physics, a client."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil
@@ -9,7 +7,7 @@ import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +82,7 @@ class Client:
         self.socket = connect(f"ws://127.0.0.1:{port}", **options)
         self.socket.send(msgspec.msgpack.encode(CAMERA))
 
-    def __enter__(self) -> Client:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
