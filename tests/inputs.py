@@ -55,9 +55,6 @@ def refuses(said: str, call: Callable[..., Any], *arguments: Any, **named: Any) 
     assert "\n" not in text and len(text) <= LONGEST, text
 
 
-# -- settings ----------------------------------------------------------------------------------------------------------
-
-
 def records() -> dict[str, Any]:
     """Returns the records whose fields are settings, by name; those of a task are its parameters."""
     found: dict[str, Any] = {"training": TrainConfig, "sweep": Sweep, "walk": WalkTask}
@@ -102,8 +99,6 @@ def wrong_settings(draw: st.DrawFn) -> tuple[str, str, Any]:
     return name, field, draw(refused(fields[field]))
 
 
-# -- command lines -----------------------------------------------------------------------------------------------------
-
 TARGETS = {
     "train": ["fake"], "eval": ["fake"], "render": ["fake", "-o", "a.png"], "view": ["fake"], "bench": ["fake"],
     "export": ["fake", "--onnx", "a.onnx"], "replay": ["a.npz"],
@@ -136,9 +131,6 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
     texts = "--set= --set=gate_width= --set=task= --set=self= --seed= --policy= --config= --nope=".split()
     flag = draw(st.sampled_from([*texts, ""]))
     return [*words, flag + "nothing " * (not flag) + draw(text)]
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
 
 
 @st.composite

@@ -169,9 +169,6 @@ def test_every_task_is_registered() -> None:
     assert "SingleEnv<mqe/go1gate-v0>" in out.stdout
 
 
-# -- opponents in every adapter: the trainer sees team 0 alone ---------------------------------------------------------
-
-
 ENDS = 3
 
 

@@ -56,9 +56,6 @@ def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv, gate
     assert float(gate.outcome(state, one, fine)["one"]) == 1
 
 
-# -- endings of every task: a fall, the time limit, and a collision in the tasks that end on one -----------------------
-
-
 def ground_height(env: Any, x: float, y: float) -> float:
     """Height of the ground or object below (x, y), m."""
     model, data = env.compiled.model, mujoco.MjData(env.compiled.model)

@@ -172,9 +172,6 @@ def test_the_demo_makes_a_policy_of_its_real_task(tmp_path: Path, monkeypatch: p
         demo.demo(tmp_path / "run", str(settings), 4, "c")
 
 
-# -- examples and notebooks --------------------------------------------------------------------------------------------
-
-
 EXAMPLES = ROOT / "examples"
 
 

@@ -79,9 +79,6 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
     assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before
 
 
-# -- host functions in compiled programs, and programs that are stored ---------------------------------------------
-
-
 class Owner:
     """Keeps its functions alive."""
 

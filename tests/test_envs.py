@@ -264,9 +264,6 @@ def test_making_and_stepping_imports_no_foreign_library_and_no_other_task() -> N
     assert type(make("go1bridgewrestling", impl="c", control="position")) is TASKS["go1wrestling"]
 
 
-# -- actions, noise, layouts ------------------------------------------------------------------------------------------
-
-
 def test_captured_constants_are_arguments_in_compiled_code(gate: QuadrupedEnv, fresh: State) -> None:
     action, assistance = jnp.zeros((2, 12)), jnp.float32(0.5)
     after = jax.jit(lambda state: jax.lax.scan(lambda state, _: (gate.step(state, action), None), state, None, 2)[0])
@@ -303,9 +300,6 @@ def test_a_block_of_entities_says_who_is_there() -> None:
     with pytest.raises(KeyError, match="'own' has no entities"):
         layout.entities(packed, "own")
     assert [b.entities.kind for b in made("go1sheep-hard").observation_layout.blocks if b.entities] == ["sheep"]
-
-
-# -- recordings -------------------------------------------------------------------------------------------------------
 
 
 def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:

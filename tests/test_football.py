@@ -50,9 +50,6 @@ def standing(env: QuadrupedEnv, state: State, places: Any, roll: float = 0.0) ->
     return placed(env, np.c_[places[:, :2], np.full(len(places), 0.31)], euler, state=state)
 
 
-# -- the field --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str) -> None:
     env = envs[task]
@@ -105,8 +102,6 @@ def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
     assert model.body_mass[duel.objects["ball"].body] == pytest.approx(0.318)
 
 
-# -- observations -----------------------------------------------------------------------------------------------------
-
 PLACES = [(4.2, 0.7, 0.3), (9.1, -1.2, 2.8), (8.4, 2.2, -2.0), (10.6, 0.4, 3.0)]
 
 
@@ -137,9 +132,6 @@ def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> No
     ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
     np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *ball], atol=1e-5)
     np.testing.assert_allclose(obs[1], [0, 1, *info[1], *info[0], *ball], atol=1e-5)
-
-
-# -- goals, rewards, endings ------------------------------------------------------------------------------------------
 
 
 GOALS = {
@@ -258,9 +250,6 @@ def test_passes_and_goals_of_both(envs: dict[str, Any], fresh: Any, task: str, t
     outcome = env.result(state, env.read(state.data), NO)
     assert float(outcome.further["both_touched"][0]) == both
     assert outcome.further["passes"].tolist() == ([first, second] if task == TASKS[2] else [first])
-
-
-# -- the defender -----------------------------------------------------------------------------------------------------
 
 
 def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> None:

@@ -211,9 +211,6 @@ def test_an_environment_keeps_its_parameters() -> None:
     assert build.players(env, "idle").env.params == env.params
 
 
-# -- evaluation and clips ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("wins", "episodes", "low", "high"), [(0, 10, 0.0, 0.2775), (5, 10, 0.2366, 0.7634), (81, 263, 0.2553, 0.3662)]
 )

@@ -263,9 +263,6 @@ def test_bad_calls(
     assert list(tmp_path.iterdir()) == []
 
 
-# -- the list of bounds ------------------------------------------------------------------------------------------------
-
-
 def kinds() -> dict[str, Any]:
     return {name: kind for name, kind in vars(limits).items() if getattr(kind, "__origin__", None) in (int, float)}
 

@@ -31,9 +31,6 @@ TRAIN += ["--ppo.minibatches", "2", "--ppo.epochs", "2", "--ppo.groups", "2", "-
 TRAIN += ["--network.no-recurrent", "--checkpoint.every", "1", "--normalization.observations"]
 
 
-# -- bad settings ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
@@ -82,9 +79,6 @@ def test_a_mistake_that_all_processes_find_is_one_line(tmp_path: Path, capfd: py
             patch.setattr(launch, "PROGRAM", [sys.executable, "-c"])
             assert launch._supervise((script,), [{"INDEX": "0"}, {"INDEX": "1"}], together=True) == 1
         assert capfd.readouterr().err.splitlines() == ["mqe: num_envs: 3"]
-
-
-# -- processes ---------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -181,8 +175,6 @@ def test_the_process_that_was_killed_is_named_where_all_have_ended(monkeypatch: 
     assert launch._wait(both, lambda: None) == 137
     assert capfd.readouterr().err == "mqe: a process of the training was killed by SIGKILL; " + launch._RESUME + "\n"
 
-
-# -- several hosts -----------------------------------------------------------------------------------------------------
 
 SRUN = """#!/bin/sh
 # Two tasks with the variables of SLURM; a task that fails ends both.

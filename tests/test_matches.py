@@ -84,9 +84,6 @@ def test_actions_are_mirrored_where_left_and_right_are_swapped() -> None:
     np.testing.assert_allclose(turned.unmirror_action(jnp.tile(legs, (2, 1)))[1], legs[0])
 
 
-# ---------------------------------------------------------------- Push Cylinder
-
-
 def tug_state(env: Any, y: float, ends: tuple[float, float] = (-1.3, 1.63)) -> Any:
     """Robot 0 is 1.43 m and robot 1 1.5 m from the axis when the cylinder is at 0.13."""
     position = [[1.6, end, 0.3] for end in ends]
@@ -161,9 +158,6 @@ def test_a_duel_is_seen_by_both_in_their_own_frames(task: str) -> None:
     np.testing.assert_allclose(obs[1], [*mirrored[0], *mirrored[1]], atol=1e-5)
 
 
-# ---------------------------------------------------------------- Revolving Door
-
-
 def test_door_rewards_result_and_end() -> None:
     env = made("go1revolvingdoor")
     state = placed(env, [[3.9, 0.0, 0.3], [3.0, 0.5, 0.3]])
@@ -182,9 +176,6 @@ def test_door_rewards_result_and_end() -> None:
     both = placed(env, [[0.6, -1.0, 0.3], [0.6, 1.0, 0.3]])
     assert not stepped(env, both).terminated
     assert env.max_steps == 250
-
-
-# ---------------------------------------------------------------- Sumo Wrestling
 
 
 def ring(env: Any, first: Any, second: Any, roll: float = 0.0) -> Any:
@@ -229,9 +220,6 @@ def test_platforms_are_as_large_as_listed(task: str, name: str, size: Any) -> No
     env = made(task)
     found = 2 * env.compiled.model.geom(env.objects[name].geom).size
     np.testing.assert_allclose(found[: len(size)], size)
-
-
-# ---------------------------------------------------------------- Traverse Bridge
 
 
 def test_bridge_rewards_result_and_end() -> None:

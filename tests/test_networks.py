@@ -87,8 +87,6 @@ def test_unknown_names_get_the_nearest() -> None:
     refuses(r"config: unknown name 'deno' \(did you mean 'demo'", base_config, "go1gate", "deno")
 
 
-# -- the multi-agent transformer: sequential acting, parallel evaluation, deviation ----------------------------------
-
 KEY = jax.random.PRNGKey(0)
 NO_MEMORY = NetworkMemory((), ())
 

@@ -187,8 +187,6 @@ def test_an_engine_that_cannot_run_says_why(monkeypatch: pytest.MonkeyPatch) -> 
     refuses(r"impl 'warp' needs the package warp-lang", engines.resolve, "warp")
 
 
-# -- crowds: numbers of contacts against the sizes of Warp's buffers ------------------------------------------------
-
 MARGIN = 0.2  # m; from a trunk's centre to what stands beside it
 STACK = 0.35  # m; each robot starts that much above the one before
 

@@ -117,9 +117,6 @@ def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> N
         assert log.last_steps() == ([None, 5, 10][count])
 
 
-# -- leagues and tournaments -------------------------------------------------------------------------------------------
-
-
 def test_a_member_joins_in_a_free_place_or_that_of_the_member_beaten_most() -> None:
     """Every fourth update, or the next one at a win rate; with the learner's rating and weights."""
     env: Any = object.__new__(league.League)

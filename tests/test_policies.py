@@ -167,8 +167,6 @@ def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:
         save_policy(tmp_path, dataclasses.replace(policy, params=huge), half=True)
 
 
-# -- scripted policies: the registry of them, and actions on observations made by hand ---------------------------------
-
 SPEED = COMMANDS[0].gain  # m/s per unit of forward action
 
 

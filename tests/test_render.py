@@ -93,9 +93,6 @@ def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -
     assert env.mj_model.vis.global_.offwidth == before  # the model's own settings are left alone
 
 
-# -- rendering models and cameras --------------------------------------------------------------------------------------
-
-
 BODIES = (
     *(f"body_{name}" for name in ("mass", "inertia", "pos", "quat", "ipos", "iquat", "parentid")),
     *(f"jnt_{name}" for name in ("type", "pos", "axis", "range", "margin", "bodyid")),

@@ -125,9 +125,6 @@ def test_temporary_files_are_new_and_unpredictable(tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "foreign").exists()
 
 
-# -- files are written whole -------------------------------------------------------------------------------------------
-
-
 def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, seen = tmp_path / "policy.safetensors", []
     path.write_bytes(b"old")
@@ -145,9 +142,6 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
         temporary.write_bytes(b"ha")
         raise KeyError
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
-
-
-# -- several seeds in one program, evaluation during training ----------------------------------------------------------
 
 
 def seeded(seed: int, **values: Any) -> TrainConfig:

@@ -312,9 +312,6 @@ def test_legs_with_joint_mechanics_stay_finite(robot: str) -> None:
     assert 1.0 < fastest < 35.0
 
 
-# -- randomised physics and noise --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=pytest.mark.gpu)]
 )

@@ -215,9 +215,6 @@ def test_files(tmp_path: Path) -> None:
     refuses(r"missing\.yaml: cannot be read", load_yaml, tmp_path / "missing.yaml")
 
 
-# -- settings of a training -------------------------------------------------------------------------------------------
-
-
 def test_parameters_in_training_change_those_that_they_name() -> None:
     config = build(TrainConfig, {"env": {"rewards": {"collision": -5}}, "train_env": {"rewards": {"approach": 10}}})
     assert config.training_env == {"rewards": {"collision": -5, "approach": 10}}

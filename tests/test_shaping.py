@@ -15,7 +15,7 @@ from mqe_jax.envs import Moment, State, make
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.train.config import TrainConfig
 from tests.inputs import refuses
-from tests.states import terms_of
+from tests.states import initial, made, terms_of
 
 BOX, BALL, DUEL, SUMO = "go1pushbox", "go1football-defender", "go1football-1vs1", "go1wrestling"
 GOAL = np.array([12.0, 0.0])
@@ -88,8 +88,7 @@ def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, 
 
 
 def test_shaping_terms_of_push_box() -> None:
-    env, states = resets(BOX, 0.0)
-    state = jax.tree.map(lambda x: x[0], states)
+    env, state = made(BOX), initial(made(BOX))
     box, gate = env.objects["box"].qpos, float(state.anchors[0, 1])
     here = float(state.data.qpos[box[1]])
     nearer = terms_after(env, state, box[1:2], [here + 0.25 * (gate - here)])
@@ -103,8 +102,7 @@ def test_shaping_terms_of_push_box() -> None:
 
 
 def test_shaping_terms_of_football() -> None:
-    env, states = resets(BALL, 0.0)
-    state = jax.tree.map(lambda x: x[0], states)
+    env, state = made(BALL), initial(made(BALL))
     ball = env.objects["ball"].qpos[:2]
     here = np.asarray(state.data.qpos)[ball]
     moved = here + 0.1 * (GOAL - here)
@@ -117,8 +115,7 @@ def test_shaping_terms_of_football() -> None:
 
 
 def test_one_sided_shaping_of_a_football_match() -> None:
-    env, states = resets(DUEL, 0.0)
-    state = jax.tree.map(lambda x: x[0], states)
+    env, state = made(DUEL), initial(made(DUEL))
     ball = jnp.asarray(env.objects["ball"].qpos[:1])
 
     def moved(state: State, x: float) -> tuple[State, np.ndarray]:
@@ -140,8 +137,7 @@ def test_one_sided_shaping_of_a_football_match() -> None:
 
 def test_a_goal_of_both_needs_touches_of_both() -> None:
     """A robot beside the ball touches it where its velocity changes."""
-    env, states = resets(BALL, 0.0)
-    state = jax.tree.map(lambda x: x[0], states)
+    env, state = made(BALL), initial(made(BALL))
     ball, speed = env.objects["ball"].qpos[:2], env.objects["ball"].qvel[0]
 
     def kicked(
@@ -169,8 +165,6 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
     for before, end, goal in ((first, alone, 1.0), (alone, late, 0.0), (both, both, 0.0)):
         assert float(terms_of(env, before, end)[0]["first_goal"]) == goal
 
-
-# -- episodes that start in states of a demonstrator's episodes ---------------------------------------------------
 
 N = 32
 

@@ -115,8 +115,6 @@ def test_evaluations_take_the_place_of_training_rewards() -> None:
     assert cell.variant == "tuned" and list(run.curve["env_steps"]) == [20_000_000, 40_000_000]
 
 
-# -- statistics --
-
 # Of rliable 1.2.0: x, y and what it returns for them.
 PACKAGE: dict[str, Any] = {
     "seed": 7, "samples": 500, "thresholds": [-1.0, -0.25, 0.0, 0.5, 1.5],

@@ -50,9 +50,6 @@ def kinds(tree: Any) -> list[tuple[Any, ...]]:
     return [(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(tree)]
 
 
-# -- 64 bits, and no implicit promotion --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_the_loops_of_jax_step_every_task(task: str) -> None:
     with jax.enable_x64(False):
@@ -100,9 +97,6 @@ def test_networks_and_leagues_train_in_single_precision(learns: str) -> None:
         assert kinds(jax.eval_shape(learner.update, state)[0]) == kinds(state)
 
 
-# -- a whole training --------------------------------------------------------------------------------------------------
-
-
 def test_switches_do_not_change_a_training(tmp_path: Path) -> None:
     config = settings(rollout_steps=2, total_steps=32, network__recurrent=False)
     switches: dict[str, Callable[[], Any]] = {
@@ -123,9 +117,6 @@ def test_switches_do_not_change_a_training(tmp_path: Path) -> None:
         if values.dtype == np.float32:
             np.testing.assert_allclose(values, plain[name], rtol=1e-3, atol=1e-5, err_msg=name)
     assert results["x64"] == pytest.approx(results["plain"], rel=1e-3)
-
-
-# -- random keys -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("generator", ["threefry2x32", "rbg", "unsafe_rbg"])

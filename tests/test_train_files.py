@@ -135,8 +135,6 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     logs.check_loggers(("tensorboard",))
 
 
-# -- checkpoints: every leaf is kept, old ones go, damage is named -----------------------------------------------------
-
 TREE = {
     "a": jnp.arange(6.0).reshape(2, 3),
     "b": (jnp.array(True), jnp.uint32(7)),

@@ -244,9 +244,6 @@ def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> N
         viewer.server.stop()
 
 
-# -- the scene -------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Any]:
     """The scene of three environments of Narrow Gate, on a server without a page."""
