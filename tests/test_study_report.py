@@ -1,20 +1,23 @@
 """Reports from made-up runs: same data, same files; figures, tables and reference values. Statistics of few runs.
 
 The statistics are compared with the package `rliable` 1.2.0 on random matrices (`PACKAGE`), which samples its
-bootstrap from numpy's global state, seeded before each interval.
+bootstrap from numpy's global state, seeded before each interval. Names and errors of others are shown as they are.
 """
 
 import csv
 import dataclasses
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from mqe_jax.core.errors import InputError, one_line
+from mqe_jax.core.literal import to_html, to_markdown
 from mqe_jax.study import statistics
 from mqe_jax.study.estimates import band, evaluated, group, score_matrices
-from mqe_jax.study.report import write_report
+from mqe_jax.study.report import markdown, write_report
 from mqe_jax.study.runs import REWARD, Cell, Reference, Run
 from tests.inputs import refuses
 
@@ -190,3 +193,40 @@ def test_normalized_scores_are_fractions_of_a_tasks_range() -> None:
     scores = {"a": np.array([[1.0, 5.0]]), "b": np.array([[3.0, 5.0]])}
     result = statistics.normalize(scores, np.array([1.0, 5.0]), np.array([5.0, 5.0]))
     np.testing.assert_allclose(result["b"], [[0.5, 0.0]])
+
+
+EVIL = "<script>x</script> <img src=x onerror=y> ![a](b) [c](d) `e` *f* __g__ ~~h~~ | &lt; $\\bad$ \\ 'i' \"j\""
+
+
+class Seen(HTMLParser):
+    """The elements of a text of HTML, and its text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags, self.text = set[str](), ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.tags.add(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_nothing_is_markup_in_html_and_markdown() -> None:
+    markdown_it = pytest.importorskip("markdown_it")
+    read = markdown_it.MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
+    for page, tags in (
+        (to_html(EVIL), set()),
+        (f'<b title="{to_html(EVIL)}"></b>{to_html(EVIL)}', {"b"}),
+        (read.render(to_markdown(EVIL)), {"p"}),
+        (read.render(markdown([{"task": EVIL}])), {"table", "thead", "tbody", "tr", "th", "td"}),
+    ):
+        seen = Seen(page)
+        assert seen.tags == tags and EVIL in seen.text
+
+
+def test_a_terminal_gets_one_printable_line() -> None:
+    said = one_line(InputError("runs/\x1b]0;title\x07\n\u202egnp.\udcff: damaged"))
+    assert said == "runs/\\x1b]0;title\\x07 \\u202egnp.\\udcff: damaged"
