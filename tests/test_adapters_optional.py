@@ -37,6 +37,17 @@ def task_env(task: str) -> Any:
     return mqe_jax.make(task, impl="c", episode_length=LIMIT * 0.02)
 
 
+def check_episodes(start: Any, obs: Any, final_obs: Any, done: Any, truncation: Any) -> None:
+    """Episodes end at the limit, each with its last observation, and start anew elsewhere."""
+    ends = np.zeros((STEPS, COUNT), bool)
+    ends[LIMIT - 1 :: LIMIT] = True
+    np.testing.assert_array_equal(done, ends)
+    np.testing.assert_array_equal(truncation, ends)
+    np.testing.assert_array_equal(np.abs(obs - final_obs).max(-1) > 1e-3, ends)
+    for other in (start, obs[2 * LIMIT - 1]):
+        assert np.abs(obs[LIMIT - 1] - other).max(-1).min() > 1e-3
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_brax_rollout(task: str) -> None:
     brax = adapter("brax")
@@ -59,15 +70,8 @@ def test_brax_rollout(task: str) -> None:
     start, final, (obs, reward, done, truncation, final_obs, steps) = play(jax.random.PRNGKey(0))
     np.testing.assert_array_equal(start, final)
     assert obs.shape == (STEPS, COUNT, env.observation_size) and reward.shape == done.shape == (STEPS, COUNT)
-    ends = np.zeros((STEPS, COUNT))
-    ends[LIMIT - 1 :: LIMIT] = 1
-    np.testing.assert_array_equal(done, ends)
-    np.testing.assert_array_equal(truncation, ends)
     np.testing.assert_array_equal(steps[:, 0], [1, 2, 3, 1, 2, 3, 1])
-    np.testing.assert_array_equal(np.abs(obs - final_obs).max(-1) > 1e-3, ends == 1)
-    # Each episode has a new initial state, unlike under Brax's wrapper.
-    assert np.abs(obs[LIMIT - 1] - start).max(-1).min() > 1e-3
-    assert np.abs(obs[LIMIT - 1] - obs[2 * LIMIT - 1]).max(-1).min() > 1e-3
+    check_episodes(start, obs, final_obs, done, truncation)  # each anew, unlike under Brax's wrapper
 
 
 def test_brax_wrap_names_what_it_does_not_take() -> None:
@@ -140,18 +144,14 @@ def test_jaxmarl_rollout(task: str) -> None:
         return obs, jax.lax.scan(one, state, jax.random.split(key, STEPS))[1]
 
     start, (obs, final_obs, reward, done, info) = play(jax.random.PRNGKey(0))
-    ends = np.zeros((STEPS, COUNT), bool)
-    ends[LIMIT - 1 :: LIMIT] = True
     assert set(obs) == set(reward) == set(agents) and set(done) == {*agents, "__all__"}
-    for agent in (*agents, "__all__"):
-        np.testing.assert_array_equal(done[agent], ends)
+    for agent in agents:
+        np.testing.assert_array_equal(done[agent], done["__all__"])
     assert {value.shape for value in info.values()} == {(STEPS, COUNT, env.num_agents)}
-    np.testing.assert_array_equal(info["truncation"][..., 0], ends)
     np.testing.assert_array_equal(info["returned_episode_lengths"][LIMIT - 1], LIMIT)
     first = agents[0]
     assert obs[first].shape == (STEPS, COUNT, *spaces[first].shape)
-    np.testing.assert_array_equal(np.abs(obs[first] - final_obs[:, :, 0]).max(-1) > 1e-3, ends)
-    assert np.abs(obs[first][LIMIT - 1] - start[first]).max(-1).min() > 1e-3
+    check_episodes(start[first], obs[first], final_obs[:, :, 0], done["__all__"], info["truncation"][..., 0])
 
 
 @pytest.mark.parametrize("library", ["brax", "jaxmarl", "pettingzoo"])

@@ -14,12 +14,11 @@ import pytest
 
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import build, override
+from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory, Params
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.runs.presets import base_config, preset
 from mqe_jax.skills.agile import FRAME_SIZE, NOW_SIZE
-from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import NETWORKS, ActorCritic, EnvDims, Network
@@ -202,12 +201,6 @@ def probe(network: str) -> Any:
     return env
 
 
-def settings_of(network: dict[str, Any]) -> TrainConfig:
-    values = {"num_envs": 4, "total_steps": 3 * 16, "rollout_steps": 4, "ppo": {"epochs": 1, "minibatches": 2}}
-    values |= {"network": network, "normalization": {"observations": True}, "checkpoint": {"every": 1}}
-    return build(TrainConfig, {**values, "evaluation": {"every": 2, "episodes": 4}, "loggers": ()})
-
-
 def test_every_registered_network_is_here() -> None:
     assert walk_network.WalkNetwork is NETWORKS["walk"]
     assert set(VARIANTS) == {name for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")}
@@ -218,7 +211,8 @@ def test_every_registered_network_is_here() -> None:
 def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
     network: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    env, config = probe(network["name"]), settings_of(network)
+    once = {"checkpoint__every": 1, "evaluation": {"every": 2, "episodes": 4}, "ppo__epochs": 1, "total_steps": 3 * 16}
+    env, config = probe(network["name"]), settings(**once, loggers=(), network=network)
     configs = [config, override(config, {"seed": 1})]
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     folders = [[parent / name for name in ("seed0", "seed1")] for parent in (whole, stopped)]

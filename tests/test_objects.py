@@ -16,7 +16,7 @@ from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.inputs import refuses
-from tests.states import angles, initial, made, placed, terms_of, with_object
+from tests.states import angles, initial, made, observation, placed, terms_of, with_object
 
 STEP = 0.02
 
@@ -56,13 +56,10 @@ def test_sheep_observation(herd: Any) -> None:
     state = dataclasses.replace(initial(herd), anchors=jnp.array([[8.5, 0.4]]))
     for number in range(9):
         state = with_object(herd, state, f"sheep{number}", [number, -0.1 * number])
-    robots = herd.read(state.data)
-    obs = np.asarray(herd.observation_layout.pack(herd.observe(state, robots)))
-    info = np.asarray(robots.base_info)
+    obs, info = observation(herd, state), np.asarray(herd.read(state.data).base_info)
+    sheep = [place for number in range(9) for place in (number, -0.1 * number)]
     for agent in range(2):
-        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], 8.5, 0.4]
-        for number in range(9):
-            expected += [number, -0.1 * number]
+        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], 8.5, 0.4, *sheep]
         np.testing.assert_allclose(obs[agent], expected, atol=1e-6)
 
 
@@ -104,9 +101,7 @@ def test_pushbox_rewards_and_success(box_env: Any) -> None:
 
 def test_pushbox_observation(box_env: Any) -> None:
     state = with_object(box_env, initial(box_env), "box", [3.0, 0.4, 0.5, 0.8, 0, 0, 0.6])
-    robots = box_env.read(state.data)
-    obs = np.asarray(box_env.observation_layout.pack(box_env.observe(state, robots)))
-    info = np.asarray(robots.base_info)
+    obs, info = observation(box_env, state), np.asarray(box_env.read(state.data).base_info)
     for agent in range(2):
         expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], *np.asarray(state.anchors[0])]
         np.testing.assert_allclose(obs[agent], [*expected, 3.0, 0.4, 0.8, 0, 0, 0.6], atol=1e-6)

@@ -72,11 +72,7 @@ class Teacher:
 
 
 def config_of(name: str) -> TrainConfig:
-    merged = {
-        key: {**value, **SETTINGS[name].get(key, {})} if isinstance(value, dict) else value
-        for key, value in COMMON.items()
-    }
-    return build(TrainConfig, {**{k: v for k, v in SETTINGS[name].items() if k not in merged}, **merged})
+    return override(build(TrainConfig, COMMON), SETTINGS[name])
 
 
 def learner_of(env: Any, config: TrainConfig) -> learning.Learner:
