@@ -92,9 +92,7 @@ OUTPUTS = {
 
 @pytest.mark.parametrize("name", OUTPUTS)
 @pytest.mark.parametrize("kind", ["in no folder", "folder", "device", "long", "below a file"])
-def test_an_output_is_checked_before_the_work(
-    name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_is_checked_first(name: str, kind: str, tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
     monkeypatch.setattr(build, "make_env", lambda *_: pytest.fail("it was not checked first"))
     monkeypatch.setattr("mqe_jax.policies.load_policy", lambda *_: pytest.fail("it was not checked first"))
     os.mkfifo("fifo")

@@ -103,9 +103,7 @@ def test_contract(task: str, robot: str, control: str, count: int, steps: int) -
     assert len(traces) == 1
 
 
-def test_a_diverged_environment_ends_with_finite_numbers_and_is_counted(
-    gate: QuadrupedEnv, fresh: State, gate_step: Any
-) -> None:
+def test_a_diverged_environment_ends_and_is_counted(gate: QuadrupedEnv, fresh: State, gate_step: Any) -> None:
     state = fresh
     broken = dataclasses.replace(state, data=state.data.replace(qvel=state.data.qvel.at[0].set(jnp.nan)))
     after = gate_step(broken, jnp.zeros((2, 12)))

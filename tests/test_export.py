@@ -112,9 +112,7 @@ def test_networks_memories_and_controls_agree(task: str, control: str, network: 
     [("lean", ("roll", "pitch"), {"lean_lean": (2, 2)}),
      (("walk", "agile"), ("vx", "vy", "yaw_rate"), {"choice_acting": (2,), "choice_agile_frames": (2, 9, 39)})],
 )  # fmt: skip
-def test_a_graph_holds_the_skill_of_the_task(
-    skill: Any, commands: Any, memory: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_graph_holds_the_skill_of_the_task(skill: Any, commands: Any, memory: Any, monkeypatch: Any) -> None:
     monkeypatch.setitem(SKILLS, "lean", StandAndLean)
     env = make("go1gate", impl="c", num_envs=1, skill=skill, commands=commands)
     policy = new_policy(env, recurrent=False)

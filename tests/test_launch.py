@@ -54,9 +54,7 @@ def test_flags_that_do_not_fit(flags: list[str], said: str, capfd: pytest.Captur
         ),
     ],
 )
-def test_variables_that_srun_and_mpirun_do_not_set(
-    variables: dict[str, str], said: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_variables_that_srun_and_mpirun_do_not_set(variables: Any, said: str, monkeypatch: Any, capfd: Any) -> None:
     monkeypatch.delenv("SLURM_PROCID", raising=False)
     monkeypatch.setattr(os, "_exit", lambda code: None)
     for name, value in variables.items():

@@ -62,10 +62,8 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_a_league_begins_with_the_policy_it_starts_from_or_its_members(
-    resumed: bool, history: list[TrainState], tmp_path: Path
-) -> None:
-    """From a policy, or resumed without environments."""
+def test_a_league_begins_with_its_policies(resumed: bool, history: list[TrainState], tmp_path: Path) -> None:
+    """With that it starts from or, resumed without environments, with its members."""
     start: dict[str, Any] = {} if resumed else {"start": str(tmp_path)}
     config, state, file = config_of(**start), history[9], None
     league = League(matches(num_envs=8), SOURCES, config)

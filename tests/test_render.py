@@ -65,9 +65,7 @@ def test_the_side_view_follows_the_first_robot(env: Any, episode: recording.Epis
 
 
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4"])
-def test_clips_land_whole_without_gl(
-    env: Any, episode: recording.Episode, tmp_path: Path, capsys: Any, suffix: str
-) -> None:
+def test_clips_land_whole_without_gl(env: Any, episode: Episode, tmp_path: Path, capsys: Any, suffix: str) -> None:
     if suffix == ".mp4":
         pytest.importorskip("imageio_ffmpeg")
     file = tmp_path / f"clip{suffix}"

@@ -159,8 +159,8 @@ def test_ranges_beyond_training_warn() -> None:
         ({"needs.dims": EnvDims(1, 18, 108, 3, 1)}, "observation 18; .* has 19"),
     ],
 )
-def test_policies_that_need_something_else_are_refused(
-    field: str, changes: dict[str, Any], said: str, weights: str, monkeypatch: pytest.MonkeyPatch
+def test_policies_of_other_needs_are_refused(
+    field: str, changes: Any, said: str, weights: str, monkeypatch: Any
 ) -> None:
     """Each by name with both values, whether the policy is an object, a name or a file."""
     monkeypatch.setattr(TrainedPolicy, "__post_init__", lambda self: None)  # which checks the shapes of weights

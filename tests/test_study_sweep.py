@@ -5,7 +5,6 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -185,9 +184,7 @@ def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, 
     ],
     ids=["file", "empty folder", "other files", "report", "other sweep"],
 )
-def test_folders_are_checked_before_the_first_cell_trains(
-    make: Callable[[Path], object], message: str | None, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_folders_are_checked_before_the_first_cell_trains(make: Any, message: Any, tmp_path: Path, capfd: Any) -> None:
     load(tmp_path)
     (tmp_path / "study").mkdir()
     make(tmp_path / "study")

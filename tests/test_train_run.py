@@ -46,9 +46,7 @@ class Killed(Exception):
     pass
 
 
-def test_a_killed_training_resumes_as_if_never_stopped(
-    straight: tuple[Path, TrainState], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_killed_training_resumes_as_if_never_stopped(straight: Any, tmp_path: Path, capsys: Any) -> None:
     straight_dir, expected = straight
     run_dir = tmp_path / "killed"
 
@@ -97,9 +95,7 @@ def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> N
         ({"env": {"gate_width": 0.7}, "train_env": {"control": "torque"}}, r"train_env.control: 'torque' differs"),
     ],
 )
-def test_environments_with_other_parameters_than_the_settings_are_refused(
-    values: dict[str, Any], said: str, tmp_path: Path
-) -> None:
+def test_environments_with_other_parameters_are_refused(values: dict[str, Any], said: str, tmp_path: Path) -> None:
     batch = VectorEnv(make("go1gate", num_envs=4, gate_width=0.7), 4)
     refuses(said, train, batch, settings(**values), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -165,9 +161,7 @@ def largest_file(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_writer_that_fails_ends_the_training_and_names_its_file(
-    straight: tuple[Path, TrainState], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_writer_that_fails_ends_the_training_and_is_named(straight: Any, tmp_path: Path, monkeypatch: Any) -> None:
     """Every time the lock is released, nothing half-written stays, and the run resumes exactly."""
     pytest.importorskip("tensorboardX", reason="needs the extra log")
     limits = contextlib.ExitStack()

@@ -43,6 +43,7 @@ class ProbeState:
     metrics: dict[str, jax.Array]
     key: jax.Array
     step: jax.Array
+    active: Any = None
 
 
 @dataclass(frozen=True)
