@@ -30,8 +30,7 @@ from mqe_jax.train.runner import train
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
 from tests import training as probes
-from tests.archives import module, named, tensor, zipped
-from tests.inputs import refuses
+from tests.inputs import module, named, refuses, tensor, zipped
 from tests.training import Probe, settings
 
 

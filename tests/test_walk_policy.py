@@ -24,9 +24,8 @@ from mqe_jax.walk.env import WalkEnv, gravity_w
 from mqe_jax.walk.rewards import desired_contact
 from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk_policy import ADAPTATION_SIZES, BODY_SIZES
-from tests import archives
-from tests.archives import module, named
-from tests.inputs import refuses
+from tests import inputs
+from tests.inputs import module, named, refuses
 
 DOWN = jnp.array([0.0, 0.0, -1.0])
 SKILL = skills.make("walk", GO1)
@@ -68,7 +67,7 @@ def write_torchscript(
     def tensor(value: np.ndarray) -> bytes:
         files[key := str(len(files))] = value.tobytes()
         stride = tuple(int(np.prod(value.shape[i + 1 :])) for i in range(value.ndim))
-        return archives.tensor(value.shape, stride, key, value.size)
+        return inputs.tensor(value.shape, stride, key, value.size)
 
     def child(value: Any) -> bytes:
         if isinstance(value, str):
@@ -85,7 +84,7 @@ def write_torchscript(
     source = f"    _0 = __torch__.torch.nn.functional.elu(input, {alpha}, False, )\n    return _0\n"
     code = {"__torch__/torch/nn/modules/activation/___torch_mangle_3.py": source}
     whole = module(*(named(name, value) for name, value in children.items()), kind=root)
-    path.write_bytes(archives.zipped(b"\x80\x02" + whole + b".", files, code))
+    path.write_bytes(inputs.zipped(b"\x80\x02" + whole + b".", files, code))
 
 
 def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.Path) -> None:
