@@ -189,9 +189,7 @@ def test_jaxmarl_world_state_and_discrete_actions() -> None:
     space: Any = env.action_space("robot_0")
     assert space.n == 7
     table = [env._continuous(jnp.int32(i)) for i in range(7)]
-    np.testing.assert_array_equal(
-        table, [[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
-    )
+    np.testing.assert_array_equal(table, [[0, 0, 0], *np.kron(np.eye(3), [[1], [-1]])])
     integers = {agent: jnp.zeros(1, jnp.int32) for agent in env.agents}  # JaxMARL's MAPPO passes (1,)
     assert jax.eval_shape(env.step_env, jax.random.PRNGKey(0), state, integers)[1].obs.shape == state.obs.shape
     assert jax.eval_shape(env.get_avail_actions, state)["robot_1"].shape == (7,)

@@ -1,4 +1,4 @@
-"""Several processes: functions that span those of a training, as an axis of `vmap`; objects pickled for a spawned one."""
+"""Several processes: functions that span those of a training, as an axis of `vmap`; objects pickled for another one."""
 
 import pickle
 import subprocess

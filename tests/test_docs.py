@@ -204,21 +204,14 @@ def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: A
     np.testing.assert_allclose(pillar.pos[:2], [2.5, 0.0])
 
 
-def test_an_environment_of_ones_own_is_trained() -> None:
-    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "foreign_env.py"))
-    history = example["main"](num_envs=32, updates=25)
-    assert len(history) == 25 and history[-1] < 0.6 * history[0]
-
-
-def test_a_network_of_ones_own_is_trained() -> None:
+@pytest.mark.parametrize("network", [{}, {"network": {"name": "mean_field", "width": 32}}], ids=["shipped", "own"])
+def test_an_environment_of_ones_own_is_trained(network: dict[str, Any]) -> None:
     runpy.run_path(str(EXAMPLES / "custom_network.py"))
     try:
-        history = importlib.import_module("foreign_env").main(
-            num_envs=32, updates=25, network={"name": "mean_field", "width": 32}
-        )
+        history = importlib.import_module("foreign_env").main(num_envs=32, updates=25, **network)
     finally:
         NETWORKS.pop("mean_field")
-    assert history[-1] < 0.6 * history[0]
+    assert len(history) == 25 and history[-1] < 0.6 * history[0]
 
 
 def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:

@@ -133,9 +133,8 @@ def test_an_own_algorithm_is_trained_and_resumed() -> None:
 
 def test_seeds_are_trained_in_one_program_into_their_folders() -> None:
     runs = mqe_jax.learn_seeds("fake", FEW, seeds=(1, 3), run_dir="runs")
-    assert (
-        [run.config.seed for run in runs] == [1, 3] == [mqe_jax.load_run(f"runs/seed{n}").config.seed for n in (1, 3)]
-    )
+    written = [mqe_jax.load_run(f"runs/seed{seed}") for seed in (1, 3)]
+    assert [run.config.seed for run in runs] == [1, 3] == [run.config.seed for run in written]
     alone = mqe_jax.learn("fake", FEW, seed=3)
     columns = [{k: v for k, v in run.metrics.items() if k not in ("seconds", "fps")} for run in (runs[1], alone)]
     close = lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)  # noqa: E731

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mqe_jax import cli
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, override, to_mapping
 from mqe_jax.envs import make
 from mqe_jax.envs.wrappers import Deadline
@@ -27,6 +26,7 @@ from mqe_jax.train.needs import needs_of
 from mqe_jax.train.policy import policy_of, save_policy
 from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
+from tests.inputs import refuses
 from tests.test_opponents import KEY, MATCHES, SETTINGS, matches
 from tests.training import assert_same_run, content, updated
 
@@ -123,10 +123,11 @@ def test_the_time_limit_may_end_episodes_for_the_learner(task: str) -> None:
     np.testing.assert_allclose(state.privileged_obs[:, -1], 1.0)
 
 
-def test_a_pool_too_small_for_its_blocks_is_refused() -> None:
-    config = config_of(league={**SMALL, "members": 2})
-    with pytest.raises(InputError, match=r"league.members: 2 .*more than the blocks that play members, 2"):
-        League(matches(num_envs=8), SOURCES, config)
+def test_a_league_has_more_members_than_blocks_and_environments_of_its_own_process() -> None:
+    few = config_of(league={**SMALL, "members": 2})
+    refuses("league.members: 2 .*more than the blocks that play members, 2", League, matches(num_envs=8), SOURCES, few)
+    env = League(matches(num_envs=8), SOURCES, config_of()).env.share(2)
+    assert env.num_envs == env.inner.num_envs == 4
 
 
 def training(steps: int, *more: str) -> list[str]:
@@ -164,11 +165,6 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
     if task == "go1wrestling":
         assert dict(config.train_env) == {"frozen_time": 0.0, "rewards": {"push": 3.0, "approach": 1.0}}
     assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
-
-
-def test_a_process_has_a_league_of_its_own_environments() -> None:
-    env = League(matches(num_envs=8), SOURCES, config_of()).env.share(2)
-    assert env.num_envs == env.inner.num_envs == 4
 
 
 def test_ratings_recover_the_strengths_behind_many_games() -> None:

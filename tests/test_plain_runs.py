@@ -110,10 +110,8 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
         state = jax.jit(make_learner(env, config).init)(KEY)
         policy = policy_of(state, env, config)
         one, two = Monitor(env, config).evaluate([policy, policy], [3, 5], N)
-        assert (one["env_steps"], two["env_steps"]) == (3, 5) and one["sampled"] == two["sampled"] != one[
-            "deterministic"
-        ]
-        assert one["deterministic"] == two["deterministic"]
+        assert (one["env_steps"], two["env_steps"]) == (3, 5) and one["sampled"] == two["sampled"]
+        assert one["deterministic"] == two["deterministic"] != one["sampled"]
         (absolute,) = Monitor(env, config).evaluate([policy], [3], N, absolute=True)
         assert absolute["sampled"] != one["sampled"]
         results.append(one["sampled"])

@@ -179,27 +179,21 @@ def climb(x: float, y: float) -> np.ndarray:
     return np.asarray(plan_seesaw({"base": base}))
 
 
-def test_the_tug_robot_pushes_a_little_faster_than_the_cylinder() -> None:
+def test_the_tug_robot_pushes_a_little_faster_than_the_cylinder_along_its_axis() -> None:
     for speed, expected in ((0.0, 0.4), (-0.3, 0.4), (0.3, 0.7)):
         assert push(speed)[:, 0] * SPEED == pytest.approx(expected, abs=1e-5)
     assert push(0.3)[:, 1:] == pytest.approx(0.0, abs=1e-5)
-
-
-def test_the_tug_robot_does_not_push_off_axis() -> None:
     action = push(0.0, x=1.2)
     assert np.all(action[:, 0] < 0) and np.all(action[:, 1] < 0)  # back, and to the right, towards x = 1.6
 
 
-def test_the_climber_enters_the_plank_centred() -> None:
+def test_the_climber_enters_the_plank_centred_and_leaves_its_low_end_at_its_edge() -> None:
     assert climb(2.8, 0.05)[0, 0] == 1
     for y in (-0.25, 0.25):
         assert climb(2.8, y)[0, 0] < 0 and np.sign(climb(2.8, y)[0, 1]) == -np.sign(y)
         assert climb(3.5, y)[0, 0] == 1
-
-
-def test_the_climber_leaves_the_low_end_of_the_plank_at_its_edge_and_goes_on_higher_up() -> None:
     assert climb(3.8, 0.4)[0, 0] < 0
-    assert climb(5.0, 0.4)[0, 0] == 1
+    assert climb(5.0, 0.4)[0, 0] == 1  # higher up it goes on
 
 
 def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> None:
