@@ -115,7 +115,6 @@ LONG = ("view", "walk train", "walk eval", "tournament")
 
 
 def command_record(command: str) -> Any:
-    """Returns the record of a command's flags; of `train` and `walk train` that of the settings."""
     return TrainConfig if isinstance(COMMANDS[command], str) else COMMANDS[command]
 
 

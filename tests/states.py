@@ -30,7 +30,6 @@ def stepper(task: str) -> Any:
 
 @functools.cache
 def initial(env: QuadrupedEnv) -> State:
-    """An initial state of an environment, computed once per process."""
     return jax.jit(env.reset)(jax.random.PRNGKey(0))
 
 

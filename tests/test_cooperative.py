@@ -67,7 +67,6 @@ def ground_height(env: Any, x: float, y: float) -> float:
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_endings(task: str) -> None:
-    """From the spawn poses, at standing height."""
     env, step = made(task), stepper(task)
     pose = np.array(env.spawn_poses())
     height = [ground_height(env, x, y) + env.robot.stand_height + 0.01 for x, y, _ in pose]

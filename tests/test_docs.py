@@ -27,6 +27,7 @@ from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.runs import build
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.networks import NETWORKS
+from tests.training import Stop
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -152,23 +153,19 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
         assert all(f"<code>{term}</code>" in page for term in vars(task.Params().rewards))
 
 
-class Begun(Exception):
-    """Ends a demo after its untrained policy is made."""
-
-
 def test_the_demo_makes_a_policy_of_its_real_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Other tests of the demo have a task without physics, whose states hold all final observations."""
 
     def evaluated(task: str, policy: Any, **_: Any) -> None:
         assert (task, policy.task, policy.agents) == ("go1gate", "go1gate", 2)
-        raise Begun
+        raise Stop
 
     monkeypatch.setattr(demo, "evaluate", evaluated)
     settings = tmp_path / "small.yaml"
     settings.write_text(
         "{num_envs: 4, rollout_steps: 8, total_steps: 32, env: {control: position}, ppo: {minibatches: 1}}"
     )
-    with pytest.raises(Begun):
+    with pytest.raises(Stop):
         demo.demo(tmp_path / "run", str(settings), 4, "c")
 
 
@@ -177,7 +174,6 @@ EXAMPLES = ROOT / "examples"
 
 @pytest.fixture(autouse=True)
 def script_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Examples run as scripts, with their own folder on the import path."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
 
 

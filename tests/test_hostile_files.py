@@ -157,7 +157,6 @@ def archived(data: bytes, storage: bytes = bytes(4)) -> bytes:
 
 
 def encrypted(content: bytes) -> bytes:
-    """Sets the flag of encryption in all headers of a zip file."""
     changed = bytearray(content)
     for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         start = content.find(mark)

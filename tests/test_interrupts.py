@@ -43,7 +43,6 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seco
 
 
 def handles(process: subprocess.Popen[str], number: int) -> bool:
-    """Whether the process has installed a handler of its own for SIGTERM, which Python has not."""
     caught = Path(f"/proc/{process.pid}/status").read_text().split("SigCgt:")[1].split()[0]
     return bool(int(caught, 16) >> (number - 1) & 1)
 

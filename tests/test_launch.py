@@ -90,7 +90,6 @@ def started(words: list[str], **options: Any) -> Iterator[subprocess.Popen[str]]
 
 
 def children(process: subprocess.Popen[str]) -> list[int]:
-    """Returns the process ids of what `launch` has started, in their order."""
     return list(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
 
 

@@ -183,7 +183,6 @@ def pay_each(hidden: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def show_widely(width: int, hidden: jax.Array, step: jax.Array) -> jax.Array:
-    """Shows the sign and the step, repeated to a width."""
     shown = jnp.stack([hidden, step.astype(jnp.float32)], axis=-1)
     return jnp.tile(shown, (1, -(-width // 2)))[:, :width]
 

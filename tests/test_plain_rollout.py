@@ -177,8 +177,6 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
 
 
 class Half(Rich):
-    """Its second agent takes no part."""
-
     def _more(self, state: probes.ProbeState) -> probes.ProbeState:
         active = jnp.zeros(state.reward.shape, bool).at[:, 0].set(True)
         return dataclasses.replace(super()._more(state), active=active)

@@ -24,7 +24,7 @@ from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, rows, settings
+from tests.training import Probe, Stop, rows, settings, stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -146,18 +146,6 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
 
 def seeded(seed: int, **values: Any) -> TrainConfig:
     return settings(seed=seed, **{"checkpoint__every": 1, **values})
-
-
-class Stop(Exception):
-    """An externally stopped training run."""
-
-
-def stop_after(updates: int) -> Any:
-    def on_update(state: Any, row: dict[str, float]) -> None:
-        if row["updates"] > updates:
-            raise Stop
-
-    return on_update
 
 
 def test_seeds_killed_between_two_checkpoints_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

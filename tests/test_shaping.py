@@ -82,7 +82,6 @@ def test_wrestlers_start_nearer_to_the_edge() -> None:
 
 
 def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, float]:
-    """Reward terms of a step in which some coordinates take new values."""
     data = state.data.replace(qpos=state.data.qpos.at[jnp.asarray(columns)].set(jnp.asarray(values)))
     return {name: float(x) for name, x in terms_of(env, state, dataclasses.replace(state, data=data))[0].items()}
 

@@ -45,7 +45,6 @@ RUNS = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of two tasks, three algorithms and three seeds."""
     target = tmp_path_factory.mktemp("report")
     write_report(RUNS, target, REFERENCE)
     return target

@@ -29,7 +29,7 @@ from mqe_jax.train.runner import train
 from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, assert_same, assert_same_run, rows, settings
+from tests.training import Probe, Stop, assert_same, assert_same_run, rows, settings, stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 KEY = jax.random.PRNGKey(0)
@@ -42,20 +42,12 @@ def straight(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) ->
     return run_dir, train(PROBE, settings(), run_dir)
 
 
-class Killed(Exception):
-    pass
-
-
 def test_a_killed_training_resumes_as_if_never_stopped(straight: Any, tmp_path: Path, capsys: Any) -> None:
     straight_dir, expected = straight
     run_dir = tmp_path / "killed"
 
-    def kill(state: TrainState, row: dict[str, float]) -> None:
-        if row["updates"] == 3:
-            raise Killed  # after the checkpoint of update 2 and the row of update 3
-
-    with pytest.raises(Killed):
-        train(PROBE, settings(), run_dir, on_update=kill)
+    with pytest.raises(Stop):
+        train(PROBE, settings(), run_dir, on_update=stop_after(2))  # the checkpoint of update 2, the row of update 3
     assert len(rows(run_dir)) == 3
     with (run_dir / "metrics.csv").open("a") as file:
         file.write("64,4,0.1")  # a half-written row
@@ -118,19 +110,16 @@ def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path) -> None
     def again(state: TrainState, row: dict[str, float]) -> None:
         for resume in (False, True):
             refuses(r"already holds a run|in use by another process", train, PROBE, settings(), tmp_path, resume=resume)
-        raise Killed
+        raise Stop
 
-    with pytest.raises(Killed):
+    with pytest.raises(Stop):
         train(PROBE, settings(), tmp_path, on_update=again)
 
 
 def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path) -> None:
-    def kill(state: TrainState, row: dict[str, float]) -> None:
-        raise Killed
-
     (tmp_path / "nohup.out").touch()  # the output of its command
-    with pytest.raises(Killed):
-        train(PROBE, settings(), tmp_path, on_update=kill)
+    with pytest.raises(Stop):
+        train(PROBE, settings(), tmp_path, on_update=stop_after(0))
     assert [path.name for path in list_checkpoints(tmp_path)] == ["step_000000000000.safetensors"]
     train(PROBE, settings(), tmp_path, resume=True)
     assert len(rows(tmp_path)) == 5
@@ -252,9 +241,9 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
 
     def kill(state: TrainState, row: dict[str, float]) -> None:
         assert float(state.obs_normalizer.obs.samples) > float(trained.obs_normalizer.obs.samples)
-        raise Killed
+        raise Stop
 
-    with pytest.raises(Killed):
+    with pytest.raises(Stop):
         train(PROBE, settings(start=str(run_dir)), tmp_path / "a", on_update=kill)
     first, last = load_file(list_checkpoints(tmp_path / "a")[0]), load_file(list_checkpoints(run_dir)[-1])
     same = [name for name in first if name.startswith(("params/actor/", "params/log_std"))]

@@ -179,7 +179,6 @@ def test_a_viser_without_the_hook_is_refused(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def listening(port: int) -> set[str]:
-    """Local addresses, as the kernel writes them, on which a port is listened to."""
     rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
     places = [row[1].rsplit(":", 1) for row in rows if row[3] == "0A"]
     return {address for address, number in places if int(number, 16) == port}

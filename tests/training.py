@@ -127,7 +127,6 @@ def show_hidden(hidden: jax.Array, step: jax.Array) -> jax.Array:
 
 
 def show_hidden_first(hidden: jax.Array, step: jax.Array) -> jax.Array:
-    """Shows the sign in an episode's first step only."""
     return jnp.where(step == 0, hidden, 0.0)[:, None]
 
 
@@ -206,6 +205,20 @@ def updated(env: Any, config: TrainConfig, count: int, seed: int = 0, **options:
     assert len(traces) == 1
     assert_same(first, metrics[0])
     return jax.block_until_ready(states), metrics  # while the environment exists
+
+
+class Stop(Exception):
+    """A training that is stopped."""
+
+
+def stop_after(updates: int) -> Callable[[Any, dict[str, float]], None]:
+    """Returns a callback that stops a training in the next update, after its row and before its checkpoint."""
+
+    def on_update(state: Any, row: dict[str, float]) -> None:
+        if row["updates"] > updates:
+            raise Stop
+
+    return on_update
 
 
 def random_params(network: Network, seed: int = 0) -> Params:
