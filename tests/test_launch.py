@@ -249,10 +249,8 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(device)
     monkeypatch.setattr(launch, "_gpus", lambda: 2)
     assert [own[device] for own in members("--processes", "2")] == ["0", "1"]
-    with pytest.raises(
-        InputError, match="processes: 3 is not allowed; it must be at most the number of this host's GPUs, 2"
-    ):
-        members("--processes", "3")
+    said = "processes: 3 is not allowed; it must be at most the number of this host's GPUs, 2"
+    refuses(said, members, "--processes", "3")
     with pytest.raises(InputError, match="devices: '1, 2' is not allowed; it must be from 0 to 1: this host has 2"):
         members("--processes", "2", "--devices", "1", "2")
     with pytest.raises(InputError, match="devices: '1, 1' is not allowed; it must be a GPU of its own for each"):

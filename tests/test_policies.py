@@ -144,9 +144,10 @@ def test_policy_files_hold_their_mode_and_card(tmp_path: Path) -> None:
     policy = load_policy("go1gate")
     file = zoo.ship(policy, override(zoo.card("go1gate"), {"mode": "deterministic"}), tmp_path)
     assert file == tmp_path / "go1gate.safetensors" and load_policy(file).metadata["card"]["mode"] == "deterministic"
-    for written, deterministic in ((file, True), (save_policy(tmp_path / "new" / "folder", policy), False)):
-        assert load_policy(written).deterministic is deterministic
-        assert load_policy(written, deterministic=True).deterministic
+    assert load_policy(file).deterministic
+    for deterministic in (False, True):
+        file = save_policy(tmp_path / "new" / "folder", dataclasses.replace(policy, deterministic=deterministic))
+        assert load_policy(file).deterministic is deterministic and load_policy(file, deterministic=True).deterministic
 
 
 def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:

@@ -178,10 +178,8 @@ def test_wrong_data_is_refused_by_name() -> None:
 def test_missing_walk_weights_say_how_to_make_them() -> None:
     robots.register(dataclasses.replace(GO1, name="new", walk=dataclasses.replace(GO1.walk, weights="walk_new.x")))
     try:
-        with pytest.raises(
-            InputError, match=r"no weights are shipped for new.*mqe skill train walk --robot new.*'position'"
-        ):
-            make("go1gate", impl="c", robot="new")
+        said = r"no weights are shipped for new.*mqe skill train walk --robot new.*'position'"
+        refuses(said, make, "go1gate", impl="c", robot="new")
         for control in ("position", "torque"):
             make("go1gate", impl="c", robot="new", control=control)
     finally:
