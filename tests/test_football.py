@@ -70,7 +70,7 @@ def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str
 
 
 def test_the_ball_can_start_between_the_attackers() -> None:
-    changes = {"ball_between": 0.5, "ball_noise": 0.2, "head_start": 0.5}
+    changes: dict[str, Any] = {"ball_between": 0.5, "ball_noise": 0.2, "head_start": 0.5}
     env: Any = make("go1football-defender", impl="c", control="position", **changes)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 256))
     y = np.asarray(jax.vmap(env.ball)(states.data))[:, 1]
