@@ -171,9 +171,8 @@ def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: py
 
 def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
     parsed = parse_train(["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"])
-    assert parsed.settings == override(
-        build.base_config("go1gate", "demo"), {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
-    )
+    expected = {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
+    assert parsed.settings == override(build.base_config("go1gate", "demo"), expected)
     parsed = parse_train(["go1gate", "--network.name", "mat", "--network.heads", "2", "--checkpoint.no-environments"])
     assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
     assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"

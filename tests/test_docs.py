@@ -162,9 +162,8 @@ def test_the_demo_makes_a_policy_of_its_real_task(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(demo, "evaluate", evaluated)
     settings = tmp_path / "small.yaml"
-    settings.write_text(
-        "{num_envs: 4, rollout_steps: 8, total_steps: 32, env: {control: position}, ppo: {minibatches: 1}}"
-    )
+    few = "num_envs: 4, rollout_steps: 8, total_steps: 32, ppo: {minibatches: 1}"
+    settings.write_text(f"{{{few}, env: {{control: position}}}}")
     with pytest.raises(Stop):
         demo.demo(tmp_path / "run", str(settings), 4, "c")
 
@@ -192,10 +191,9 @@ def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: A
     assert result.success_rate >= 0.5
     idle = evaluate_batch(env, lambda obs, memory, _: (jnp.zeros((8, 1, 3)), memory), 8, jax.random.PRNGKey(0))
     assert idle.success_rate == 0
-    np.testing.assert_allclose(
-        example.flee(jnp.array([3.0, 1.0]), jnp.array([3.0, 0.0]), speed=0.4), [0, 0.4], atol=1e-6
-    )
-    np.testing.assert_allclose(example.flee(jnp.array([3.0, 2.0]), jnp.array([3.0, 0.0]), speed=0.4), [0, 0])
+    near, far = (example.flee(jnp.array([3.0, y]), jnp.array([3.0, 0.0]), speed=0.4) for y in (1.0, 2.0))
+    np.testing.assert_allclose(near, [0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(far, [0, 0])
     pillar = env.env.compiled.model.geom("wall/pillar1")
     np.testing.assert_allclose(pillar.pos[:2], [2.5, 0.0])
 

@@ -190,9 +190,8 @@ ARCHIVES: dict[str, Callable[[], bytes]] = {
 
 def test_a_small_archive_is_read(tmp_path: Path) -> None:
     """The opcodes of the cases below are right."""
-    layers = module(
-        named("0", module(LINEAR, kind="torch.nn.modules.linear.Linear")), kind="torch.nn.modules.container.Sequential"
-    )
+    linear = named("0", module(LINEAR, kind="torch.nn.modules.linear.Linear"))
+    layers = module(linear, kind="torch.nn.modules.container.Sequential")
     (tmp_path / "good.jit").write_bytes(archived(layers, struct.pack("<f", 3.0)))
     assert read_torchscript(tmp_path / "good.jit") == {"0.weight": np.array([3.0], np.float32)}
 

@@ -75,9 +75,8 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
     speed = 0.2 * 0.8 / 0.64**1.4 - 0.0981
     assert float(env.sheep(after.data)[0, 0]) == pytest.approx(2.0 + STEP * speed, abs=1e-3)
     cornered = with_object(env, state, "sheep0", [2.0, 1.75])
-    cornered = dataclasses.replace(
-        cornered, data=cornered.data.replace(qpos=cornered.data.qpos.at[index[0, :2]].set(jnp.array([2.0, 1.2])))
-    )
+    qpos = cornered.data.qpos.at[index[0, :2]].set(jnp.array([2.0, 1.2]))
+    cornered = dataclasses.replace(cornered, data=cornered.data.replace(qpos=qpos))
     for _ in range(50):
         cornered = step(cornered, jnp.zeros((2, 12)))
     assert float(env.sheep(cornered.data)[0, 1]) < 1.85  # the side wall is at 2.0, the sheep's radius 0.2

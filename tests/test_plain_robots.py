@@ -246,9 +246,8 @@ def test_objects_have_the_masses_and_inertias_of_their_shapes() -> None:
 
 
 def test_sheep_follow_the_law_with_the_parameters_of_their_task() -> None:
-    env: Any = make(
-        "go1sheep-hard", impl="c", control="position", num_envs=1, restlessness=0.2, sheep_friction=0.3, flock=(2, 1)
-    )
+    herd: dict[str, Any] = {"restlessness": 0.2, "sheep_friction": 0.3, "flock": (2, 1)}
+    env: Any = make("go1sheep-hard", impl="c", control="position", num_envs=1, **herd)
     state = initial(env)
     speed = jax.random.normal(KEY, (2, 2))
     columns = np.stack([env.objects[f"sheep{number}"].qvel for number in range(2)])

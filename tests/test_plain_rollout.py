@@ -207,9 +207,8 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
     env._roster, env._members = league.Roster(sources), members
     random = np.random.default_rng(0)
     ratings = random.normal(0, 200, members).astype(np.float32)
-    start = pool.new_pool({"x": jnp.zeros(1)}, members)._replace(
-        born=jnp.array([0, 3, 5, -1]), rating=jnp.asarray(ratings)
-    )
+    fields = {"born": jnp.array([0, 3, 5, -1]), "rating": jnp.asarray(ratings)}
+    start = pool.new_pool({"x": jnp.zeros(1)}, members)._replace(**fields)
     zeros = jnp.zeros(5, jnp.int32)
     state = league.LeagueState(start, zeros, zeros, jnp.zeros(()), jnp.int32(0), jnp.zeros((5, 3)), KEY)
     score, games, rating, played, recent = np.zeros(members), np.zeros(members), 0.0, np.zeros(5), np.zeros((5, 3))

@@ -205,9 +205,8 @@ class Plain:
         if config.normalization.values:
             decay = config.normalization.value_decay
             new = (target.mean(), (target**2).mean(), 1.0)
-            self.statistics = ValueStatistics(
-                *(jnp.float32(decay * x + (1 - decay) * y) for x, y in zip(state.value_normalizer, new, strict=True))
-            )
+            pairs = zip(state.value_normalizer, new, strict=True)
+            self.statistics = ValueStatistics(*(jnp.float32(decay * x + (1 - decay) * y) for x, y in pairs))
         if config.normalization.advantages:
             advantage = (advantage - advantage.mean()) / advantage.std()
         mean, deviation = self.value_scale(self.statistics)

@@ -47,9 +47,8 @@ def tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
 def lifted() -> Iterator[Robot]:
     trunk = dataclasses.replace(GO1.trunk, mass=6.0)
     joints = GO1.default_joints.reshape(4, 3) * [1.0, 0.8, 0.8]
-    robot = dataclasses.replace(
-        GO1, name="lifted", trunk=trunk, default_joints=joints.ravel(), kp=35.0, stand_height=0.34
-    )
+    changes = {"trunk": trunk, "default_joints": joints.ravel(), "kp": 35.0, "stand_height": 0.34}
+    robot = dataclasses.replace(GO1, name="lifted", **changes)
     yield robots.register(robot)
     del robots.ROBOTS["lifted"]
 

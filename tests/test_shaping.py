@@ -128,9 +128,8 @@ def test_one_sided_shaping_of_a_football_match() -> None:
     _, third = moved(back, 8.25)
     np.testing.assert_allclose([first, second, third], [[1.0, 0.0], [0.0, 0.5], [0.25, 0.0]], atol=1e-4)
     robot = jnp.asarray(env.index.base_qpos[:, 0])
-    near = dataclasses.replace(
-        state, data=state.data.replace(qpos=state.data.qpos.at[robot].add(jnp.array([0.5, 0.0])))
-    )
+    qpos = state.data.qpos.at[robot].add(jnp.array([0.5, 0.0]))
+    near = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
     np.testing.assert_allclose(terms_of(env, state, near)[0]["chase"], [0.5, 0.0], atol=1e-2)
 
 
@@ -145,9 +144,8 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
         qpos = state.data.qpos.at[jnp.asarray(ball)].set(jnp.array([x, 0.0]))
         places = jnp.array([[x, other], [x, -other], [10.0, 0.0]]).at[robot].set(jnp.array([x - apart, 0.0]))
         qpos = qpos.at[jnp.asarray(env.index.base_qpos[:, :2])].set(places)
-        after = dataclasses.replace(
-            state, data=state.data.replace(qpos=qpos, qvel=state.data.qvel.at[speed].add(change))
-        )
+        qvel = state.data.qvel.at[speed].add(change)
+        after = dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=qvel))
         moments = [Moment(each, env.read(each.data)) for each in (state, after)]
         return dataclasses.replace(after, task=env.step_task(*moments))
 

@@ -75,9 +75,8 @@ def test_the_default_ranges_change_nothing(commands: tuple[str, ...]) -> None:
 
 
 def test_a_range_is_of_the_command_not_of_its_change() -> None:
-    commands = controller(commands=("gait_frequency",), gait_frequency=(2.0, 5.0)).skill_commands(
-        jnp.array([[-1.0], [0.0], [1.0]])
-    )
+    rate = controller(commands=("gait_frequency",), gait_frequency=(2.0, 5.0))
+    commands = rate.skill_commands(jnp.array([[-1.0], [0.0], [1.0]]))
     np.testing.assert_allclose(commands[:, 4], [2.0, 3.0, 5.0])
 
 

@@ -110,9 +110,8 @@ def test_single_seeds_without_evaluation_are_reported(tmp_path: Path) -> None:
 
 
 def test_evaluations_take_the_place_of_training_rewards() -> None:
-    cells = group(
-        [made_up(Cell("go1gate", "mat", "tuned"), 0), made_up(Cell("go1gate", "mat"), 0, evaluated=False)], REFERENCE
-    )
+    runs = [made_up(Cell("go1gate", "mat", "tuned"), 0), made_up(Cell("go1gate", "mat"), 0, evaluated=False)]
+    cells = group(runs, REFERENCE)
     ((cell, (run,)),) = evaluated(cells).items()
     assert cell.variant == "tuned" and list(run.curve["env_steps"]) == [20_000_000, 40_000_000]
 

@@ -169,9 +169,8 @@ def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     memory = walk_policy.WalkMemory(jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(()))
     commands = SKILL.default_commands("trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
     joints = GO1.default_joints + np.arange(12)
-    obs = walk_policy.observe(
-        GO1, memory, jnp.asarray(commands), Proprioception(DOWN, jnp.asarray(joints), jnp.full(12, 2.0))
-    )
+    sensed = Proprioception(DOWN, jnp.asarray(joints), jnp.full(12, 2.0))
+    obs = walk_policy.observe(GO1, memory, jnp.asarray(commands), sensed)
     scaled = [2.0, -1.0, 0.1, 0, 3.0, 0.5, 0, 0, 0.5, 0.012, 0, 0, 0.25, 0.428, 0]
     np.testing.assert_allclose(obs[:18], [0, 0, -1, *scaled], atol=1e-6)
     np.testing.assert_allclose(obs[18:30], np.arange(12), atol=1e-6)

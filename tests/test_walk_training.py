@@ -109,9 +109,8 @@ def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> Non
         gradient, loss = jax.grad(log_prob, has_aux=True)(params)
         return loss, gradient["policy"]["adaptation"]
 
-    _, latent = walk_policy.infer(
-        params["policy"], windows(rest[0].actor, rest[1], obs[:, :, 0], ALL).reshape(3, 2, -1)
-    )
+    flat = windows(rest[0].actor, rest[1], obs[:, :, 0], ALL).reshape(3, 2, -1)
+    _, latent = walk_policy.infer(params["policy"], flat)
     error = np.square(latent - privileged[..., -2:]).mean()
     loss, policy_gradient = evaluated(params)
     assert float(loss) == pytest.approx(float(error), rel=1e-5)
