@@ -11,8 +11,6 @@ state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64)
 state = jax.jit(jax.vmap(env.step))(state, action)  # (64, env.num_agents, env.action_size)
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

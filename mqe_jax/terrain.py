@@ -6,8 +6,6 @@ environments are attached to an anchor, which is sampled at reset and is part of
 Frame: the environment's, x along the track from its start, y across it with 0 on the centre line, z up; metres.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import mujoco
@@ -78,7 +76,7 @@ class TerrainBlock:
     length: float = 1.0
     """Extent along x, m."""
 
-    def layout(self, start: float, track: Track, number: int) -> Layout:
+    def layout(self, start: float, track: "Track", number: int) -> Layout:
         """Returns the walls and poses of the block from x = `start`, m; `number` is its index in the track."""
         raise NotImplementedError(f"terrain block {type(self).__name__}: layout() is not defined")
 
@@ -95,7 +93,7 @@ class SpawnArea(TerrainBlock):
     back_wall: bool = True
     """Whether there is a wall behind the robots."""
 
-    def layout(self, start: float, track: Track, number: int) -> Layout:
+    def layout(self, start: float, track: "Track", number: int) -> Layout:
         x = start + (self.length / 2 if self.spawn_x is None else self.spawn_x)
         spacing = track.width / track.num_robots if self.spacing is None else self.spacing
         middle = (track.num_robots - 1) / 2
@@ -108,7 +106,7 @@ class SpawnArea(TerrainBlock):
 class Plane(TerrainBlock):
     """Ground without walls."""
 
-    def layout(self, start: float, track: Track, number: int) -> Layout:
+    def layout(self, start: float, track: "Track", number: int) -> Layout:
         return Layout()
 
 
@@ -118,7 +116,7 @@ class EndWall(TerrainBlock):
 
     length: float = 0.0
 
-    def layout(self, start: float, track: Track, number: int) -> Layout:
+    def layout(self, start: float, track: "Track", number: int) -> Layout:
         return Layout(barriers=(Barrier(f"end{number}", (start, 0.0), (-1.0, 0.0), track.width),))
 
 
@@ -134,7 +132,7 @@ class Gate(TerrainBlock):
     random: tuple[float, float] = (0.0, 0.0)
     """Half-widths of the range of the gap's centre, sampled at reset (x, y), m."""
 
-    def layout(self, start: float, track: Track, number: int) -> Layout:
+    def layout(self, start: float, track: "Track", number: int) -> Layout:
         gap, depth, height = self.width, self.depth, track.wall_height
         if not 0 < gap < track.width:
             raise InputError(f"terrain block gate: width {gap} must be between 0 and the track's width {track.width}")

@@ -20,8 +20,6 @@ These 2100 numbers contain every action twice, constant commands 30 times, and i
 `RestrictedWalkPolicy` computes the same actions from about two thirds of them, with weights changed accordingly.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Sequence
@@ -172,7 +170,7 @@ class WalkPolicy(Skill):
         """Returns the history with the newest observation and without the oldest."""
         return jnp.concatenate([history[1:], observation[None]])
 
-    def restrict(self, varied: Sequence[str], gait: str | None) -> WalkPolicy:
+    def restrict(self, varied: Sequence[str], gait: str | None) -> "WalkPolicy":
         return RestrictedWalkPolicy(self.robot, varied, gait)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:

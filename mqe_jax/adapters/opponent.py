@@ -1,7 +1,5 @@
 """A match against a fixed opponent as an environment of team 0 alone; `opponents.Versus` is its batched form."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Hashable, Sequence
@@ -85,7 +83,7 @@ class TeamEnv:
         named = isinstance(self.opponent, SimplePolicy) and self._source is not None
         return self._source if named else id(self.opponent)
 
-    def with_num_envs(self, num_envs: int) -> TeamEnv:
+    def with_num_envs(self, num_envs: int) -> "TeamEnv":
         """Returns an environment whose engine holds `num_envs` environments; see `QuadrupedEnv.with_num_envs`."""
         match = self.match.with_num_envs(num_envs)
         if match is self.match:

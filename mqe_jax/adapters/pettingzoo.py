@@ -4,8 +4,6 @@
 registers every task as `mqe/TASK-v0`, for `pettingzoo.make("parallel", id)` and `pettingzoo.make("aec", id)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -36,7 +34,7 @@ def register() -> None:
             pettingzoo.register("aec", f"mqe/{task}-v0", f"{__name__}:env", kwargs={"task": task})
 
 
-def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> QuadrupedParallelEnv:
+def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> "QuadrupedParallelEnv":
     """Returns the parallel environment of a task; the settings are those of `QuadrupedParallelEnv`."""
     return QuadrupedParallelEnv(task, **settings)
 

@@ -4,8 +4,6 @@ The learner runs in each of them under `jax.shard_map` over the axis `AXIS`. The
 processes; anywhere else they are those of a single process: means are the identity, and rows are all rows.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import zlib
@@ -154,7 +152,7 @@ class Processes:
         self._mesh = Mesh(np.array(jax.devices()[: self.count]), (AXIS,))
         self._specs = jax.tree.map(self._spec, own, whole)
 
-    def stack(self, shared: PyTree) -> Processes:
+    def stack(self, shared: PyTree) -> "Processes":
         """Returns those of several states, with a leading axis on all leaves but the shared ones (`SeedBatch`)."""
         other = object.__new__(Processes)
         vars(other).update(vars(self))

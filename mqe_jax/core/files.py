@@ -1,7 +1,5 @@
 """Files and folders: bounded readers (`mqe_jax.core.limits`), atomic writes, errors that name the file, locks."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import json
@@ -210,7 +208,7 @@ def read_rows(path: Path) -> Iterator[list[str]]:
         yield from csv.reader(file, strict=True)
 
 
-def read_tensors(file: Path, what: str) -> dict[str, np.ndarray]:
+def read_tensors(file: Path, what: str) -> "dict[str, np.ndarray]":
     """Reads a safetensors file of finite floating-point weights; an InputError says `what` it should be."""
     import numpy as np
     from safetensors.numpy import load_file
@@ -225,8 +223,8 @@ def read_tensors(file: Path, what: str) -> dict[str, np.ndarray]:
 
 
 def linear_layers(
-    what: str, arrays: Mapping[str, np.ndarray], sizes: Mapping[str, tuple[int, int]]
-) -> dict[str, dict[str, np.ndarray]]:
+    what: str, arrays: "Mapping[str, np.ndarray]", sizes: Mapping[str, tuple[int, int]]
+) -> "dict[str, dict[str, np.ndarray]]":
     """Returns the arrays LAYER.weight (outputs, inputs) and LAYER.bias (outputs,) by layer, as float32.
 
     `sizes` holds inputs and outputs of each layer. An InputError says what is wrong with `what`.

@@ -1,7 +1,5 @@
 """Environment protocol and learner data types."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -145,7 +143,7 @@ def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no)
 
 
-def reset_memory(memory: NetworkMemory, is_first: jax.Array) -> NetworkMemory:
+def reset_memory(memory: "NetworkMemory", is_first: jax.Array) -> "NetworkMemory":
     """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first (N,) bool."""
     return where_rows(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
 
@@ -217,7 +215,7 @@ class Outcome:
         """Win, draw and loss of each team, in the order of `RESULTS` (K, 3)."""
         return jnp.stack([getattr(self, name) for name in RESULTS], axis=-1)
 
-    def by_team(self, change: Callable[[jax.Array], jax.Array]) -> Outcome:
+    def by_team(self, change: Callable[[jax.Array], jax.Array]) -> "Outcome":
         """Returns the outcome with all arrays (..., K) changed."""
         teams = {name: getattr(self, name) for name in ("success", *RESULTS)}
         teams = {name: change(x) for name, x in teams.items() if x is not None}
@@ -245,7 +243,7 @@ class Observations:
     groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     """Observations of further groups by name (N, A, O_g)."""
 
-    def of(self, agents: slice) -> Observations:
+    def of(self, agents: slice) -> "Observations":
         """Returns what some of the agents see."""
         cut = lambda x: x[..., agents, :]  # noqa: E731
         active = None if self.active is None else self.active[..., agents]
@@ -263,7 +261,7 @@ class Observations:
         return self if hasattr(policy, "groups") else self.obs
 
     @classmethod
-    def at(cls, seen: Any) -> Observations:
+    def at(cls, seen: Any) -> "Observations":
         """Returns the observations of an environment's state; an array is that of the group `policy`."""
         return seen if isinstance(seen, Observations) else cls(seen)
 

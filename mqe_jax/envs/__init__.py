@@ -1,7 +1,5 @@
 """The environments: `make` creates one from a task id."""
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +38,7 @@ def tasks() -> tuple[str, ...]:
 @check_arguments(task=str, impl=str, control=str, num_envs=Environments)
 def make(
     task: str, *, impl: str = "auto", control: str = "command", num_envs: int = 4096, **overrides: Any
-) -> QuadrupedEnv:
+) -> "QuadrupedEnv":
     """Creates the environment of a task.
 
     Args:

@@ -1,7 +1,5 @@
 """Observation layouts: the order and width of an observation's blocks, defined once per task."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Mapping
@@ -161,7 +159,7 @@ def for_all(value: jax.Array, agents: int) -> jax.Array:
     return jnp.broadcast_to(value.reshape(-1), (agents, value.size))
 
 
-def box(bound: float, shape: tuple[int, ...]) -> Box:
+def box(bound: float, shape: tuple[int, ...]) -> "Box":
     """Returns the space of arrays of a shape with numbers from -bound to bound."""
     from gymnasium.spaces import Box  # on demand: importing Gymnasium takes 0.1 s
 

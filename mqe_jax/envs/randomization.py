@@ -1,7 +1,5 @@
 """Domain randomisation: physics parameters that differ between environments."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import TYPE_CHECKING
 
@@ -127,7 +125,7 @@ class Randomizer:
                 fields[name] = as_float(getattr(model, name)) * factor
         return fields
 
-    def push(self, data: mjx.Data, key: jax.Array, dt: float) -> mjx.Data:
+    def push(self, data: "mjx.Data", key: jax.Array, dt: float) -> "mjx.Data":
         """Changes each trunk's horizontal velocity at random, on average once per `push_period`; `dt` in s."""
         random, index = self.random, self.index
         if not random.push:

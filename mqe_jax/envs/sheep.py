@@ -1,7 +1,5 @@
 """go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: two robots herd sheep through a gate."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import jax
@@ -146,7 +144,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         noise = jax.random.uniform(key, start.shape, minval=-params.flock_noise, maxval=params.flock_noise)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
 
-    def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
+    def step_npcs(self, data: "mjx.Data", robot_state: RobotState, key: jax.Array) -> "mjx.Data":
         """Sets the sheep's velocities by `flock`."""
         index = self._sheep("qvel")
         velocity = flock(
@@ -160,7 +158,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         )
         return data.replace(qvel=data.qvel.at[index].set(velocity))
 
-    def sheep(self, data: mjx.Data) -> jax.Array:
+    def sheep(self, data: "mjx.Data") -> jax.Array:
         """Returns the sheep's positions (S, 2), m."""
         return data.qpos[self._sheep("qpos")]
 

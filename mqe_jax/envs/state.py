@@ -1,7 +1,5 @@
 """The state of an environment, which `reset` and `step` return."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
@@ -70,7 +68,7 @@ class State(EnvironmentState, Generic[S]):
     have dropped contacts or constraints in any physics step of this step); its outcome has the `ENDINGS`.
     """
 
-    data: mjx.Data
+    data: "mjx.Data"
     """Physics state."""
     anchors: jax.Array
     """Positions of the terrain's anchors, such as gate centres (G, 2), m, environment frame."""

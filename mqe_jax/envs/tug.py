@@ -1,7 +1,5 @@
 """go1tug, the paper's Push Cylinder: two robots push a cylinder, which slides along one axis, towards each other."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -117,7 +115,7 @@ class Go1Tug(Duel[TugState, TugParams]):
     def step_task(self, before: Moment[TugState], after: Moment[TugState]) -> TugState:
         return TugState(self.cylinder_y(before.state.data))
 
-    def cylinder_y(self, data: mjx.Data) -> jax.Array:
+    def cylinder_y(self, data: "mjx.Data") -> jax.Array:
         """Returns the cylinder's y (), m."""
         return self.object_pose(data, "cylinder")[1]
 

@@ -1,7 +1,5 @@
 """An actuator network: torques of all robots' joints from their targets, at every physics step."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import pathlib
@@ -67,12 +65,12 @@ class NetworkActuators:
 
     def step(
         self,
-        data: mjx.Data,
+        data: "mjx.Data",
         memory: tuple[jax.Array, jax.Array],
         target: jax.Array,
         fields: Mapping[str, jax.Array],
         xfrc_applied: jax.Array | None,
-    ) -> tuple[mjx.Data, Any, jax.Array]:
+    ) -> "tuple[mjx.Data, Any, jax.Array]":
         """Advances the physics by one environment step under joint targets (R, 12), rad; returns as `Engine.step`."""
 
         def substep(carry: Any, _: None) -> Any:

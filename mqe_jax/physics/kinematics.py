@@ -4,8 +4,6 @@ The engines' states hold no poses (`engines.STATE_FIELDS`); MuJoCo's C engine re
 the last physics step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -29,7 +27,7 @@ class Poses(NamedTuple):
     quaternion: jax.Array  # orientations, wxyz (B, 4)
 
 
-def poses(model: mujoco.MjModel, data: mjx.Data, bodies: Sequence[int] | np.ndarray) -> Poses:
+def poses(model: mujoco.MjModel, data: "mjx.Data", bodies: Sequence[int] | np.ndarray) -> Poses:
     """Returns the poses of bodies, given by their ids; quaternions in `data.qpos` are taken to be normalised."""
     found: dict[int, tuple[Any, Any]] = {0: (jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]))}
 
@@ -42,7 +40,7 @@ def poses(model: mujoco.MjModel, data: mjx.Data, bodies: Sequence[int] | np.ndar
     return Poses(jnp.stack(positions), jnp.stack(quaternions))
 
 
-def _place(model: mujoco.MjModel, data: mjx.Data, body: int, position: Any, quaternion: Any) -> tuple[Any, Any]:
+def _place(model: mujoco.MjModel, data: "mjx.Data", body: int, position: Any, quaternion: Any) -> tuple[Any, Any]:
     """Returns the pose of a body in the pose of its parent."""
     if (number := int(model.body_mocapid[body])) >= 0:
         return data.mocap_pos[number], data.mocap_quat[number]

@@ -1,7 +1,5 @@
 """A training by one call: `learn`, `learn_seeds`, and the `Run` that they return."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -72,7 +70,7 @@ class Run:
         total = self.config.num_updates * self.config.steps_per_update
         return f"<Run of {self.policy.task}: {self.env_steps:,} of {total:,} environment steps>"
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """Returns a figure of reward and success over environment steps."""
         from mqe_jax.viz.curves import plot_curves
 

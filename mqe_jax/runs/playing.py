@@ -1,7 +1,5 @@
 """Policies at play by one call: `evaluate` measures them, `render` shows them."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import tempfile
@@ -163,7 +161,7 @@ def render(
     width: int | None = None,
     fps: float | None = None,
     speed: float = 1.0,
-) -> Clip:
+) -> "Clip":
     """Records an episode as a clip, which shows itself in a notebook and can be saved.
 
     Example:

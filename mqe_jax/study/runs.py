@@ -1,7 +1,5 @@
 """Finished runs of a sweep, from FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV; reference values."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence
@@ -45,7 +43,7 @@ class Cell:
         return Path(self.task) / f"{self.algorithm}{suffix}"
 
     @classmethod
-    def at(cls, path: Path) -> Cell:
+    def at(cls, path: Path) -> "Cell":
         """Returns the cell of a folder, given its last two parts at least."""
         algorithm, _, variant = path.name.partition("+")
         return cls(path.parent.name, algorithm, variant or PLAIN)

@@ -1,7 +1,5 @@
 """Unbiased evaluation: a fixed quota of episodes from each environment, so that short ones are not over-represented."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable
@@ -52,7 +50,7 @@ class Rate(NamedTuple):
 
     @classmethod
     @check_arguments(value=Fraction, episodes=PositiveInt)
-    def of(cls, value: float, episodes: int) -> Rate:
+    def of(cls, value: float, episodes: int) -> "Rate":
         """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is conservative."""
         spread = _NORMAL**2 / episodes
         middle = (value + spread / 2) / (1 + spread)

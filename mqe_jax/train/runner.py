@@ -1,7 +1,5 @@
 """The training loop: updates, evaluations, logs, and what it writes into a run folder."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math
@@ -87,7 +85,7 @@ def open_training(
     league: Matchmaker | None = None,
     teacher: Any = None,
     stages: type[Stages] = Stages,
-) -> Iterator[Training]:
+) -> Iterator["Training"]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
     check("env", env, AnyBatch)
     for config, _ in zip(configs, run_dirs, strict=True):

@@ -1,7 +1,5 @@
 """Drawings by matplotlib: curves of a training, and a top view for machines without a GL library."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,7 +34,7 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
 
 
 @check_arguments(tables=Annotated[Sequence[Mapping[str, Any]], MinLen(1)], title=str)
-def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> Figure:
+def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> "Figure":
     """Returns a figure of average step reward (else return) and success over environment steps.
 
     `tables` are columns of metrics.csv by name, of each seed.
@@ -76,7 +74,7 @@ def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> Figur
     return figure
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
     """Writes a figure atomically, in a folder that it creates."""
     with replacing(path) as temporary:
         figure.savefig(temporary)

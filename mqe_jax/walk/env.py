@@ -4,8 +4,6 @@ Slopes are rotations of gravity, so each environment has its own without its own
 here are in the slope's frame. Randomisation and rewards follow walk-these-ways (arXiv 2212.03238).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import TYPE_CHECKING
 
@@ -75,7 +73,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         super().__init__(params, impl=impl, control="position", num_envs=num_envs)
         self.skill.check_period(self.compiled.scene.timestep, self.physics.num_substeps)
 
-    def with_num_envs(self, num_envs: int) -> WalkEnv:
+    def with_num_envs(self, num_envs: int) -> "WalkEnv":
         if self.physics.holds(num_envs):
             return self
         return WalkEnv(self.robot, self.task, skill=self.skill.name, impl=self.impl, num_envs=num_envs)
@@ -291,7 +289,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         torque = jnp.clip(torque - robot.kd * velocity, -robot.torque_limit, robot.torque_limit)
         return jnp.sum(jnp.abs(torque * velocity))
 
-    def foot_force(self, data: mjx.Data) -> jax.Array:
+    def foot_force(self, data: "mjx.Data") -> jax.Array:
         """Returns the strongest contact force on each foot (4,), N."""
         return jnp.linalg.norm(data.sensordata[self.index.foot_force[0]], axis=-1)
 

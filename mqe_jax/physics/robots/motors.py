@@ -14,8 +14,6 @@ does with a joint's velocity limit.
 The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any
@@ -60,7 +58,7 @@ class Motors:
     timestep: float  # physics step, s
 
     @classmethod
-    def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> Motors:
+    def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> "Motors":
         """Returns the motors of all robots of a scene, whose actuators are in the order of the robots' joints."""
         assert np.array_equal(index.actuator.ravel(), np.arange(index.actuator.size))
         per_joint = lambda values: np.tile(values, index.num_robots).astype(np.float32)  # noqa: E731
@@ -189,7 +187,7 @@ class Motors:
         """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry it further."""
         return np.float32((1.0 - ROUNDING) * REACH) * np.where(self._steep, np.float32(np.inf), self.speed)
 
-    def repeat(self, count: int) -> Motors:
+    def repeat(self, count: int) -> "Motors":
         """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast ones."""
         rows = {name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")}
         return dataclasses.replace(self, **rows)

@@ -5,8 +5,6 @@ zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf e
 is described, the front left; the others are its mirror images.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections import Counter
@@ -50,7 +48,7 @@ class Link:
     """Inertia (xx, yy, zz, xy, xz, yz) about the centre of mass, in the axes of the link frame, kg m^2."""
 
     @classmethod
-    def from_principal(cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]) -> Link:
+    def from_principal(cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]) -> "Link":
         """Returns a link from principal `moments` of inertia (kg m^2) and the orientation of their axes, wxyz."""
         w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
         axes = np.array(
@@ -62,7 +60,7 @@ class Link:
         )
         return cls(mass, com, _six(axes @ np.diag(moments) @ axes.T))
 
-    def reflect(self, x: int, y: int) -> Link:
+    def reflect(self, x: int, y: int) -> "Link":
         """Returns the link reflected by the signs `x` and `y` (each 1 or -1)."""
         xx, yy, zz, xy, xz, yz = self.inertia
         cx, cy, cz = self.com
@@ -73,7 +71,7 @@ class Link:
         xx, yy, zz, xy, xz, yz = self.inertia
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
-    def weld(self, other: Link, position: Vector) -> Link:
+    def weld(self, other: "Link", position: Vector) -> "Link":
         """Returns this link with `other` fixed to it at `position` (m, link frame, same axes)."""
         mass = self.mass + other.mass
         centers = (np.asarray(self.com), np.asarray(position) + np.asarray(other.com))
@@ -235,7 +233,7 @@ class Robot:
     walk: WalkSettings
 
     def __post_init__(self) -> None:
-        for name in (field.name for field in dataclasses.fields(self) if field.type == "np.ndarray"):
+        for name in (field.name for field in dataclasses.fields(self) if field.type is np.ndarray):
             array = np.array(getattr(self, name), float)
             if array.shape != (NUM_JOINTS,):
                 raise InputError(f"Robot.{name}: shape {array.shape}; expected ({NUM_JOINTS},)")
