@@ -32,11 +32,7 @@ MIN_SEEDS = 3
 
 
 def update(runs: Sequence[Run], folder: Path, page: Path) -> None:
-    """Writes the page's figures, and fills its tables, with the paper's values in FOLDER/reference.yaml.
-
-    Raises:
-        InputError: if the page lacks a section.
-    """
+    """Writes the page's figures, and fills its tables, with the paper's values in FOLDER/reference.yaml."""
     reference = load_reference(folder / "reference.yaml")
     cells = group(runs, reference)
     for name, figure in figures(cells, reference).items():

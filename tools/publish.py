@@ -60,11 +60,7 @@ def thin(curve: Curve) -> Curve:
 
 
 def read_tables(folder: Path) -> list[Run]:
-    """Reads the published runs of a folder, ordered by path and seed.
-
-    Raises:
-        InputError: for a table that is missing or damaged.
-    """
+    """Reads the published runs of a folder, by path and seed; InputError for a missing or damaged table."""
     evaluations: dict[Key, dict[str, list[dict[str, Any]]]] = {}
     for key, row in _read(folder / EVALUATIONS):
         point: dict[str, Any] = {name: int(row[name]) for name in ("env_steps", "episodes") if row[name]}
@@ -121,11 +117,7 @@ def _numbers(point: Mapping[str, Any], names: Sequence[str] | None = None) -> di
 
 
 def publish(sweeps: Sequence[Path], target: Path) -> None:
-    """Adds finished runs to the tables below `target`.
-
-    Raises:
-        InputError: for a sweep without finished runs, or with other results of a run that is published.
-    """
+    """Adds finished runs to the tables below `target`; InputError for other results of a run that is published."""
     runs = {(run.cell, run.seed): run for run in read_tables(target)} if (target / CURVES).is_file() else {}
     for sweep in sweeps:
         for run in read_runs(sweep):

@@ -75,7 +75,8 @@ class Env(BraxEnv):
             raise InputError(
                 f"action: shape {jnp.shape(action)}; expected {(self.action_size,)} (agents * action size)"
             )
-        after = self.env.step(_task_state(state), action.reshape(self.env.num_agents, self.env.action_size))
+        before: Any = state.pipeline_state
+        after = self.env.step(before, action.reshape(self.env.num_agents, self.env.action_size))
         obs = after.obs.reshape(-1)
         info = {**state.info, "truncation": after.truncated.astype(jnp.float32), FINAL_OBS: obs}
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
@@ -129,7 +130,8 @@ class AutoReset(Wrapper):
             # EpisodeWrapper may end an episode earlier than the task's time limit.
             return autoreset(task, dataclasses.replace(own, truncated=done.astype(bool) & ~own.terminated))
 
-        own = jax.vmap(restart)(_task_state(after), after.done)
+        reached: Any = after.pipeline_state
+        own = jax.vmap(restart)(reached, after.done)
         obs = own.obs.reshape(*after.done.shape, -1)
         return after.replace(pipeline_state=own, obs=obs)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -146,16 +148,8 @@ def wrap(
     return AutoReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 
-def _device_put_replicated(tree: Any, devices: Any) -> Any:
-    """Returns the tree with every leaf repeated along a new leading axis, one entry per device."""
-    return jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree)
-
-
-def _task_state(state: State) -> TaskState:
-    own: Any = state.pipeline_state
-    return own
-
-
 register()
 if not hasattr(jax, "device_put_replicated"):  # trainers of Brax 0.14.2 call what jax 0.10 has removed
-    jax.device_put_replicated = _device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]
+    jax.device_put_replicated = lambda tree, devices: jax.tree.map(  # pyright: ignore[reportAttributeAccessIssue]
+        lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree
+    )

@@ -82,9 +82,7 @@ def _check_words(arguments: Sequence[str]) -> None:
 def parse(arguments: Sequence[str]) -> Any:
     """Returns the record of the command that the first word or two name; its `run` returns the object of `--json`.
 
-    Raises:
-        InputError: for an unknown command or task.
-        SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
+    InputError for an unknown command or task; SystemExit 0 after help, 2 after tyro's message about a wrong argument.
     """
     _check_words(arguments)
     given, arguments = arguments, resolve_alias(arguments)

@@ -68,12 +68,7 @@ class Launch:
     """Arguments of the command."""
 
     def run(self) -> None:
-        """Runs the processes of this host and ends with their exit code.
-
-        Raises:
-            InputError: for flags that do not fit together.
-            SystemExit: with the exit code of the first process that failed.
-        """
+        """Runs the processes of this host; SystemExit with the exit code of the first one that failed."""
         if os.name != "posix":
             raise InputError(f"launch: {sys.platform} is not supported; it needs Linux or macOS")
         code = _supervise(self.command, self._members(), together=not self._sweeps)
@@ -144,11 +139,7 @@ def _split(visible: str | None) -> list[str]:
 
 
 def join() -> None:
-    """Joins the other processes of a training where `launch` has started this one; ends when `launch` does.
-
-    Raises:
-        InputError: if they cannot be reached.
-    """
+    """Joins the other processes of a training if `launch` started this one; InputError if they cannot be reached."""
     if MEMBER not in os.environ:
         return
     member = os.environ[MEMBER]

@@ -50,11 +50,9 @@ class SkillTrain:
 
 
 def parse_skill_train(arguments: Sequence[str]) -> SkillTrain:
-    """Parses the arguments of `mqe skill train`, where the skill comes first and decides the flags' defaults.
+    """Parses the arguments of `mqe skill train`: the skill, which decides the flags' defaults, comes first.
 
-    Raises:
-        InputError: for a skill that cannot be trained.
-        SystemExit: as in `parse_train`.
+    InputError for a skill that cannot be trained; SystemExit as of `parse_train`.
     """
     name = next(iter(arguments), "")
     if name not in SETTINGS and not {"-h", "--help"}.intersection(arguments):

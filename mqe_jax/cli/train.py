@@ -95,9 +95,8 @@ class Train(TaskOptions):
 def parse_train(arguments: Sequence[str]) -> Train:
     """Parses the arguments of `mqe train`; the settings' file, algorithm and network decide the flags' defaults.
 
-    Raises:
-        InputError: without a task in front, or for a file, an algorithm or a network that is not allowed.
-        SystemExit: 0 after help, 2 after tyro's message about a wrong argument.
+    InputError without a task in front, or for a file, an algorithm or a network that is not allowed; SystemExit as of
+    `mqe_jax.cli.arguments.parse`.
     """
     task, helps = next(iter(arguments), ""), {"-h", "--help"}.intersection(arguments)
     if not helps and (not task or task.startswith("-")):

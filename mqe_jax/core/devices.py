@@ -141,11 +141,7 @@ class Processes:
     """Shapes of the state of all environments."""
 
     def __init__(self, own: PyTree, whole: PyTree) -> None:
-        """Takes the shapes of a process's part of the state and of the state of all environments.
-
-        Raises:
-            InputError: unless each of several processes has one device.
-        """
+        """Takes the shapes of a process's part of the state and of the state of all environments."""
         self.count, self.leads, self.whole = jax.process_count(), jax.process_index() == 0, whole
         if self.count > 1 and jax.local_device_count() > 1:
             raise InputError(f"processes: one has {jax.local_device_count()} devices; it must have one")

@@ -73,12 +73,9 @@ def write_atomically(path: Path, content: bytes) -> None:
 def append(path: Path, content: bytes) -> None:
     """Appends to a file, which it creates where there is none; an OSError names it, also where it is a link."""
     check_locks(path)
-    with naming(path), open(path, "ab", opener=_without_links) as file:
+    no_links = getattr(os, "O_NOFOLLOW", 0)
+    with naming(path), open(path, "ab", opener=lambda name, flags: os.open(name, flags | no_links, 0o666)) as file:
         file.write(content)
-
-
-def _without_links(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def make_folder(path: Path) -> None:

@@ -20,7 +20,9 @@ _REPEATED = 1.0
 temporaries: set[os.PathLike[str]] = set()
 """Files that are removed when a signal ends the process."""
 
-_deferring = _installed = False
+installed = False
+"""Whether `install` was called: in the command line, not in a notebook."""
+_deferring = False
 _noted, _since = 0, 0.0
 
 
@@ -42,7 +44,7 @@ def exit_code(number: int) -> int:
 
 def install() -> None:
     """Ends the process on SIGINT and SIGTERM from now on. A signal that is ignored, as by `nohup`, stays ignored."""
-    global _installed
+    global installed
     if threading.current_thread() is not threading.main_thread():
         return
     wanted = [number for number in _WORDS if signal.getsignal(number) is not signal.SIG_IGN]
@@ -52,12 +54,7 @@ def install() -> None:
     signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
     for number in wanted:
         signal.signal(number, lambda number, frame: None)
-    _installed = True
-
-
-def is_installed() -> bool:
-    """Returns whether `install` was called: in the command line, not in a notebook."""
-    return _installed
+    installed = True
 
 
 @contextlib.contextmanager
@@ -74,7 +71,7 @@ def defer() -> Iterator[Callable[[], int]]:
 
     restore = None
     handled = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
-    if handled and not _installed and threading.current_thread() is threading.main_thread():
+    if handled and not installed and threading.current_thread() is threading.main_thread():
         restore = signal.signal(signal.SIGINT, note)
     _deferring, _noted = True, 0
     try:

@@ -6,7 +6,6 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from mqe_jax import skills, walk_policy  # noqa: F401  (skills register themselves
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import (
     Buffer,
     Coordinate,
@@ -151,23 +150,13 @@ P = TypeVar("P", bound=TaskParams)
 
 
 def check_above(spawn_height: float, top: float, robot: str) -> None:
-    """Checks that the spawn height clears the supporting surface at height `top` (m) for a standing robot.
-
-    Raises:
-        InputError: if it does not.
-    """
+    """Raises an InputError unless a standing robot's spawn height clears the supporting surface at `top`, m."""
     least = top + robots.get(robot).stand_height
     if spawn_height < least:
-        raise InputError(
-            f"spawn_height: {spawn_height} must be at least {least:.2f}, as the supporting surface is at {top}"
-        )
+        fail("spawn_height", spawn_height, f"at least {least:.2f}, because the supporting surface is at {top}")
 
 
 def check_gap(name: str, width: float, track_width: float) -> None:
-    """Checks that the parameter `name`, the width of a gap in a wall across the track, m, fits into the track.
-
-    Raises:
-        InputError: if it does not.
-    """
+    """Raises an InputError unless the parameter `name`, the width of a gap in a wall, m, fits into the track."""
     if width >= track_width:
         fail(name, width, f"less than the width of the track, {track_width}")

@@ -51,16 +51,12 @@ def _place(model: mujoco.MjModel, data: "mjx.Data", body: int, position: Any, qu
         if kind == _JOINT.mjJNT_FREE:
             return data.qpos[address : address + 3], data.qpos[address + 3 : address + 7]
         axis, anchor = _single(model.jnt_axis[joint]), _single(model.jnt_pos[joint])
+        moved = data.qpos[address] - _single(model.qpos0[address])
         if kind == _JOINT.mjJNT_SLIDE:
-            position = position + rotate(quaternion, axis) * (
-                data.qpos[address] - model.qpos0[address].astype(np.float32)
-            )
+            position = position + rotate(quaternion, axis) * moved
             continue
-        if kind == _JOINT.mjJNT_BALL:
-            turn = data.qpos[address : address + 4]
-        else:
-            turn = rotation(axis, data.qpos[address] - model.qpos0[address].astype(np.float32))
-        turned = compose(quaternion, turn)
+        ball = kind == _JOINT.mjJNT_BALL
+        turned = compose(quaternion, data.qpos[address : address + 4] if ball else rotation(axis, moved))
         if anchor.any():
             position = position + rotate(quaternion, anchor) - rotate(turned, anchor)
         quaternion = turned

@@ -214,7 +214,7 @@ def _train(
         try:
             training.run()
         except KeyboardInterrupt:
-            if not interrupts.is_installed():
+            if not interrupts.installed:
                 echo(f"mqe: interrupted after {training.env_steps:,} environment steps")
         written = [folder for folder in folders if folder is not None]
         if written and jax.process_index() == 0:  # one process writes the files

@@ -19,11 +19,7 @@ def _parts(file: str) -> dict[str, Any]:
 
 
 def preset(algorithm: str) -> dict[str, Any]:
-    """Returns the settings that define an algorithm, those of configs/paper.yaml, for `mqe_jax.core.settings.override`.
-
-    Raises:
-        InputError: for an unknown name, with the nearest known one.
-    """
+    """Returns the settings that define an algorithm, for `override`; InputError for an unknown name."""
     algorithms = {name: changes for name, changes in _parts("paper").items() if name != "common"}
     if algorithm not in algorithms:
         fail("algorithm", algorithm, f"one of {', '.join(algorithms)}{nearest(algorithm, algorithms)}")

@@ -91,7 +91,8 @@ def sweep(
         return {"left": _estimate(folder, jobs), "report": []}
     sweeps.prepare(settings, folder)
     make = functools.partial(build.environments, impl)
-    others, failed = sweeps.run(jobs, make, on_failure=_report_failure, stop=stop)
+    report_failure = lambda job, error: echo(f"mqe: {_names([job])} failed: {one_line(error)}")  # noqa: E731
+    others, failed = sweeps.run(jobs, make, report_failure, stop)
     if others:
         echo(f"mqe: skipped, in use by other processes: {_names(others)}")
     if stop():
@@ -109,10 +110,6 @@ def sweep(
 
 def _names(jobs: Sequence[Job]) -> str:
     return ", ".join(job.cell.path.as_posix() for job in jobs)
-
-
-def _report_failure(job: Job, error: Exception) -> None:
-    echo(f"mqe: {_names([job])} failed: {one_line(error)}")
 
 
 def _estimate(folder: Path, jobs: Sequence[Job]) -> dict[str, Any]:

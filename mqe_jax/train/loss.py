@@ -47,11 +47,9 @@ def value_loss(
 
     def loss(error: jax.Array) -> jax.Array:
         size, half = jnp.abs(error), 0.5 * jnp.square(error)
-        return (
-            half
-            if huber_delta is None
-            else jnp.where(size <= huber_delta, half, huber_delta * (size - 0.5 * huber_delta))
-        )
+        if huber_delta is None:
+            return half
+        return jnp.where(size <= huber_delta, half, huber_delta * (size - 0.5 * huber_delta))
 
     unclipped = loss(value - target)
     if clip is None:

@@ -51,10 +51,9 @@ class Needs:
 
 @check_arguments(env=AnyEnvironment, config=TrainConfig)
 def needs_of(env: Any, config: TrainConfig) -> Needs:
-    """Returns the needs of a policy of one of an environment's teams, of a task or a batch of it.
+    """Returns what a policy of one team needs of an environment, a task or a batch of it.
 
-    Raises:
-        InputError: if the environment lacks the policy's group of observations.
+    InputError if the environment lacks the policy's group of observations.
     """
     sizes = {"policy": env.observation_size, **getattr(env, "group_sizes", {})}
     if config.group not in sizes:

@@ -97,7 +97,9 @@ class Viewer:
                 if now - shown >= 1 / PANEL_RATE:
                     real_time = (self.session.steps - counted) * dt / (now - shown)
                     shown, counted = now, self.session.steps
-                    self._panel.show(self._positions(), real_time)
+                    agents = self.session.env.index.base_qpos[: self.session.env.num_agents, :3]
+                    frame = self.session.moment(self._panel.back).frame
+                    self._panel.show(frame.qpos[self._panel.env, agents], real_time)
                     self._panel.plot()
                 if not stepped:
                     time.sleep(max(0.001, min(due - now, 0.01)))
@@ -140,10 +142,6 @@ class Viewer:
             return False
         self.session.advance()
         return True
-
-    def _positions(self) -> np.ndarray:
-        env, frame = self.session.env, self.session.moment(self._panel.back).frame
-        return frame.qpos[self._panel.env, env.index.base_qpos[: env.num_agents, :3]]
 
     def _target(self) -> tuple[int, list[int]] | None:
         camera = self._panel.camera

@@ -86,7 +86,9 @@ def _draw_gl(
     vis.quality.shadowsize = 2048 if size[0] > 640 else 1024  # a fifth of a software renderer's time
     vis.quality.offsamples = 4
     vis.quality.numslices, vis.quality.numstacks = 18, 8
-    grain(model)
+    # The ground's texture, if the model has one.
+    material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, GROUND_MATERIAL)
+    model.geom_matid[model.geom_group == GROUND_GROUP] = material
     # One directional light and a headlight, together below saturation on a pale floor.
     vis.headlight.ambient[:] = 0.46
     vis.headlight.diffuse[:] = 0.16
@@ -120,12 +122,6 @@ def _draw_gl(
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, view, option)
             yield renderer.render()
-
-
-def grain(model: mujoco.MjModel) -> None:
-    """Gives the ground its texture, where the model has one."""
-    material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, GROUND_MATERIAL)
-    model.geom_matid[model.geom_group == GROUND_GROUP] = material
 
 
 _SIZE = tuple[Pixels, Pixels]
@@ -168,11 +164,11 @@ def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
     episode=Episode,
     path=PathText,
     view=str | None,
-    size=tuple[Pixels, Pixels] | None,
+    size=_SIZE | None,
     fps=FrameRate | None,
     speed=Speed,
     at=Time | None,
-    backend=Literal["auto", "egl", "osmesa"] | None,
+    backend=_BACKEND,
 )
 def render_episode(
     env: QuadrupedEnv,
