@@ -23,9 +23,8 @@ def measure(run: str, task: str, episodes: int, deterministic: bool) -> tuple[di
     results, endings = {}, {}
     match = issubclass(TASKS[task], Match)
     for opponent in ("random", "idle", "scripted") if match else (None,):
-        shown = Eval(
-            target=run, opponent=opponent, episodes=episodes, deterministic=deterministic, impl="c", json=True
-        ).run()
+        options = {"episodes": episodes, "deterministic": deterministic, "impl": "c", "json": True}
+        shown = Eval(target=run, opponent=opponent, **options).run()
         found = {name: round(value, DIGITS) for name, value in shown.items() if isinstance(value, float)}
         if match:
             results |= {f"{name}/{opponent}": found[f"{name}_rate"] for name in ("win", "loss")}

@@ -72,9 +72,7 @@ class Env(BraxEnv):
         """Advances by one environment step; raises an InputError for an action of another size."""
         check("state", state, State)
         if jnp.shape(action) != (self.action_size,):
-            raise InputError(
-                f"action: shape {jnp.shape(action)}; expected {(self.action_size,)} (agents * action size)"
-            )
+            raise InputError(f"action: shape {jnp.shape(action)}; expected ({self.action_size},), agents * action size")
         before: Any = state.pipeline_state
         after = self.env.step(before, action.reshape(self.env.num_agents, self.env.action_size))
         obs = after.obs.reshape(-1)
@@ -118,9 +116,7 @@ class AutoReset(Wrapper):
         """Steps the batch, then resets the environments whose episodes ended."""
         shape = (*jnp.shape(check("state", state, State).done), self.action_size)
         if jnp.shape(action) != shape:
-            raise InputError(
-                f"action: shape {jnp.shape(action)}; expected {shape} (environments, agents * action size)"
-            )
+            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape}, environments and all actions")
         info = {**state.info, "steps": jnp.where(state.done, 0.0, state.info["steps"])}
         cleared = state.replace(done=jnp.zeros_like(state.done), info=info)  # pyright: ignore[reportAttributeAccessIssue]
         after = self.env.step(cleared, action)

@@ -17,9 +17,7 @@ from mqe_jax.core.literal import line
 from mqe_jax.core.settings import merge, record
 
 Repeated = tyro.conf.UseAppendAction
-Impl = Annotated[
-    str, tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine on the CPU).")
-]
+Impl = Annotated[str, tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine, CPU).")]
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
 Seed = Annotated[settings.Seed, tyro.conf.arg(help="Random seed.")]
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]

@@ -40,10 +40,8 @@ def keep() -> None:
     from mqe_jax.core.files import user_cache
 
     with contextlib.suppress(OSError, InputError):  # without a home, or one that cannot be written, nothing is stored
-        lines = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
-        flags = next(
-            (line for line in lines.splitlines() if line.startswith(("flags", "Features"))), platform.machine()
-        )
+        lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
+        flags = next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
         folder = user_cache() / f"programs-{zlib.crc32(flags.encode()):08x}"
         folder.mkdir(parents=True, exist_ok=True)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)

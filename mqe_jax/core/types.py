@@ -26,9 +26,8 @@ def _key(value: Any) -> Any:
     raw = _raw_key(generator())
     given = (value.shape, value.dtype) if isinstance(value, jax.Array | np.ndarray) else ()
     if given != (raw.shape, raw.dtype) and not (given[:1] == ((),) and is_typed_key(value)):
-        raise ValueError(
-            f"a random key, such as jax.random.PRNGKey(0); a raw one of {generator()} is {raw.shape} uint32"
-        )
+        about = f"a raw one of {generator()} is {raw.shape} uint32"
+        raise ValueError(f"a random key, such as jax.random.PRNGKey(0); {about}")
     return value
 
 

@@ -309,9 +309,8 @@ class QuadrupedEnv(Task[S, P]):
         draw = None if outcome.draw is None else clean(outcome.draw, 1.0)
         causes = jnp.stack([diverged, fall, crash, decided, late])
         first = (causes & (jnp.cumsum(causes) == 1)).astype(jnp.float32)
-        outcome = dataclasses.replace(
-            jax.tree.map(clean, outcome), draw=draw, ending=dict(zip(ENDINGS, first, strict=True))
-        )
+        ending = dict(zip(ENDINGS, first, strict=True))
+        outcome = dataclasses.replace(jax.tree.map(clean, outcome), draw=draw, ending=ending)
         metrics = {name: clean(value) for name, value in {**logged, "collision": collision}.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
         ended = {"terminated": terminated, "truncated": ~terminated & late}

@@ -104,11 +104,10 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
         return robot_state.position_w[:, 0] > state.anchors[0, 0] + self.params.past_gate
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
+        nearer = self.target_distance(before.robots) - self.target_distance(after.robots)
         return {
             "success": jnp.sum(after.robots.count(self.through(after.state, after.robots))).astype(jnp.float32),
-            "approach": jnp.sum(
-                after.robots.count(self.target_distance(before.robots) - self.target_distance(after.robots))
-            ),
+            "approach": jnp.sum(after.robots.count(nearer)),
             "crowding": reward.crowding(after.robots.position_w[:, :2], after.robots.active),
             "collision": collision.astype(jnp.float32),
         }

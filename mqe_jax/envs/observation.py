@@ -85,9 +85,7 @@ class ObservationLayout:
         """Concatenates named blocks (A, width) into observations (A, size); ValueError for other names or widths."""
         check_names("observe", values, self.names)
         rows = (agents or len(values[self.names[0]]),)
-        parts = [
-            check_shape(f"observe: {block.name}", values[block.name], (*rows, block.width)) for block in self.blocks
-        ]
+        parts = [check_shape(f"observe: {x.name}", values[x.name], (*rows, x.width)) for x in self.blocks]
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 
     def entities(self, observation: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:

@@ -49,8 +49,7 @@ class TaskParams:
     """Maximum |roll|, rad; above it the episode terminates."""
     max_pitch: Positive = 1.6
     """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so a limit above pi / 2, as in the
-    released system, is never reached: a robot that pitches over has a roll of pi.
-    """
+    released system, is never reached: a robot that pitches over has a roll of pi."""
     min_height: Coordinate = -1.0
     """Minimum trunk height, m; below it the episode terminates."""
     max_height: Coordinate = 100.0
@@ -61,8 +60,7 @@ class TaskParams:
     """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
     skill: str | tuple[str, ...] = "walk"
     """Skill of the agents with control `command` (`mqe_jax.skills`); of several, a further action entry says which one
-    acts (`mqe_jax.skills.choice`).
-    """
+    acts (`mqe_jax.skills.choice`)."""
     skill_weights: FileName | None = None
     """Weights file of the skill; the shipped one if None."""
     gait: str | None = None
@@ -71,12 +69,10 @@ class TaskParams:
     """Commands of the skill that the action sets, in order."""
     command_ranges: Mapping[str, Range] = FrozenMapping()
     """Lowest and highest value of these commands, by name; the skill's default ranges for those that are not named.
-    Scripted policies keep the default ranges.
-    """
+    Scripted policies keep the default ranges."""
     position_scale: Positive = 1.0
     """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
-    joint angles, hips within 0.125 rad.
-    """
+    joint angles, hips within 0.125 rad."""
     actuator_network: FileName | None = None
     """Weights file of an actuator network that replaces PD control; PD control if None."""
     friction: PositiveFriction = 1.0
@@ -87,24 +83,20 @@ class TaskParams:
     """Maximum solver iterations per physics step."""
     contacts: Literal["full", "minimal"] = "full"
     """Set of the robots' collision geoms: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
-    and disables limb collisions.
-    """
+    and disables limb collisions."""
     contacts_per_robot: Buffer = 12
     """Contact buffer size per robot: per environment on MJX-JAX, which keeps the deepest contacts, and on average over
-    all environments on Warp.
-    """
+    all environments on Warp."""
     constraints_per_robot: Buffer = 64
     """Constraint buffer size per robot on Warp, per environment."""
     privileged_contact_forces: bool = False
     """Whether the privileged observation includes the contact forces on trunks and feet; their sensors cost about 8% of
-    the throughput.
-    """
+    the throughput."""
     randomization: Randomization = Randomization()
     """Domain randomisation."""
     frozen_time: Time = 4.0
     """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
-    first learn sequential subtasks one at a time. Inactive at assistance 0.
-    """
+    first learn sequential subtasks one at a time. Inactive at assistance 0."""
 
     shaping_floor: Fraction = 1.0
     """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at assistance 1."""

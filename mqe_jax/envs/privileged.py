@@ -44,28 +44,20 @@ class PrivilegedObservation:
         self._foot_force = index.foot_force if contact_forces else None
         self._qpos = np.setdiff1d(np.arange(model.nq), np.concatenate([index.base_qpos, index.joint_qpos], axis=1))
         self._qvel = np.setdiff1d(np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1))
-        robot_blocks = [
-            Block(f"robot{i}/{part.name}", part.width, part.meaning) for i in range(count) for part in _ROBOT
-        ]
-        self.layout = ObservationLayout(
-            tuple(
-                block
-                for block in (
-                    *robot_blocks,
-                    Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
-                    Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
-                    Block("anchors", 2 * num_anchors, "x, y of each, m"),
-                    Block("friction", count, "sliding friction of each robot"),
-                    Block("payload", count, "of each robot, kg"),
-                    Block("center_of_mass", 3 * count, "shift of each trunk's centre of mass, m"),
-                    Block("motor_strength", count, "factor on each robot's torques"),
-                    Block("action_lag", 1, "environment steps"),
-                    Block("gait_phase", clock_size * count, "of each robot's skill; walk policy: sine and cosine"),
-                    Block("contact_force", 5 * count if contact_forces else 0, "on each robot's trunk and feet, N"),
-                )
-                if block.width
-            )
+        blocks = (
+            *(Block(f"robot{i}/{part.name}", part.width, part.meaning) for i in range(count) for part in _ROBOT),
+            Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
+            Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
+            Block("anchors", 2 * num_anchors, "x, y of each, m"),
+            Block("friction", count, "sliding friction of each robot"),
+            Block("payload", count, "of each robot, kg"),
+            Block("center_of_mass", 3 * count, "shift of each trunk's centre of mass, m"),
+            Block("motor_strength", count, "factor on each robot's torques"),
+            Block("action_lag", 1, "environment steps"),
+            Block("gait_phase", clock_size * count, "of each robot's skill; walk policy: sine and cosine"),
+            Block("contact_force", 5 * count if contact_forces else 0, "on each robot's trunk and feet, N"),
         )
+        self.layout = ObservationLayout(tuple(block for block in blocks if block.width))
 
     def observe(self, robot_state: RobotState, state: State[Any], clock: jax.Array) -> jax.Array:
         """Returns the observation of one environment (P,); `clock` is that of the skills (R, clock_size)."""

@@ -56,9 +56,7 @@ class Scene:
         if not 1 <= self.num_robots <= MAX_ROBOTS:
             raise InputError(f"Scene.num_robots: {self.num_robots} must be between 1 and {MAX_ROBOTS}")
         if self.colors and len(self.colors) != self.num_robots:
-            raise InputError(
-                f"Scene.colors: {self.colors} must have one colour for each of the {self.num_robots} robots"
-            )
+            raise InputError(f"Scene.colors: {self.colors} must have a colour for each of {self.num_robots} robots")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -71,10 +71,10 @@ def finished(run_dir: Path) -> bool:
     total = config.num_updates * config.steps_per_update
     if read_metadata(run_dir / POLICY_FILE, kind="policy").get("env_steps") != total:
         return False
+    if config.evaluation.every is None:
+        return True
     evaluations = read_evaluations(run_dir)
-    return config.evaluation.every is None or (
-        evaluations["absolute"] is not None and evaluations.get("ended_at") == total
-    )
+    return evaluations["absolute"] is not None and evaluations.get("ended_at") == total
 
 
 def read_runs(folder: Path) -> list[Run]:

@@ -130,9 +130,7 @@ def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False,
     expected, structure = _flatten(template)
     for name in expected:
         if name not in arrays:
-            raise InputError(
-                f"{path}: {name} is missing; the file was written with different settings or another version"
-            )
+            raise InputError(f"{path}: {name} is missing; the file has other settings or is of another version")
     for name in arrays:
         if name not in expected:
             raise InputError(f"{path}: unexpected entry {name}, not defined by the current settings")

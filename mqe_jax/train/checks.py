@@ -17,9 +17,7 @@ from mqe_jax.train.networks import Network
 def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
     if len(teams_of(env)) > 1:
-        raise InputError(
-            f"env: {env.name} has {len(teams_of(env))} teams; give one: versus(env, opponents) or Mirror(env)"
-        )
+        raise InputError(f"env: {env.name} has {len(teams_of(env))} teams; use versus(env, opponents) or Mirror(env)")
     if env.num_envs * processes != config.num_envs:
         fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs * processes}")
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
@@ -65,9 +63,7 @@ def check_teacher(config: TrainConfig, teacher: Any) -> None:
 def check_divisible(config: TrainConfig, network: Network, processes: int = 1) -> None:
     """Checks that rollouts split into chunks, and these into minibatches."""
     if config.rollout_steps % network.chunk_length:
-        fail(
-            "rollout_steps", config.rollout_steps, f"a multiple of the network's chunk_length ({network.chunk_length})"
-        )
+        fail("rollout_steps", config.rollout_steps, f"a multiple of network.chunk_length, {network.chunk_length}")
     chunks = config.steps_per_update // network.chunk_length
     if chunks % config.ppo.minibatches:
         fail("ppo.minibatches", config.ppo.minibatches, f"a divisor of the rollout's number of chunks ({chunks})")

@@ -237,9 +237,7 @@ class Evaluator:
                 sums = jax.device_get(progress._replace(env_state=(), memory=()))
                 each = [jax.tree.map(lambda x: x[i], sums) for i in range(len(keys))]  # noqa: B023
                 return [_result(self._env.name, episodes, own) for own in each]
-        raise InputError(
-            f"episodes: {episodes} episodes of {self._env.name} are not finished after {self._max_steps} steps"
-        )
+        raise InputError(f"episodes: {episodes} of {self._env.name} are not finished after {self._max_steps} steps")
 
 
 def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:

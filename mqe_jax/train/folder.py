@@ -73,12 +73,9 @@ def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
         return [steps[max(common)] for steps in by_step]
     if all(not steps or 0 in steps for steps in by_step):
         return [None] * len(folders)
-    newest = ", ".join(
-        f"{folder.name} {max(steps, default='none')}" for folder, steps in zip(folders, by_step, strict=True)
-    )
-    raise InputError(
-        f"run_dir: {folders[0].parent}: no step has checkpoints of all seeds ({newest}); resume them separately"
-    )
+    newest = [f"{run.name} {max(steps, default='none')}" for run, steps in zip(folders, by_step, strict=True)]
+    hint = f"({', '.join(newest)}); resume them separately"
+    raise InputError(f"run_dir: {folders[0].parent}: no step has checkpoints of all seeds {hint}")
 
 
 def check_links(run_dir: Path) -> None:

@@ -147,11 +147,10 @@ def make_learner(
         loss_metrics["learning_rate"] = learning_rate * now.learning_rate_factor
         obs_normalizer = state.obs_normalizer
         if config.normalization.observations:
+            some = jnp.any(transitions.active, axis=-1)
             obs_normalizer = ObservationNormalizer(
                 running_update(obs_normalizer.obs, transitions.obs, transitions.active),
-                running_update(
-                    obs_normalizer.privileged, transitions.privileged_obs, jnp.any(transitions.active, axis=-1)
-                ),
+                running_update(obs_normalizer.privileged, transitions.privileged_obs, some),
             )
         new_state = TrainState(
             params=params,

@@ -20,6 +20,7 @@ from typing_extensions import TypedDict
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_locks, read_json, write_atomically
+from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Memory, Observations, VectorEnv
 from mqe_jax.train.checkpoint import files_by_step
 from mqe_jax.train.config import TrainConfig
@@ -54,9 +55,7 @@ class Monitor:
 
     def __init__(self, env: VectorEnv, config: TrainConfig) -> None:
         if env.num_envs != config.evaluation.episodes:
-            raise InputError(
-                f"evaluation.episodes: {config.evaluation.episodes} must equal the env's num_envs, {env.num_envs}"
-            )
+            fail("evaluation.episodes", config.evaluation.episodes, f"the number of environments, {env.num_envs}")
         dims = needs_of(env, config).dims
         act_of = policy_act(dims, config.network, config.normalization.observations)
 

@@ -147,8 +147,8 @@ def minibatches(ppo: PPO, key: jax.Array, parts: int, envs: int) -> jax.Array:
     """
     groups = ppo.groups // devices.size()
     keys = key[None] if ppo.groups == 1 else devices.rows(lambda n: jax.random.split(key, n), groups)
-    part, env = jnp.divmod(
-        jax.vmap(lambda key: jax.random.permutation(key, parts * envs // groups))(keys), envs // groups
-    )
-    chunk = part * envs + jnp.arange(groups)[:, None] * (envs // groups) + env
+    of_group = envs // groups
+    permuted = jax.vmap(lambda key: jax.random.permutation(key, parts * envs // groups))(keys)
+    part, env = jnp.divmod(permuted, of_group)
+    chunk = part * envs + jnp.arange(groups)[:, None] * of_group + env
     return jnp.swapaxes(chunk.reshape(groups, ppo.minibatches, -1), 0, 1).reshape(ppo.minibatches, -1)

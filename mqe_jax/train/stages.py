@@ -68,9 +68,8 @@ class Stages:
         log_ratio = RATIOS[ppo.ratio](now_taken, old)
         surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
         policy_loss = _mean(jnp.sum(surrogate, axis=-1), active)
-        critic_loss = _mean(
-            value_loss(new.value, batch.old_value, batch.target, ppo.value_clip, ppo.huber_delta), active
-        )
+        error = value_loss(new.value, batch.old_value, batch.target, ppo.value_clip, ppo.huber_delta)
+        critic_loss = _mean(error, active)
         mean_entropy = _mean(new.entropy, active)
         per_agent = RATIOS["agent"](now_taken, old)[..., 0]
         metrics = {

@@ -77,19 +77,17 @@ def first_state(
             if league is not None:
                 state = league.seat(dataclasses.replace(state, extra=league.begin(state)))
         return state, 0.0
-    metadata = read_metadata(checkpoint, kind="checkpoint")
+    metadata, run = read_metadata(checkpoint, kind="checkpoint"), checkpoint.parent.parent
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
     if (theirs := metadata.get("generator", generator())) != generator():
-        fail(
-            "jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {checkpoint.parent.parent}"
-        )
+        fail("jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {run}")
     if (algorithm := metadata.get("stages", Stages.__name__)) != stages.__name__:
-        fail("stages", stages.__name__, f"{algorithm!r}, the algorithm of the run in {checkpoint.parent.parent}")
+        fail("stages", stages.__name__, f"{algorithm!r}, the algorithm of the run in {run}")
     before, seconds = metadata.get("config", {}), metadata.get("seconds", 0.0)
     if not isinstance(before, dict) or not isinstance(seconds, int | float) or not 0 <= seconds < math.inf:
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
-    check_same(checkpoint.parent.parent, before, config)
+    check_same(run, before, config)
     if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
         fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
     whole = metadata.get("environments", True)
@@ -114,9 +112,7 @@ def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> Trai
     """Returns the policy that `config.start` names; InputError unless it fits environment, parameters and settings."""
     start = str(config.start)
     if start not in NAMED and not Path(start).exists():
-        shipped = (
-            f"one of {', '.join(NAMED)}" if NAMED else "a shipped policy's task, after `import mqe_jax.policies.zoo`"
-        )
+        shipped = f"one of {', '.join(NAMED)}" if NAMED else "a shipped one's task, after `import mqe_jax.policies.zoo`"
         fail("start", start, f"a run folder, a policy file, or {shipped}")
     policy = NAMED[start]() if start in NAMED else read_policy(start)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})

@@ -49,9 +49,8 @@ class Stage:
         fixed, moving, self._walls = _sort_geoms(self._model)
         still = [self._add_batch(f"fixed/{body}", geoms, [body]) for body, geoms in fixed.items()]
         self._place(still, *self._poses(frame))
-        self._batches = [
-            self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in self._group(moving)
-        ]
+        groups = self._group(moving)
+        self._batches = [self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in groups]
         self._wall_handles = [self._add_wall(geom) for geom in self._walls]
         self.draw(frame)
 

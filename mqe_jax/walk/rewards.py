@@ -92,9 +92,8 @@ def reward_terms(
     feet_heading = jnp.stack([cos * feet_w[:, 0] + sin * feet_w[:, 1], -sin * feet_w[:, 0] + cos * feet_w[:, 1]], -1)
 
     # Raibert heuristic: stance corners, shifted by half of the distance travelled during stance.
-    stance = jnp.stack(
-        [jnp.array([0.5, 0.5, -0.5, -0.5]) * commands[13], jnp.array([0.5, -0.5, 0.5, -0.5]) * commands[12]], -1
-    )
+    along, across = jnp.array([0.5, 0.5, -0.5, -0.5]), jnp.array([0.5, -0.5, 0.5, -0.5])
+    stance = jnp.stack([along * commands[13], across * commands[12]], -1)
     shift = jnp.abs(1.0 - 2.0 * phases) - 0.5
     speed = jnp.stack([commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1)
     place = stance + shift[:, None] * speed * 0.5 / commands[4]

@@ -67,9 +67,8 @@ def hall(x: Point, y: Point, color: Color, shapes: Sequence[Shape] = ()) -> Grou
 def halves(x: Point, y: Point) -> Ground:
     """Returns a floor whose halves are those of the first and of the second team, with a line between them."""
     blue, red = (mix(ROBOT_COLORS[i], STONE, 0.74) for i in (0, 2))
-    return Ground(
-        _HALL, (rectangle(x, (y[0], 0.0), blue), rectangle(x, (0.0, y[1]), red), line((x[0], 0.0), (x[1], 0.0)))
-    )
+    middle = line((x[0], 0.0), (x[1], 0.0))
+    return Ground(_HALL, (rectangle(x, (y[0], 0.0), blue), rectangle(x, (0.0, y[1]), red), middle))
 
 
 def warehouse(length: float, width: float, goal_x: float) -> Ground:
@@ -109,11 +108,9 @@ def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
     """Returns a football pitch between two goal lines x; `goal` is the width, height and depth of both goals, m."""
     half, (mouth, height, depth) = width / 2, goal
     middle = sum(x) / 2
-    edges = np.linspace(x[0] - depth, x[1] + depth, 13).tolist()
+    stripes = itertools.pairwise(np.linspace(x[0] - depth, x[1] + depth, 13).tolist())
     tones = ((0.33, 0.57, 0.29, 1.0), (0.38, 0.63, 0.33, 1.0))
-    shapes: list[Shape] = [
-        rectangle((a, b), (-half, half), tones[i % 2]) for i, (a, b) in enumerate(itertools.pairwise(edges))
-    ]
+    shapes: list[Shape] = [rectangle(stripe, (-half, half), tones[i % 2]) for i, stripe in enumerate(stripes)]
     shapes += outline(x, (0.1 - half, half - 0.1), width=0.07)
     shapes += [line((middle, 0.1 - half), (middle, half - 0.1), width=0.07), mark((middle, 0.0, 0.0), (0.12,), level=3)]
     shapes += circle((middle, 0.0), 1.3, width=0.07)

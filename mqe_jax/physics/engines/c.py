@@ -61,9 +61,8 @@ class CEngine(Engine):
         return f"runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
 
     def blank(self) -> mjx.Data:
-        return private.without_pointers(
-            private.load_mjx().make_data(self.model, jax.local_devices(backend="cpu")[0], impl="cpp")
-        )
+        device = jax.local_devices(backend="cpu")[0]
+        return private.without_pointers(private.load_mjx().make_data(self.model, device, impl="cpp"))
 
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int

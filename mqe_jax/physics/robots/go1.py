@@ -109,7 +109,5 @@ GO1 = Robot(
     stand_height=0.30,
     collision=_COLLISION,
     visuals=_VISUALS,
-    walk=WalkSettings(
-        weights="go1", stance_width=0.25, stance_length=0.428, min_knee_height=0.06, min_trunk_height=0.1
-    ),
+    walk=WalkSettings("go1", stance_width=0.25, stance_length=0.428, min_knee_height=0.06, min_trunk_height=0.1),
 )

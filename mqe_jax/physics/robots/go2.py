@@ -113,7 +113,5 @@ GO2 = Robot(
     stand_height=0.30,
     collision=_COLLISION,
     visuals=_VISUALS,
-    walk=WalkSettings(
-        weights="go2", stance_width=0.28, stance_length=0.438, min_knee_height=0.06, min_trunk_height=0.1
-    ),
+    walk=WalkSettings("go2", stance_width=0.28, stance_length=0.438, min_knee_height=0.06, min_trunk_height=0.1),
 )
