@@ -38,9 +38,6 @@ _WHOLE = PartitionSpec()
 _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
 
 
-# -- inside of the learner ---------------------------------------------------------------------------------------------
-
-
 def size() -> int:
     """Returns the number of processes among which the environments are split."""
     if _ALONE.get():
@@ -103,9 +100,6 @@ def alone() -> Iterator[None]:
         yield
     finally:
         _ALONE.reset(token)
-
-
-# -- around it ---------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

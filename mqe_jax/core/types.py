@@ -20,6 +20,8 @@ Params = dict[str, Any]
 """Nested dict of parameter arrays."""
 Memory = Any
 """Recurrent state: a pytree of arrays with leading axis N, empty for feed-forward networks."""
+Mask = jax.Array | None
+"""Which agents take part (..., A) bool; None: all."""
 
 
 def _key(value: Any) -> Any:

@@ -58,8 +58,6 @@ class Match(QuadrupedEnv[S, P]):
                 given = self.params.command_ranges[name]
                 fail(f"command_ranges.{name}", given, f"symmetric in {self.name}, which mirrors team 1")
 
-    # -- task interface (override) ------------------------------------------------------------------------------
-
     def eliminated(self, robot_state: RobotState) -> jax.Array:
         """Returns which team is eliminated (2,) bool: by default one with a fallen active robot."""
         return jnp.any(self.fallen(robot_state).reshape(2, -1), axis=1)
@@ -76,8 +74,6 @@ class Match(QuadrupedEnv[S, P]):
     def further(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns further results of both teams by name (2,), if the episode ends in this step."""
         return {}
-
-    # -- both teams' frames -------------------------------------------------------------------------------------
 
     def views(self, info: jax.Array) -> jax.Array:
         """Transforms base information (R, 6), position and roll, pitch, yaw, to both teams' frames: (2, R, 6)."""
@@ -107,8 +103,6 @@ class Match(QuadrupedEnv[S, P]):
         else:
             mirrored = action[:, MIRRORED_JOINTS] * MIRRORED_SIGNS
         return jnp.where(self.team_of[:, None] == 1, mirrored, action)
-
-    # -- rewards and result -------------------------------------------------------------------------------------
 
     def zero_sum(self, own: jax.Array) -> jax.Array:
         """Returns each agent's zero-sum term (A,) from both teams' own terms (2,)."""

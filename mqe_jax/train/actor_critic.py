@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mqe_jax.core import devices
 from mqe_jax.core.settings import fail
-from mqe_jax.core.types import Memory, NetworkMemory, Params
+from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import ActorCritic, ChunkResult, EnvDims, Network
@@ -123,7 +123,7 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         return mean, jnp.broadcast_to(log_std, mean.shape), memory
 
     def act(
-        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: jax.Array | None = None
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: Mask = None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         is_first = jnp.zeros((1, *obs.shape[:-2]), bool)
         mean, log_std, memory = distribution(params, memory, is_first, obs[None])
@@ -134,12 +134,7 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         return action, log_prob(action, mean, log_std), memory
 
     def value(
-        params: Params,
-        memory: Memory,
-        is_first: jax.Array,
-        obs: jax.Array,
-        privileged: jax.Array,
-        active: jax.Array | None = None,
+        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array, active: Mask = None
     ) -> tuple[jax.Array, Memory]:
         if settings.critic_input == "privileged":
             x = privileged[..., None, :]
@@ -157,7 +152,7 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         obs: jax.Array,
         privileged: jax.Array,
         action: jax.Array,
-        active: jax.Array | None = None,
+        active: Mask = None,
     ) -> ChunkResult:
         mean, log_std, _ = distribution(params, memory.actor, is_first, obs)
         values, _ = value(params, memory.critic, is_first, obs, privileged)

@@ -15,14 +15,14 @@ import numpy as np
 
 from mqe_jax.core import devices
 from mqe_jax.core.settings import fail
-from mqe_jax.core.types import Memory, NetworkMemory, Params
+from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import ChunkResult, EnvDims, Mat, Network
 
 
 def attention(
-    params: Params, query: jax.Array, context: jax.Array, heads: int, active: jax.Array | None, *, causal: bool
+    params: Params, query: jax.Array, context: jax.Array, heads: int, active: Mask, *, causal: bool
 ) -> jax.Array:
     """Multi-head attention of `query` to `context`: (..., A, W), (..., A, W) -> (..., A, W).
 
@@ -98,7 +98,7 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
     }
 
 
-def encode(params: Params, obs: jax.Array, heads: int, active: jax.Array | None = None) -> jax.Array:
+def encode(params: Params, obs: jax.Array, heads: int, active: Mask = None) -> jax.Array:
     """Returns features of each agent from the observations of all active ones: (..., A, O) -> (..., A, W)."""
     x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], nn.layer_norm(params["norm_in"], obs))))
     for block in params["blocks"]:
@@ -107,9 +107,7 @@ def encode(params: Params, obs: jax.Array, heads: int, active: jax.Array | None 
     return x
 
 
-def decode(
-    params: Params, features: jax.Array, action: jax.Array, heads: int, active: jax.Array | None = None
-) -> jax.Array:
+def decode(params: Params, features: jax.Array, action: jax.Array, heads: int, active: Mask = None) -> jax.Array:
     """Returns mean actions given those of preceding active agents: (..., A, W), (..., A, D) -> (..., A, D).
 
     An agent's own and later actions have no effect on its mean; its token is the action of the active agent before it,
@@ -125,7 +123,7 @@ def decode(
     return _head(params["head"], x)
 
 
-def _preceding(action: jax.Array, active: jax.Array | None) -> jax.Array:
+def _preceding(action: jax.Array, active: Mask) -> jax.Array:
     """Returns the action (..., A, D) of each agent's predecessor among the active ones, zero without one."""
     tokens, last = [], jnp.zeros_like(action[..., 0, :])
     for agent in range(action.shape[-2]):
@@ -149,7 +147,7 @@ def network(settings: Mat, dims: EnvDims) -> Network:
     heads = settings.heads
 
     def act(
-        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: jax.Array | None = None
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: Mask = None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         features = encode(params["encoder"], obs, heads, active)
         shape = (*obs.shape[:-1], dims.action)
@@ -167,12 +165,7 @@ def network(settings: Mat, dims: EnvDims) -> Network:
         return action, log_prob(action, mean, log_std), memory
 
     def value(
-        params: Params,
-        memory: Memory,
-        is_first: jax.Array,
-        obs: jax.Array,
-        privileged: jax.Array,
-        active: jax.Array | None = None,
+        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array, active: Mask = None
     ) -> tuple[jax.Array, Memory]:
         return _head(params["value_head"], encode(params["encoder"], obs, heads, active))[..., 0], memory
 
@@ -183,7 +176,7 @@ def network(settings: Mat, dims: EnvDims) -> Network:
         obs: jax.Array,
         privileged: jax.Array,
         action: jax.Array,
-        active: jax.Array | None = None,
+        active: Mask = None,
     ) -> ChunkResult:
         features = encode(params["encoder"], obs, heads, active)
         mean = decode(params["decoder"], features, action, heads, active)

@@ -34,11 +34,6 @@ def begun_anew(state: AdamState, when: jax.Array | bool) -> AdamState:
     return state if when is False else jax.tree.map(lambda x: jnp.where(when, jnp.zeros_like(x), x), state)
 
 
-def global_norm(tree: PyTree) -> jax.Array:
-    """Returns the Euclidean norm () of all leaves as one vector."""
-    return jnp.sqrt(sum((jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.float32(0.0)))
-
-
 def adam(eps: float = 1e-5, max_grad_norm: float | None = None) -> Optimizer:
     """Returns Adam with gradients clipped to a global norm of at most `max_grad_norm`.
 
@@ -55,7 +50,8 @@ def adam(eps: float = 1e-5, max_grad_norm: float | None = None) -> Optimizer:
     def update(
         grads: PyTree, state: AdamState, params: PyTree, learning_rate: jax.Array | float
     ) -> tuple[PyTree, AdamState, jax.Array]:
-        grad_norm = global_norm(grads)
+        squares = (jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(grads))
+        grad_norm = jnp.sqrt(sum(squares, jnp.float32(0.0)))
         if max_grad_norm is not None:
             scale = jnp.minimum(1.0, max_grad_norm / jnp.maximum(grad_norm, 1e-12))
             grads = jax.tree.map(lambda g: g * scale, grads)

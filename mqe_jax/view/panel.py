@@ -131,8 +131,6 @@ class Panel:
             commands = np.stack(list(session.commands)[::every])[:, self.env, agent]
             self._command_plot.data = (times, *commands.T.astype(float))
 
-    # -- controls -----------------------------------------------------------------------------------------------
-
     def _add_menu(self, menu: Menu) -> None:
         gui, shown = self._gui, menu.shown
         with gui.add_folder("Task and policies"):

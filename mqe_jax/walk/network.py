@@ -16,7 +16,7 @@ Source: walk-these-ways, Margolis and Agrawal, arXiv 2212.03238.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from mqe_jax import walk_policy
 from mqe_jax.core import devices
 from mqe_jax.core.limits import Horizon, NonNegative
 from mqe_jax.core.settings import FileName, fail, record
-from mqe_jax.core.types import Memory, NetworkMemory, Params
+from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.physics import robots
 from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
 from mqe_jax.skills import agile
@@ -88,7 +88,7 @@ class Form:
     def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
         """Returns the mean square difference () of actions of mirrored inputs (B, n) from mirrored actions (B, 12)."""
         other, _ = self.infer(params, self.reflect(inputs), precision=_PRECISION)
-        return jnp.mean(jnp.square(other - mirror_action(mean)))
+        return jnp.mean(jnp.square(other - mean[..., MIRRORED_JOINTS] * MIRRORED_SIGNS))
 
 
 WALK_FORM = Form(
@@ -122,12 +122,11 @@ class HistorySettings(GaussianSettings):
     symmetry_coef: NonNegative = 0.5
     """Weight of the loss of left-right symmetry."""
 
-    def form(self) -> Form:
-        """Returns what the network has of its own."""
-        raise NotImplementedError
+    form: ClassVar[Form]
+    """What the network has of its own."""
 
     def build(self, dims: EnvDims) -> Network:
-        form = self.form()
+        form = self.form
         inputs = next(iter(form.networks.widths.values()))[0]
         expected = inputs - (len(form.rows) - 1) * form.row_size
         if (dims.agents, dims.observation, dims.action) != (1, expected, NUM_JOINTS):
@@ -139,19 +138,16 @@ class HistorySettings(GaussianSettings):
 class WalkNetwork(HistorySettings):
     """Settings of the walk policy and its critic."""
 
+    form = WALK_FORM
     adaptation_coef: NonNegative = 1.0
     """Weight of the adaptation network's regression loss."""
-
-    def form(self) -> Form:
-        return WALK_FORM
 
 
 @register_network("agile")
 class AgileNetwork(HistorySettings):
     """Settings of the agile skill and its critic."""
 
-    def form(self) -> Form:
-        return AGILE_FORM
+    form = AGILE_FORM
 
 
 def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.ndarray) -> jax.Array:
@@ -166,11 +162,6 @@ def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.nda
     of_row = jnp.concatenate([jnp.zeros((len(before), count), episode.dtype), episode])
     alive = (of_row[rows] == episode[:, None]).astype(obs.dtype)
     return jnp.swapaxes(jnp.concatenate([before, obs])[rows] * alive[..., None], 1, 2)
-
-
-def mirror_action(action: jax.Array) -> jax.Array:
-    """Mirrors actions (..., 12)."""
-    return action[..., MIRRORED_JOINTS] * MIRRORED_SIGNS
 
 
 def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
@@ -193,7 +184,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         return NetworkMemory(jnp.zeros((num_envs, form.past, form.row_size)), ())
 
     def act(
-        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: jax.Array | None = None
+        params: Params, memory: Memory, obs: jax.Array, key: jax.Array | None, active: Mask = None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         history = jnp.concatenate([memory, obs[..., : form.row_size]], axis=-2)
         inputs = form.inputs(history[..., form.rows, :], obs[..., 0, :])
@@ -203,12 +194,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], history[..., 1:, :]
 
     def value(
-        params: Params,
-        memory: Memory,
-        is_first: jax.Array,
-        obs: jax.Array,
-        privileged: jax.Array,
-        active: jax.Array | None = None,
+        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array, active: Mask = None
     ) -> tuple[jax.Array, Memory]:
         return nn.mlp(params["critic"], privileged, jax.nn.elu, precision=_PRECISION), memory
 
@@ -219,7 +205,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         obs: jax.Array,
         privileged: jax.Array,
         action: jax.Array,
-        active: jax.Array | None = None,
+        active: Mask = None,
     ) -> ChunkResult:
         obs = obs[..., 0, :]
         inputs = form.inputs(windows(memory.actor, is_first, obs[..., : form.row_size], form.rows), obs)

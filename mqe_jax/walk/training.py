@@ -103,7 +103,7 @@ def train_skill(
     if not isinstance(network, HistorySettings):
         fail("network.name", network.name, SETTINGS[skill][0].network.name)
     if weights is not None:
-        network.form().networks.load(body, weights)
+        network.form.networks.load(body, weights)
         config = override(config, {"network.weights": str(Path(weights).resolve())})
     env = WalkEnv(body, task or SETTINGS[skill][1], skill=skill, impl=impl, num_envs=config.num_envs)
     config = override(config, {"env": {"control": env.control, **to_mapping(env.params)}})
@@ -115,6 +115,6 @@ def train_skill(
         if updates % config.checkpoint.every == 0 or updates == config.num_updates:
             about = {"robot": body.name, "env_steps": int(row["env_steps"])}
             file = run_dir / f"{skill}.safetensors"
-            network.form().networks.save(state.params["policy"], file, about, half=True)
+            network.form.networks.save(state.params["policy"], file, about, half=True)
 
     return train(VectorEnv(env, config.num_envs), config, run_dir, resume, on_update=save)

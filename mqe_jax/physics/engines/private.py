@@ -54,16 +54,10 @@ def load_mjx() -> ModuleType:
     return mjx
 
 
-# -- MJX's data on the C engine -----------------------------------------------------------------------------------
-
-
 def without_pointers(data: mjx.Data) -> mjx.Data:
     """Zeroes MJX's memory addresses in data made with impl `cpp`: they are invalid in another process."""
     zeros = {name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")}
     return data.replace(_impl=dataclasses.replace(data._impl, **zeros))
-
-
-# -- Warp -----------------------------------------------------------------------------------------------------------
 
 
 def warp_is_installed() -> bool:
@@ -99,9 +93,6 @@ def without_overflow(data: mjx.Data) -> mjx.Data:
 def overflow(data: mjx.Data) -> jax.Array:
     """Returns whether Warp dropped contacts or constraints since its flags were cleared () bool."""
     return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
-
-
-# -- MJX-JAX --------------------------------------------------------------------------------------------------------
 
 
 def contact(data: mjx.Data) -> mjx.Contact:
