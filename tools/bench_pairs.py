@@ -29,21 +29,13 @@ def work(case: str, steps: int, repeats: int) -> None:
     import jax.numpy as jnp
 
     import mqe_jax
+    from mqe_jax.runs.throughput import programs
 
     task, impl, count = case.split(":")
     env = mqe_jax.make(task, impl=impl, num_envs=int(count))
     vector: Any = mqe_jax.VectorEnv(env, int(count))
-    shape = (int(count), env.num_agents, env.action_size)
-
-    def step(carry: Any, _: None) -> Any:
-        state, key = carry
-        key, action_key = jax.random.split(key)
-        action = jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0)
-        return (vector.step(state, action), key), None
-
-    whole = jax.jit(lambda carry: jax.lax.scan(step, carry, None, steps)[0])
-    bare_step = jax.vmap(lambda data: env.physics.step(data, data.ctrl)[0])
-    bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps)[0])
+    scan, bare_scan = programs(env, vector, steps, lambda state: ())
+    whole, bare = jax.jit(lambda carry: scan(carry)[0]), jax.jit(bare_scan)
 
     def rate(run: Any, start: Any) -> float:
         seconds = []

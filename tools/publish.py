@@ -146,7 +146,6 @@ def add_measurement(name: str, file: Path, target: Path = MEASUREMENTS) -> None:
 
 
 def _entries(entries: Mapping[str, Any]) -> str:
-    """Returns JSON with a line for each entry and each of its items."""
     parts = []
     for name, entry in sorted(entries.items()):
         lines = [json.dumps(item) for item in entry]

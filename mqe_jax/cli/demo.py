@@ -65,7 +65,6 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
 
 
 def _summary(result: Mapping[str, Any]) -> str:
-    """Returns the main figures in one line."""
     parts = [f"both robots through {result['success_rate']:.0%}"]
     if "success/one" in result:
         parts.append(f"at least one {result['success/one']:.0%}")

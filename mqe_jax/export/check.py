@@ -41,7 +41,6 @@ def verify(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str,
 
 
 def _largest(errors: Mapping[str, float], where: str) -> float:
-    """Returns the largest error; InputError if it is larger than `LARGEST_ERROR`."""
     error, output = max((error, name) for name, error in errors.items())
     if not error <= LARGEST_ERROR:
         raise InputError(

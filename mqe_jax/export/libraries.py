@@ -81,7 +81,6 @@ def _member(archive: Path, name: str) -> bytes:
 
 
 def _fetch(title: str, archive: Path) -> None:
-    """Fetches a package's archive with npm."""
     npm = shutil.which("npm")
     if npm is None:
         raise InputError("libraries: npm is not installed; install it, or name a folder that holds them (docs/play.md)")

@@ -107,7 +107,6 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
 
 
 def _properties(policy: Trained, env: QuadrupedEnv) -> dict[str, str]:
-    """Returns the metadata of the model as strings, JSON-encoded where structured."""
     layout = [[block.name, block.width, block.meaning] for block in env.observation_layout.blocks]
     return {
         "mqe_jax": mqe_jax.__version__,

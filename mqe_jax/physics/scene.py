@@ -177,7 +177,6 @@ def compile_scene(scene: Scene) -> CompiledScene:
 
 
 def _index_objects(model: mujoco.MjModel, names: Iterable[str]) -> Mapping[str, ObjectIndex]:
-    """Looks up the addresses of all objects of a compiled model by name."""
     found = {}
     for name in names:
         body = model.body(f"object/{name}")

@@ -201,7 +201,6 @@ def _train(
     dump_diverged: str | Path | None,
     stages: type[Stages],
 ) -> list[Run]:
-    """Trains into the folders of the seeds, or writes nothing where they are None."""
     with (
         guard(cast.env, dump_diverged) as env,
         open_training(

@@ -113,7 +113,6 @@ def _names(jobs: Sequence[Job]) -> str:
 
 
 def _estimate(folder: Path, jobs: Sequence[Job]) -> dict[str, Any]:
-    """Returns the remaining jobs of a sweep and their estimated times, one row per job, plus totals."""
     seconds = sweeps.estimate(folder, jobs)
     rows = [
         {

@@ -70,7 +70,6 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
 
 
 def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
-    """Draws dashed lines at values by algorithm or `best`."""
     for name, value in values.items():
         axes.axhline(value, color=_COLORS.get(name, _INK), lw=1.0, ls=_DASHES, alpha=0.8)
 

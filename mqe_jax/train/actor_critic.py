@@ -19,7 +19,6 @@ _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu
 
 
 def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, settings: ActorCritic) -> Params:
-    """Initialises hidden layers, an optional recurrent unit and an output layer."""
     hidden_key, gru_key, head_key = jax.random.split(key, 3)
     width = settings.hidden_sizes[-1]
     params: Params = {

@@ -56,7 +56,6 @@ def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:
 
 
 def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
-    """Returns the checksum of arrays, their names and metadata."""
     total = zlib.crc32(metadata.encode())
     for name in sorted(arrays):
         array = arrays[name]

@@ -275,7 +275,6 @@ class ProgressLog:
         return max(self._total - self._step, 0) * self._seconds / max(self._step - self._first, 1)
 
     def _text(self) -> str:
-        """Returns what follows the bar."""
         steps = f"{self._step:,} of {self._total:,} steps"
         if self._total >= 1_000_000:
             steps = f"{self._step / 1e6:.2f} of {self._total / 1e6:g} M steps"
@@ -284,7 +283,6 @@ class ProgressLog:
         return f"{steps}, {self._numbers}, {_clock(self._left)} left" if self._numbers else steps
 
     def _refresh(self) -> None:
-        """Shows a bar and its text in a notebook."""
         if self._output is not None:
             done = 10 * self._step // self._total
             bar = f"{self._title} {'█' * done}{'░' * (10 - done)} {self._text()}"

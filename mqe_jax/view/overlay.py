@@ -56,7 +56,6 @@ class Overlay:
                 )
 
     def _bodies(self) -> dict[int, list[int]]:
-        """Returns the collision geoms of moving bodies, by body."""
         found: dict[int, list[int]] = {}
         for geom in np.flatnonzero(self._model.geom_group == COLLISION_GROUP):
             body = int(self._model.geom_bodyid[geom])

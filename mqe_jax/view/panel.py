@@ -110,7 +110,6 @@ class Panel:
         self._observation.content = observation_table(getattr(session.env, "observation_layout", None), obs)
 
     def _score(self, reward: float) -> str:
-        """Returns the lines with episode, reward, and the outcomes of the episodes that ended."""
         session = self._session
         text = f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step"
         counts = ", ".join(f"{name} {count}" for name, count in zip(session.outcomes, session.counts, strict=True))

@@ -43,7 +43,6 @@ class Viewer:
         self._announced = True
 
     def _build(self, model: mujoco.MjModel, frame: Episode) -> None:
-        """Builds the scene, in place of the last one, and clears the panel."""
         self.server.scene.reset()
         self._clear()
         self._stage = Stage(self.server, model, frame)

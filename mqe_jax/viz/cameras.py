@@ -7,7 +7,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.viz.framing import Camera, fit, goal_points, hidden, smooth, targets
-from mqe_jax.viz.geometry import body_boxes, extent, pose, pose_boxes, robot_bases
+from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, posed, robot_bases
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
@@ -49,11 +49,10 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
 
 def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
     """Returns the corners (8 x targets, 3) of boxes about the targets of each frame, m."""
-    data, bodies, robots = mujoco.MjData(model), targets(model, episode), len(robot_bases(model))
+    bodies, robots = targets(model, episode), len(robot_bases(model))
     local, frames = body_boxes(model, bodies), []
     margins = _MARGIN * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    for index in range(len(episode)):
-        pose(model, data, episode, index)
+    for data in posed(model, episode, range(len(episode))):
         boxes = pose_boxes(data, bodies, local)
         boxes[:robots] = data.xpos[bodies[:robots], None] + margins
         frames.append(boxes.reshape(-1, 3))
@@ -81,10 +80,8 @@ def _direction(
 
 def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> float:
     """Returns how much robots are behind each other in the view of a camera, 0 to 1; `right` (3,) is its direction."""
-    data, robots = mujoco.MjData(model), robot_bases(model)
-    values = []
-    for index in range(len(episode)):
-        pose(model, data, episode, index)
+    robots, values = robot_bases(model), []
+    for data in posed(model, episode, range(len(episode))):
         apart = (data.xpos[robots][:, None] - data.xpos[robots])[np.triu_indices(len(robots), 1)][:, :2]
         across = np.abs(apart @ right[:2]) / np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         values.append(1.0 - across.mean() if len(across) else 0.0)
@@ -104,11 +101,8 @@ def _following(
 
 
 def _beside(model: mujoco.MjModel, episode: Episode) -> list[Camera]:
-    """Returns cameras that track the first robot from its side."""
-    data, robot = mujoco.MjData(model), robot_bases(model)[0]
-    views = []
-    for index in range(len(episode)):
-        pose(model, data, episode, index)
+    robot, views = robot_bases(model)[0], []
+    for data in posed(model, episode, range(len(episode))):
         x, y, _ = data.xpos[robot]
         views.append(Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0))
     return smooth(views, max(1, round(0.3 / episode.dt)))

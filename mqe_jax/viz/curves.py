@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
 from mqe_jax.core.settings import check_arguments
-from mqe_jax.viz.geometry import box_corners, extent, pose, robot_bases, robot_color, scenery_geoms
+from mqe_jax.viz.geometry import box_corners, extent, posed, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
 if TYPE_CHECKING:
@@ -94,9 +94,7 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
     axes.axis("off")
-    data = mujoco.MjData(model)
-    bases = robot_bases(model)
-    scenery, robots = [], []
+    bases, scenery, robots = robot_bases(model), [], []
     for geom in scenery_geoms(model):
         moves = model.body_dofnum[model.body_rootid[model.geom_bodyid[geom]]] > 0
         face = "#c9ced6" if moves else "#3a3d45"
@@ -107,8 +105,7 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
         colour = robot_color(model, body)
         patch = axes.add_patch(Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4))
         robots.append((body, patch))
-    for index in range(len(episode)):
-        pose(model, data, episode, index)
+    for data in posed(model, episode, range(len(episode))):
         for geom, patch in scenery:
             points = box_corners(model, data, geom)[:, :2]
             patch.set_xy(points[ConvexHull(points).vertices])

@@ -1,7 +1,7 @@
 """Geometry of a scene: robot bodies, visible geoms, bounding boxes."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -52,6 +52,14 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: in
         data.mocap_pos[:] = episode.mocap_pos[index]
         data.mocap_quat[:] = episode.mocap_quat[index]
     mujoco.mj_kinematics(model, data)
+
+
+def posed(model: mujoco.MjModel, episode: Episode, frames: Iterable[int]) -> Iterator[mujoco.MjData]:
+    """Yields one workspace, set to each of some frames of an episode by `pose`."""
+    data = mujoco.MjData(model)
+    for index in frames:
+        pose(model, data, episode, index)
+        yield data
 
 
 def box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
@@ -120,8 +128,7 @@ def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
     fixed = [geom for geom in shown if int(model.geom_bodyid[geom]) == 0]
     if not fixed:
         return model
-    data = mujoco.MjData(model)
-    pose(model, data, episode, 0)
+    data = next(posed(model, episode, [0]))
     sides = np.concatenate([box_corners(model, data, geom)[:, 1] for geom in fixed])
     for geom in shown:
         if model.body_mocapid[model.geom_bodyid[geom]] < 0:

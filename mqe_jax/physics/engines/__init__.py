@@ -7,7 +7,7 @@
 | `jax` | MJX, JAX implementation | CPU, GPU, TPU |
 """
 
-import importlib
+import pkgutil
 from typing import Any
 
 import mujoco
@@ -32,18 +32,12 @@ def resolve(impl: str = "auto") -> str:
     if impl not in allowed:
         raise InputError(f"impl: unknown engine {impl!r}{nearest(impl, allowed)}; allowed: {', '.join(allowed)}")
     if impl == "auto":
-        return next(name for name in ENGINES if _load(name).is_preferred())
-    obstacle = _load(impl).obstacle()
-    if obstacle is not None:
+        return next(name for name in ENGINES if pkgutil.resolve_name(ENGINES[name]).is_preferred())
+    if (obstacle := pkgutil.resolve_name(ENGINES[impl]).obstacle()) is not None:
         raise InputError(f"impl {impl!r} {obstacle}")
     return impl
 
 
 def make(model: mujoco.MjModel, *, impl: str = "auto", **options: Any) -> Engine:
     """Creates an engine by name for a compiled model; the options are those of `Engine`; InputError as `resolve`."""
-    return _load(resolve(impl))(model, **options)
-
-
-def _load(name: str) -> type[Engine]:
-    module, _, attribute = ENGINES[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return pkgutil.resolve_name(ENGINES[resolve(impl)])(model, **options)
