@@ -23,9 +23,8 @@ from mqe_jax.train.policy import Policy
 
 def missing(library: str, error: ImportError) -> InputError:
     """Returns the error for an adapter whose library cannot be imported."""
-    return InputError(
-        f"mqe_jax.adapters.{library}: needs the package {library} ({error}); pip install 'mqe-jax[{library}]'"
-    )
+    hint = f"pip install 'mqe-jax[{library}]'"
+    return InputError(f"mqe_jax.adapters.{library}: needs the package {library} ({error}); {hint}")
 
 
 def task_env(

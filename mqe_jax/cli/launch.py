@@ -175,9 +175,8 @@ def _job() -> tuple[str, int, int]:
 
     try:
         known = os.environ.get("JAX_COORDINATOR_ADDRESS")
-        address, count, index, _ = ClusterEnv.auto_detect_unset_distributed_params(
-            known, None, None, None, None, int(LIMIT)
-        )
+        detect = ClusterEnv.auto_detect_unset_distributed_params
+        address, count, index, _ = detect(known, None, None, None, None, int(LIMIT))
     except Exception as error:  # of variables that are not theirs
         raise InputError(f"coordinator: variables of srun or mpirun cannot be read ({error})") from None
     if address is None or count is None or index is None:

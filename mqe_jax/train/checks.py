@@ -63,7 +63,7 @@ def check_teacher(config: TrainConfig, teacher: Any) -> None:
 def check_divisible(config: TrainConfig, network: Network, processes: int = 1) -> None:
     """Checks that rollouts split into chunks, and these into minibatches."""
     if config.rollout_steps % network.chunk_length:
-        fail("rollout_steps", config.rollout_steps, f"a multiple of network.chunk_length, {network.chunk_length}")
+        fail("rollout_steps", config.rollout_steps, f"a multiple of the network's chunk_length, {network.chunk_length}")
     chunks = config.steps_per_update // network.chunk_length
     if chunks % config.ppo.minibatches:
         fail("ppo.minibatches", config.ppo.minibatches, f"a divisor of the rollout's number of chunks ({chunks})")

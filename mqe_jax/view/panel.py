@@ -160,10 +160,9 @@ class Panel:
             step = gui.add_button("One step")
             reset = gui.add_button("Reset")
             speed = gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Real-time factor")
-            length = (session.moments.maxlen or 1) * session.env.dt
-            back = gui.add_slider(
-                "Back", min=0.0, max=length, step=session.env.dt, initial_value=0.0, hint="Pauses; s before now"
-            )
+            dt = session.env.dt
+            length = (session.moments.maxlen or 1) * dt
+            back = gui.add_slider("Back", min=0.0, max=length, step=dt, initial_value=0.0, hint="Pauses; s before now")
 
         def set_paused(paused: bool) -> None:
             session.paused = paused
@@ -175,7 +174,7 @@ class Panel:
                 back.value, self.back = 0.0, 0
 
         def scrub(_: Any) -> None:
-            self.back = round(float(back.value) / session.env.dt)
+            self.back = round(float(back.value) / dt)
             if self.back:
                 set_paused(True)
 
