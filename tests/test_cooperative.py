@@ -42,7 +42,8 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, gate_fres
     close = robot_state([[3.6, 0.6, 0.3], [3.6, 0.4, 0.3]])
     near = gate.rewards(Moment(state, after), Moment(state, close), jnp.array(False))
     assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
-    assert float(near["collision"]) == 0
+    closer = np.hypot(1.7, 0.03) - np.hypot(1.9, 0.15) + np.hypot(2.0, 1.1) - np.hypot(1.9, 1.15)
+    assert float(near["collision"]) == 0 and float(near["approach"]) == pytest.approx(closer, abs=1e-5)
     assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
 
 
