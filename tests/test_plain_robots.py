@@ -187,30 +187,30 @@ def test_a_compiled_robot_has_the_constants_of_its_data(name: str) -> None:
 
 def test_the_flock_is_that_of_a_plain_implementation() -> None:
     """Five sheep and three robots; one of each, near (at the top speed) and about as far as a sheep sees."""
-    random, half = np.random.default_rng(0), 0.8 * GRAVITY * 0.1 / 2
+    random = np.random.default_rng(0)
     several = random.normal(size=(5, 2)), random.normal(size=(5, 2)), 1.5 * random.normal(size=(3, 2))
     pairs = [(np.zeros((1, 2)), np.zeros((1, 2)), np.array([[-apart, 0.0]])) for apart in (0.1, 0.5, 2.9, 3.1)]
 
-    def slowed(v: np.ndarray) -> np.ndarray:
-        return v * max(1 - half / max(np.linalg.norm(v), 1e-9), 0.0)
+    def slowed(v: np.ndarray, friction: float) -> np.ndarray:
+        return v * max(1 - friction * GRAVITY * 0.1 / 2 / max(np.linalg.norm(v), 1e-9), 0.0)
 
-    def plain(sheep: np.ndarray, speed: np.ndarray, dogs: np.ndarray, s: float) -> np.ndarray:
+    def plain(sheep: np.ndarray, speed: np.ndarray, dogs: np.ndarray, s: float, friction: float) -> np.ndarray:
         result, noise = np.zeros_like(sheep), np.asarray(jax.random.normal(KEY, sheep.shape))
         for i in range(len(sheep)):
-            v = slowed(speed[i]) + 2 * s * noise[i]
+            v = slowed(speed[i], friction) + 2 * s * noise[i]
             inward = sheep.mean(0) - sheep[i]
             v = v + s / 1.5 * inward / max(np.linalg.norm(inward), 1e-9)
             for dog in dogs:
                 away = sheep[i] - dog
                 near = math.hypot(*(away**2))
                 v = v + (0.2 * away / near**1.4 if near <= 9 else 0.0)
-            result[i] = slowed(np.clip(v, -2, 2))
+            result[i] = slowed(np.clip(v, -2, 2), friction)
         return result
 
-    for numbers, s in ((several, 0.0), (several, 0.3), *((pair, 0.0) for pair in pairs)):
+    for numbers, s, friction in ((several, 0.0, 0.8), (several, 0.3, 0.8), *((pair, 0.0, 0.0) for pair in pairs)):
         arrays = [jnp.asarray(x, jnp.float32) for x in numbers]
-        found = flock(KEY, *arrays, restlessness=s, step=0.1, friction=0.8)
-        np.testing.assert_allclose(found, plain(*numbers, s), atol=1e-4)
+        found = flock(KEY, *arrays, restlessness=s, step=0.1, friction=friction)
+        np.testing.assert_allclose(found, plain(*numbers, s, friction), atol=1e-4)
 
 
 def test_objects_have_the_masses_and_inertias_of_their_shapes() -> None:
