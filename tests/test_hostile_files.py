@@ -207,7 +207,8 @@ def test_a_recording_whose_parameters_are_none(name: str, tmp_path: Path) -> Non
 def test_bad_archives(case: str, tmp_path: Path) -> None:
     path, before = tmp_path / "bad.jit", peak()
     path.write_bytes(ARCHIVES[case]())
-    refuses(r"bad\.jit: damaged, or not a TorchScript Sequential", read_torchscript, path)
+    said = "its members have" if case == "large member" else ""
+    refuses(rf"bad\.jit: damaged, or not a TorchScript Sequential.*{said}", read_torchscript, path)
     assert peak() < before + 2**29
     refuses(r"bad\.jit", load_recording, path)
 
