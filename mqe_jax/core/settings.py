@@ -285,9 +285,6 @@ def hints_of(kind: Any) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
-# -- conversion before pydantic's own validation ---------------------------------------------------------------------
-
-
 def _accept_yaml(hint: Any) -> Any:
     """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as numbers."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
@@ -342,9 +339,6 @@ def _boolean(value: Any) -> bool:
     if not type(value).__name__.startswith("bool"):  # of Python or numpy
         raise ValueError("true or false")
     return bool(value)
-
-
-# -- names and messages ----------------------------------------------------------------------------------------------
 
 
 def _fields(value: Any) -> Mapping[str, Any]:

@@ -3,8 +3,6 @@
 Source: resets to demonstrated states (Tao et al., arXiv 2405.03379).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Sequence

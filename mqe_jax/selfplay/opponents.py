@@ -1,7 +1,5 @@
 """A match as an environment of one team: against given opponents (`versus`), or with both teams learning (`Mirror`)."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

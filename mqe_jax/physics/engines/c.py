@@ -1,7 +1,5 @@
 """MuJoCo's C engine, called from JAX: all environments of a batch in one call."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
@@ -60,13 +58,13 @@ class CEngine(Engine):
             return None
         return f"runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
 
-    def blank(self) -> mjx.Data:
+    def blank(self) -> "mjx.Data":
         device = jax.local_devices(backend="cpu")[0]
         return private.without_pointers(private.load_mjx().make_data(self.model, device, impl="cpp"))
 
     def advance(
-        self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
-    ) -> tuple[mjx.Data, jax.Array]:
+        self, data: "mjx.Data", fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
+    ) -> "tuple[mjx.Data, jax.Array]":
         names = tuple(sorted(fields))
         out = jax.ShapeDtypeStruct((sum(self._sizes),), jnp.float32)
         forces = (data.xfrc_applied,) if forced else ()

@@ -1,7 +1,5 @@
 """Scripted policies (`--policy scripted`), one per task, acting like learned ones, and their steering."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import jax

@@ -1,7 +1,5 @@
 """Scripted policies of the cooperative tasks but football: Narrow Gate, Climb on Seesaw, Sheep Dog, Push Box."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Scripted policies of football: move behind the ball, facing an open part of the goal, then push it."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Scripted policies of the matches but football: Push Cylinder, Revolving Door, Sumo Wrestling, Traverse Bridge."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Cross-play of a cooperative task: teams whose agents follow policies of different trainings."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

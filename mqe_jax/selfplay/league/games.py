@@ -4,8 +4,6 @@ Sources: Balduzzi et al. 2018, arXiv 1806.02643 (Nash averaging); Li and Wellman
 seeds and episodes).
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -30,7 +28,7 @@ class Estimate(NamedTuple):
     low: Any
     high: Any
 
-    def at(self, *index: int) -> Estimate:
+    def at(self, *index: int) -> "Estimate":
         """Returns the estimate of one of the numbers."""
         return Estimate(*(x[index] for x in self))
 

@@ -3,8 +3,6 @@
 Source: prioritised fictitious self-play (AlphaStar, doi 10.1038/s41586-019-1724-z).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """A pool of earlier policies, as arrays: how the learner fares against each, who plays next, who leaves."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

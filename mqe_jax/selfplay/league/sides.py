@@ -1,7 +1,5 @@
 """Matches whose teams change sides, so that the learner, always team 0, is trained from both."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

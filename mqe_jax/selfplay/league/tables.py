@@ -1,7 +1,5 @@
 """Results of tournaments as text at most 80 columns wide, CSV files and pictures."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Round robins of policies of a match, and ratings from their results."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools
