@@ -106,11 +106,12 @@ TARGETS = {
     "export": ["fake", "--onnx", "a.onnx"], "replay": ["a.npz"],
     "walk convert": ["a.jit", "b.jit", "-o", "w.safetensors"],
     "sweep": ["a.yaml"], "report": ["a"], "tournament": ["go1tug", "idle", "random", "-o", "cup"],
+    "exploit": ["go1tug", "idle"], "oracle": ["go1tug", "go1tug"],
 }  # fmt: skip
 """Positional and needed arguments of each command."""
 
 
-LONG = ("view", "walk train", "walk eval", "tournament")
+LONG = ("view", "walk train", "walk eval", "tournament", "exploit", "oracle")
 """Commands that run for long where a text happens to be allowed; they get numbers only, which never are."""
 
 

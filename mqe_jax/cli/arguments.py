@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from mqe_jax.cli import commands, export, programs, render, skill, study, view
+from mqe_jax.cli import commands, exploit, export, programs, render, skill, study, view
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.settings import TEXT, fail, is_text
@@ -47,6 +47,8 @@ COMMANDS: dict[str, Any] = {
     "sweep": study.SweepCommand,
     "report": study.Report,
     "tournament": study.Tournament,
+    "exploit": exploit.Exploit,
+    "oracle": exploit.Oracle,
 }
 """Arguments by command, or what it does, where the arguments depend on others."""
 

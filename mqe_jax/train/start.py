@@ -23,7 +23,7 @@ from mqe_jax.train.seeds import with_shared, without_shared
 from mqe_jax.train.stages import Stages
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
-_MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
+MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
 """Settings of a network that the policy to start from may have otherwise."""
 
 
@@ -122,7 +122,7 @@ def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> Trai
     theirs = dict(_leaves(to_mapping(policy.config)))
     for name, value in _leaves(to_mapping(config)):
         acts = name in ("action_scale", "normalization.observations") or name.startswith("network.")
-        if acts and name.split(".")[-1] not in _MAY_DIFFER and theirs.get(name) != value:
+        if acts and name.split(".")[-1] not in MAY_DIFFER and theirs.get(name) != value:
             raise InputError(f"{name}: {value!r} differs from that of the policy in {start}, {theirs.get(name)!r}")
     return policy
 
