@@ -12,8 +12,7 @@ from tempfile import TemporaryDirectory
 from mqe_jax.cli.commands import Eval
 from mqe_jax.envs import TASKS
 from mqe_jax.envs.match import Match
-from mqe_jax.policies import zoo
-from mqe_jax.train.policy import read_policy, save_policy
+from mqe_jax.policies import load_policy, mixture, zoo
 
 DIGITS = 4
 
@@ -43,8 +42,8 @@ if __name__ == "__main__":
     parser.add_argument("--gpu-minutes", type=float)
     parser.add_argument("--episodes", type=int, default=512)
     given = vars(parser.parse_args())
-    policy = read_policy(given.pop("run"))
+    policy = load_policy(given.pop("run"))
     with TemporaryDirectory() as folder:
-        rounded = str(save_policy(folder, policy, half=True))
+        rounded = str(mixture.save(folder, policy, half=True))
         results, endings = measure(rounded, policy.task, given["episodes"], given["mode"] == "deterministic")
     print(zoo.ship(policy, zoo.Card(results=results, endings=endings, **given)))

@@ -25,6 +25,7 @@ from mqe_jax.policies import mixture, zoo
 from mqe_jax.policies.mixture import Trained
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.translated import together, translate
+from mqe_jax.policies.zoo import population
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.needs import Needs
 from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, check_policy, groups_of
@@ -178,7 +179,8 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
 
     Args:
         source: one of `NAMES`, of the task's `NAMED_PLANNERS`, a task with a shipped policy
-            (`mqe_jax.policies.zoo`), or a path; a folder with one of these names is given as ./NAME.
+            (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path; a folder with one of these
+            names is given as ./NAME.
         env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
         deterministic: whether a trained policy acts with its mean actions; it does so too where its file or the card
             of a shipped one declares it.
@@ -191,6 +193,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
             scripted policy.
     """
     env = getattr(env, "env", env)  # of a batch
+    given, source = str(source), source if env is None else population.resolve(source, env.name)
     further = () if env is None else tuple(NAMED_PLANNERS.get(env.name, ()))
     if str(source) in (*NAMES, *further):
         if env is None:
@@ -205,7 +208,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
     else:
         policy = mixture.read(source)
     policy = policy.acting(True) if deterministic else policy
-    return policy if env is None else translate(policy, env, str(source))
+    return policy if env is None else translate(policy, env, given)
 
 
 def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
@@ -243,7 +246,7 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
         policy = source
         if isinstance(source, str | Path) and str(source) not in NAMES:
             with contextlib.suppress(InputError):  # `load_as` raises it, where it matters
-                policy = load_policy(source)
+                policy = load_policy(population.resolve(source, task))
         if isinstance(policy, Trained) and policy.needs.control is not None and policy.task == task:
             every.append(policy.needs)
     for needs in every:

@@ -23,7 +23,15 @@ from mqe_jax.core.types import Memory, RandomKey
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import Needs
-from mqe_jax.train.policy import POLICY_FILE, TrainedPolicy, file_content, policy_in, policy_path, write_policy
+from mqe_jax.train.policy import (
+    POLICY_FILE,
+    TrainedPolicy,
+    file_content,
+    policy_in,
+    policy_path,
+    save_policy,
+    write_policy,
+)
 
 MEMBERS = 4
 """Members of a mixture, at most."""
@@ -143,6 +151,13 @@ def save_mixture(folder: str | Path, mixture: Mixture, name: str = POLICY_FILE, 
     arrays, records = zip(*(file_content(member, half) for member in mixture.members), strict=True)
     metadata = {**mixture.metadata, "members": records, "weights": mixture.weights}
     return write_policy(folder, name, {"members": arrays}, metadata)
+
+
+def save(folder: str | Path, policy: Trained, name: str = POLICY_FILE, *, half: bool = False) -> Path:
+    """Writes a policy or a mixture into a folder; see `save_policy` and `save_mixture`."""
+    if isinstance(policy, Mixture):
+        return save_mixture(folder, policy, name, half=half)
+    return save_policy(folder, policy, name, half=half)
 
 
 @single

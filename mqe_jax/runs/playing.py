@@ -18,6 +18,7 @@ from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy, parameters_for
+from mqe_jax.policies.zoo import population
 from mqe_jax.runs import build
 from mqe_jax.runs.build import Player, parameters_of
 from mqe_jax.runs.divergence import guard
@@ -25,7 +26,7 @@ from mqe_jax.selfplay.league import tournament as league
 from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.league.tournament import Standings
-from mqe_jax.train.evaluate import Result, evaluate_batch
+from mqe_jax.train.evaluate import Result, evaluate_batch, pool
 
 Camera = Literal["follow", "near", "scene", "side"]
 
@@ -58,7 +59,8 @@ def evaluate(
         policy: a policy, or what `load_policy` accepts. Default: the run's; of a task the shipped one, else the
             scripted one, else `forward`, or `random` where actions are not commands. A task by its id gets the skill,
             gait, command ranges, control mode and robot that a trained policy needs.
-        opponent: policy of the other team of a match. Default: that of the first team if it is the shipped one by
+        opponent: policy of the other team of a match, or a population (`mqe_jax.policies.zoo.population`), whose
+            members play `episodes` each. Default: that of the first team if it is the shipped one by
             default, else `idle`.
         env: task parameters.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
@@ -74,6 +76,12 @@ def evaluate(
     Raises:
         InputError: for a task, parameters or a policy that is not allowed.
     """
+    if isinstance(opponent, str) and population.is_named(opponent):
+        options = {"env": env, "impl": impl, "episodes": episodes, "sides": sides, "num_envs": num_envs}
+        options |= {"deterministic": deterministic, "seed": seed, "dump_diverged": dump_diverged}
+        match = build.players(task, policy, env=env, impl=impl).env.name
+        every = {name: evaluate(task, policy, name, **options) for name in population.members(opponent, match)}
+        return pool(every, opponent)
     num_envs = min(num_envs, episodes)
     playing = build.players(task, policy, opponent, env=env, impl=impl, num_envs=num_envs, deterministic=deterministic)
     batch, about = playing.batch, dict(playing.about)
@@ -108,9 +116,9 @@ def tournament(
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `load_policy` accepts. In a match scripted, idle and random play too; ratings are relative to
-            scripted, or idle without it. In a task of one team, agent 0 follows each policy with each as its mates,
-            scripted and idle ones too.
+        policies: what `load_policy` accepts, and populations. In a match scripted, idle and random play too; ratings are
+            relative to scripted, or idle without it. In a task of one team, agent 0 follows each policy with each as
+            its mates, scripted and idle ones too.
         episodes: episodes of each pair on each side, or of each team.
 
     Returns:
@@ -120,6 +128,7 @@ def tournament(
         InputError: as `evaluate`.
     """
     task = task_id(task) if isinstance(task, str) else task
+    policies = population.expand(policies, task if isinstance(task, str) else task.name)
     needed = parameters_for(task, *policies) if isinstance(task, str) else parameters_of(task)
     params = merge(needed, env or {})
     single, _ = build.make_env(task, impl, params, 1)

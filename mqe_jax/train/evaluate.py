@@ -2,8 +2,8 @@
 
 import functools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -86,6 +86,8 @@ class Result:
     """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
     about: dict[str, Any] = field(default_factory=dict)
     """Who acted, by name: policy, actions, opponent, sides, seed."""
+    by_opponent: dict[str, Result] = field(default_factory=dict)
+    """Results against each member of a population, of which the others are means."""
 
     @property
     def success(self) -> Rate:
@@ -102,10 +104,14 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values for JSON; the entries of all mappings but `terms` become top-level keys."""
-        values = {k: v for k, v in vars(self).items() if k not in ("task", "about", "endings", "outcomes", "match")}
+        mappings = ("task", "about", "endings", "outcomes", "match", "by_opponent")
+        values = {k: v for k, v in vars(self).items() if k not in mappings}
         named = {"ending": self.endings, "success": self.outcomes}
         flat = {f"{kind}/{name}": value for kind, values in named.items() for name, value in values.items()}
-        return {"task": self.task, **self.about, **values, **self.match, **flat}
+        flat |= {f"win_rate/{name}": result.match["win_rate"] for name, result in self.by_opponent.items()}
+        worst = [flat[f"win_rate/{name}"] for name in self.by_opponent]
+        match = {**self.match, "worst_win_rate": min(worst)} if worst else self.match
+        return {"task": self.task, **self.about, **values, **match, **flat}
 
     def rows(self) -> dict[str, str]:
         """Returns all results as text by name; rates have their intervals."""
@@ -115,6 +121,8 @@ class Result:
                 found |= {f"reward/{term}": f"{mean:.4g}" for term, mean in value.items()}
             elif name == "success_rate" or name in self.match:
                 found[name] = str(Rate.of(value, self.episodes))
+            elif "win_rate" in name:
+                found[name] = str(Rate.of(value, self.episodes // len(self.by_opponent)))
             else:
                 found[name] = f"{value:.4g}" if isinstance(value, float) else line(value)
         return found
@@ -125,6 +133,17 @@ class Result:
     def _repr_html_(self) -> str:
         cells = ((to_html(name), to_html(text)) for name, text in self.rows().items())
         return "<table>" + "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in cells) + "</table>"
+
+
+def pool(results: Mapping[str, Result], opponent: str) -> Result:
+    """Returns the results against the members of a population, by name, as one, in which each counts the same."""
+    every = list(results.values())
+    summed, fixed = ("episodes", "overflow", "diverged"), ("task", "about", "by_opponent")
+    means = [{name: x for name, x in vars(each).items() if name not in (*summed, *fixed)} for each in every]
+    mean = jax.tree.map(lambda *values: math.fsum(values) / len(values), *means)
+    sums = {name: sum(getattr(each, name) for each in every) for name in summed}
+    about = {**every[0].about, "opponent": opponent}
+    return replace(every[0], **mean, **sums, about=about, by_opponent=dict(results))
 
 
 class _Progress(NamedTuple):

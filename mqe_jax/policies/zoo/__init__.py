@@ -15,9 +15,9 @@ from mqe_jax.core.limits import NonNegative
 from mqe_jax.core.settings import PathText, build, check_arguments, record, to_mapping
 from mqe_jax.core.types import AnyTrained
 from mqe_jax.policies import mixture
-from mqe_jax.policies.mixture import Mixture, Trained, save_mixture
+from mqe_jax.policies.mixture import Mixture, Trained
 from mqe_jax.train.checkpoint import read_metadata
-from mqe_jax.train.policy import NAMED, TrainedPolicy, save_policy
+from mqe_jax.train.policy import NAMED, TrainedPolicy
 
 FOLDER = Path(__file__).parent
 
@@ -76,8 +76,7 @@ def ship(policy: Trained, about: Card, folder: Path = FOLDER) -> Path:
     """Writes a policy with its card, its parameters as float16; returns the file."""
     metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
     shipped = dataclasses.replace(policy.acting(about.mode == "deterministic"), metadata=metadata)
-    save: Any = save_mixture if isinstance(shipped, Mixture) else save_policy
-    return save(folder, shipped, file_of(policy.task).name, half=True)
+    return mixture.save(folder, shipped, file_of(policy.task).name, half=True)
 
 
 def heaviest(task: str) -> TrainedPolicy:

@@ -1,0 +1,126 @@
+"""Fixed opponents by version: their files and names, and results against all of them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mqe_jax
+from mqe_jax.core.errors import InputError
+from mqe_jax.envs import make
+from mqe_jax.policies import load_policy, parameters_for
+from mqe_jax.policies.zoo import population
+from mqe_jax.runs import playing
+from mqe_jax.selfplay.opponents import versus
+from mqe_jax.train.evaluate import Rate, Result
+from tests.test_opponents import matches, new_policy
+
+TASK = "go1revolvingdoor"
+
+
+@pytest.fixture
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A population of a team that stands and an early policy, which needs joint targets as actions."""
+    monkeypatch.setattr(population, "FOLDER", tmp_path)
+    population.add("1", TASK, "idle")
+    population.add("1", TASK, "early", new_policy(versus(matches(), ["idle"])))
+    return tmp_path
+
+
+def check(name: str) -> None:
+    """Checks that a population is small, and that each member loads."""
+    manifest = json.loads((population.FOLDER / f"{name.removeprefix('population/')}.json").read_text())
+    for task in manifest:
+        members = population.members(name, task)
+        assert 1 <= len(members) <= population.MEMBERS
+        for member in members:
+            env = make(task, impl="c", num_envs=1, **parameters_for(task, member))
+            assert load_policy(member, env).task == task
+    for file in population.FOLDER.glob(f"{name.removeprefix('population/')}-*.safetensors"):
+        assert file.stat().st_size <= population.BYTES
+
+
+def test_the_shipped_populations_are_whole() -> None:
+    assert not list(population.FOLDER.glob("*.safetensors")) or population.names()
+    for name in population.names():
+        check(name)
+
+
+def test_a_population_has_named_and_trained_members(fake: Path) -> None:
+    check("population/1")
+    assert population.names() == ["population/1"]
+    assert population.members("population/1", TASK) == ["population/1/idle", "population/1/early"]
+    assert population.expand(["a", "population/1"], TASK) == ["a", "population/1/idle", "population/1/early"]
+    assert parameters_for(TASK, "population/1/early") == {"control": "position"}
+    for name in ("a", "population/1/early", "population"):
+        assert not population.is_named(name)
+
+
+def test_a_published_version_does_not_change(fake: Path) -> None:
+    policy = new_policy(versus(matches(), ["idle"]), 1)
+    with pytest.raises(InputError, match=r"member: 'early' .* a new one, of at most 5: idle, early"):
+        population.add("1", TASK, "early", policy)
+    for name in ("scripted", "random", "forward"):
+        population.add("1", TASK, name)
+    with pytest.raises(InputError, match="member: 'sixth' "):
+        population.add("1", TASK, "sixth", policy)
+    (file,) = fake.glob("*.safetensors")
+    file.write_bytes(file.read_bytes() + b" ")
+    with pytest.raises(InputError, match=r"early\.safetensors: is missing, or not the file of population/1"):
+        population.resolve("population/1/early", TASK)
+
+
+def test_a_member_that_is_too_large_is_refused(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(population, "BYTES", 1000)
+    before = sorted(fake.iterdir())
+    with pytest.raises(InputError, match=r"policy: '[0-9]+ bytes' is not allowed; it must be at most 1000"):
+        population.add("1", TASK, "late", new_policy(versus(matches(), ["idle"]), 2))
+    assert sorted(fake.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("population/2/early", "population: 'population/2' is not allowed; it must be one of population/1"),
+        (
+            "population/1",
+            "policy: 'population/1' is not allowed; it must be one of population/1/idle, population/1/early",
+        ),
+        ("population/1/late", "policy: 'population/1/late' is not allowed; it must be one of population/1/idle"),
+    ],
+)
+def test_an_unknown_member_is_named(name: str, said: str, fake: Path) -> None:
+    with pytest.raises(InputError) as error:
+        load_policy(name, matches().env)
+    assert said in str(error.value)
+    with pytest.raises(InputError, match="population: population/1 has no members for 'go1tug'"):
+        load_policy("population/1/early", matches("go1tug").env)
+
+
+def test_an_evaluation_has_the_mean_and_the_worst_case(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rates = iter((0.5, 0.75))
+
+    def play(env: Any, policy: Any, episodes: int, key: Any) -> Result:
+        rate = next(rates)
+        match = {"win_rate": rate, "draw_rate": 1.0 - rate, "loss_rate": 0.0}
+        return Result(TASK, episodes, rate, 0.0, {"win": 2.0 * rate}, 0.0, 5.0, 0, 1, {}, {}, match)
+
+    monkeypatch.setattr(playing, "evaluate_batch", play)
+    options: dict[str, Any] = {"env": {"control": "position"}, "impl": "c", "episodes": 4}
+    result = mqe_jax.evaluate(TASK, "random", "population/1", sides="both", **options)
+    assert (result.episodes, result.diverged, result.about["opponent"]) == (8, 2, "population/1")
+    assert result.about["sides"] == "both" and result.terms == {"win": 1.25}
+    shown, rows = result.to_dict(), result.rows()
+    assert {name: shown[name] for name in shown if "win_rate" in name} == {
+        "win_rate": 0.625,
+        "worst_win_rate": 0.5,
+        "win_rate/population/1/idle": 0.5,
+        "win_rate/population/1/early": 0.75,
+    }
+    assert (rows["win_rate"], rows["worst_win_rate"]) == (repr(Rate.of(0.625, 8)), repr(Rate.of(0.5, 4)))
+    assert json.dumps(shown)
+    monkeypatch.setattr(playing.league, "round_robin", lambda matches, teams, key: np.ones((len(teams),) * 2 + (3,)))
+    standings = mqe_jax.tournament(TASK, ["population/1"], **options)
+    assert standings.policies == ("population/1/idle", "population/1/early", "idle", "random")
