@@ -1,5 +1,6 @@
 """Exported policies: equal outputs in onnxruntime and in JAX, and refused exports."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from mqe_jax import cli, load_policy, make
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.policies import zoo
+from mqe_jax.policies.mixture import Mixture
 from mqe_jax.skills import SKILLS
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
@@ -28,6 +30,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 from mqe_jax.export import translate  # noqa: E402
 from mqe_jax.export.check import errors, record_actions  # noqa: E402
 from mqe_jax.export.policy import input_shapes, shapes, to_onnx  # noqa: E402
+from mqe_jax.export.task import policy_function  # noqa: E402
 
 GATE = zoo.file_of("go1gate")
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
@@ -118,6 +121,39 @@ def test_a_graph_holds_the_skill_of_the_task(skill: Any, commands: Any, memory: 
     policy = new_policy(env, recurrent=False)
     assert memory.items() <= input_shapes(policy, env).items()
     assert export_error(policy, env) < 2e-5
+
+
+def mixture_of(env: Any) -> Mixture:
+    """A mixture of policies without and with a recurrent state."""
+    one, other = (new_policy(env, "position", hidden_sizes=[16], recurrent=x, gru_size=8) for x in (False, True))
+    third = dataclasses.replace(one, params=jax.tree.map(lambda x: -x, one.params))
+    return Mixture((one, other, third), (0.5, 0.2, 0.3))
+
+
+def test_the_graph_of_a_mixture_has_all_members() -> None:
+    env = make("go1plane", impl="c", num_envs=1, control="position")
+    policy = mixture_of(env)
+    assert input_shapes(policy, env)["memory_member"] == ()
+    assert export_error(policy, env) < 1e-4
+    inputs, outputs = record_actions(policy, env, 8)
+    assert {*inputs["memory_member"].tolist()} == {0, 1, 2, 3}
+    assert max(errors(to_onnx(policy, env), inputs, outputs).values()) < 1e-4
+
+
+def test_the_page_draws_a_member_by_its_noise() -> None:
+    env = make("go1plane", impl="c", num_envs=1, control="position")
+    policy = mixture_of(env)
+    act, sizes = policy_function(policy, env.observation_size)
+    assert sizes["noise"] == (1 + 3 * env.num_agents * env.action_size,)
+    inputs = {name: np.zeros((4, *shape), np.float32) for name, shape in sizes.items()}
+    inputs["noise"][:, 0] = [-1.0, 0.1, 1.0, 1.0]  # the median of the weights is 0
+    inputs["memory_member"][3] = 2.0
+    inputs["obs"] += 0.3
+    found = jax.vmap(act)(inputs)
+    assert found["next_memory_member"].tolist() == [1, 2, 3, 2]
+    means = [each.act(inputs["obs"][0], each.initial_memory())[0] for each in policy.members]
+    np.testing.assert_allclose(found["action"], np.stack([means[i] for i in (0, 1, 2, 1)]), atol=1e-5)
+    assert max(errors(translate.translate(act, sizes, "test"), inputs, jax.device_get(found)).values()) < 1e-4
 
 
 @pytest.mark.soak

@@ -13,7 +13,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
-from mqe_jax.policies.mixture import Trained
+from mqe_jax.policies.mixture import Mixture, Trained
 
 STEPS = 100
 """Environment steps over which a graph is compared with JAX."""
@@ -72,6 +72,8 @@ def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arra
         inputs, outputs, state = advance(state, memory)
         rows.append(jax.device_get((inputs, outputs)))
         memory = {name: outputs[f"next_{name}"] for name in memory}
+        if isinstance(policy, Mixture):  # whose members take turns
+            memory["memory_member"] = jnp.float32(i % (len(policy.members) + 1))
         if state.terminated or state.truncated:
             state, memory = start(jax.random.PRNGKey(i + 1))
     return jax.tree.map(lambda *x: np.stack(x), *rows)

@@ -12,7 +12,8 @@ the input `X` of the next step. Of a match, the graph is that of team 0.
 Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vector in the trunk frame, `joint_position`
 and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: those of the skill, of the walk policy `walk_history`
 (N, A, 30, 70), `walk_action`, `walk_previous_action` (N, A, 12) and `walk_gait` (N, A), and those of the network:
-`memory` if it is one array, else `memory_NAME`.
+`memory` if it is one array, else `memory_NAME`. A mixture's graph has those of all members, and `memory_member` (N,),
+the number of the member that acts, from 1. Draw it by the weights at an episode's start; 0 is the heaviest member.
 """
 
 import functools

@@ -124,10 +124,11 @@ class Mixture:
         if jax.tree.structure(memory) != jax.tree.structure(self.initial_memory()):
             fail("memory", memory, "the recurrent state of this mixture, that of `initial_memory`")
         draw_key, key = (None, None) if key is None else jax.random.split(key)
-        acts = [each.act(obs, own, key) for each, own in zip(self.members, memory["members"], strict=True)]
         member = jnp.where(memory["member"] < 0.5, self._draw(jnp.shape(memory["member"]), draw_key), memory["member"])
-        chosen = [member[..., None, None] < number + 1.5 for number in range(len(acts))]
-        action = jnp.select(chosen, [action for action, _ in acts], acts[-1][0])
+        acts = [each.act(obs, own, key) for each, own in zip(self.members, memory["members"], strict=True)]
+        action = acts[-1][0]
+        for number in range(len(acts) - 1, 0, -1):
+            action = jnp.where(member[..., None, None] < number + 0.5, acts[number - 1][0], action)
         return action, {"member": member, "members": tuple(own for _, own in acts)}
 
     def _draw(self, shape: tuple[int, ...], key: jax.Array | None) -> jax.Array:

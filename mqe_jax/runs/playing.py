@@ -116,9 +116,9 @@ def tournament(
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `load_policy` accepts, and populations. In a match scripted, idle and random play too; ratings are
-            relative to scripted, or idle without it. In a task of one team, agent 0 follows each policy with each as
-            its mates, scripted and idle ones too.
+        policies: what `load_policy` accepts, and populations. In a match scripted, idle and random play too; ratings
+            are relative to scripted, or idle without it. In a task of one team, agent 0 follows each policy with each
+            as its mates, scripted and idle ones too.
         episodes: episodes of each pair on each side, or of each team.
 
     Returns:

@@ -86,7 +86,7 @@ class Result:
     """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
     about: dict[str, Any] = field(default_factory=dict)
     """Who acted, by name: policy, actions, opponent, sides, seed."""
-    by_opponent: dict[str, Result] = field(default_factory=dict)
+    by_opponent: "dict[str, Result]" = field(default_factory=dict)
     """Results against each member of a population, of which the others are means."""
 
     @property
