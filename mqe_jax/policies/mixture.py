@@ -1,13 +1,11 @@
 """Mixtures: policies that draw one of a few trained policies at the start of each episode."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +90,7 @@ class Mixture:
         """Whether all members act with their mean actions."""
         return all(member.deterministic for member in self.members)
 
-    def acting(self, deterministic: bool) -> Mixture:
+    def acting(self, deterministic: bool) -> Self:
         """Returns the mixture whose members act with their mean actions, or sample them."""
         return dataclasses.replace(self, members=tuple(member.acting(deterministic) for member in self.members))
 
@@ -136,7 +134,7 @@ class Mixture:
         if key is None:
             return jnp.full(shape, 1.0 + int(np.argmax(self.weights)))
         last = max(i for i, weight in enumerate(self.weights) if weight > 0)
-        shares = [math.fsum(self.weights[: i + 1]) for i in range(last)]  # in (0, 1), or 0
+        shares = [min(math.fsum(self.weights[: i + 1]), 1 - 1e-12) for i in range(last)]
         ends = [NormalDist().inv_cdf(share) if share else -math.inf for share in shares]
         normal = devices.normal(key, (math.prod(shape),), jnp.float32).reshape(shape)
         return sum(((normal > end).astype(jnp.float32) for end in ends), jnp.ones(shape))
