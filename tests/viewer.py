@@ -57,10 +57,8 @@ class Panel:
 
     widgets: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Message that created each widget, by label; the first HTML as `state`."""
-    commands: dict[str, str] = field(default_factory=dict)
-    """Uuid of each command, by label."""
-    values: dict[str, Any] = field(default_factory=dict)
-    """Values by label that differ from the initial ones."""
+    commands: dict[str, str] = field(default_factory=dict)  # uuid of each command, by label
+    values: dict[str, Any] = field(default_factory=dict)  # values by label that differ from the initial ones
 
     def uuid(self, label: str) -> str:
         return self.widgets[label]["uuid"]

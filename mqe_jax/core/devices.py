@@ -127,12 +127,9 @@ class Processes:
     split, and copies of all others. `own` and `together` convert; a conversion takes about 30 us per array.
     """
 
-    count: int
-    """Number of processes."""
-    leads: bool
-    """Whether this process writes the files."""
-    whole: PyTree
-    """Shapes of the state of all environments."""
+    count: int  # number of processes
+    leads: bool  # whether this process writes the files
+    whole: PyTree  # shapes of the state of all environments
 
     def __init__(self, own: PyTree, whole: PyTree) -> None:
         """Takes the shapes of a process's part of the state and of the state of all environments."""

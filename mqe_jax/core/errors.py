@@ -4,7 +4,7 @@ import os
 import reprlib
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from mqe_jax.core.limits import SHOWN
@@ -60,6 +60,13 @@ def short_repr(value: object) -> str:
 def brief(text: str) -> str:
     """Returns a text of at most `SHOWN` characters."""
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
+def known_name(wrong: str, name: str, known: Collection[str]) -> str:
+    """Returns a name if it is known; raises an InputError that begins with `wrong` and suggests the nearest one."""
+    if name not in known:
+        raise InputError(f"{wrong} {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
+    return name
 
 
 def nearest(word: object, known: Iterable[object]) -> str:

@@ -144,11 +144,15 @@ def is_text(value: str) -> bool:
     return len(value) <= limits.TEXT and not any(ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value)
 
 
-def check_arguments(**kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a function check some of its arguments, each against a type, as a record checks its fields."""
+def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Makes a function check some of its arguments, each against a type, as a record checks its fields.
+
+    `annotated` are names of arguments that are checked against their annotations.
+    """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(function)
+        kinds.update({name: signature.parameters[name].annotation for name in annotated})
 
         @functools.wraps(function)
         def call(*given: P.args, **named: P.kwargs) -> R:

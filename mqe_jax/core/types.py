@@ -160,21 +160,22 @@ def replace_fields(state: Any, **fields: jax.Array) -> Any:
     raise InputError(f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}")
 
 
+def shapes_of(tree: PyTree) -> Any:
+    """Returns the structure of a pytree, and the shape of each leaf, None of what is no array."""
+    return jax.tree.structure(tree), [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
+
+
 def check_act(name: str, returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
     """Returns what a policy's `act` returned: actions of a shape, and a recurrent state like its `memory`.
 
     InputError, naming the argument that the policy is, for anything else.
     """
-
-    def shapes(tree: Any) -> Any:
-        return jax.tree.structure(tree), [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
-
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         found, expected = f"returns {type(returned).__name__}", "returns (action, memory)"
-    elif shapes(returned[0]) != shapes(jax.ShapeDtypeStruct(shape, jnp.float32)) or is_typed_key(returned[0]):
+    elif shapes_of(returned[0]) != shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32)) or is_typed_key(returned[0]):
         given = getattr(returned[0], "shape", type(returned[0]).__name__)
         found, expected = f"returns actions {given}", f"returns {shape}"
-    elif shapes(returned[1]) != shapes(memory):
+    elif shapes_of(returned[1]) != shapes_of(memory):
         found, expected = "changes the structure of its memory", "keeps it"
     else:
         return returned[0], returned[1]

@@ -10,7 +10,7 @@ from collections import UserDict
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.settings import check_arguments, fail
 
 if TYPE_CHECKING:
@@ -128,10 +128,7 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | None = None) -> t
 
 def task_id(name: str) -> str:
     """Returns the id of a task from it or an alias; raises an InputError that names the nearest for an unknown one."""
-    name = ALIASES.get(name, name)
-    if name not in TASKS:
-        raise InputError(f"task: unknown id {name!r}{nearest(name, TASKS)}; allowed: {', '.join(TASKS)}")
-    return name
+    return known_name("task: unknown id", ALIASES.get(name, name), TASKS)
 
 
 def load(package: str, path: str) -> Any:

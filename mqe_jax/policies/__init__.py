@@ -28,7 +28,7 @@ from mqe_jax.policies.translated import together, translate
 from mqe_jax.policies.zoo import population
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.needs import Needs
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_obs, check_policy, groups_of
+from mqe_jax.train.policy import Composed, Policy, TrainedPolicy, check_obs, check_policy
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
@@ -63,7 +63,7 @@ class SimplePolicy:
 
 
 @dataclasses.dataclass(frozen=True)
-class BothTeams:
+class BothTeams(Composed):
     """The policies of a match's two teams, as one policy for the agents of both."""
 
     first: Policy
@@ -71,20 +71,12 @@ class BothTeams:
     second: Policy
     """Policy of team 1."""
 
-    @property
-    def task(self) -> str:
-        """Id of the task."""
-        return self.first.task
+    _parts = property(lambda self: (self.first, self.second))
 
     @property
     def agents(self) -> int:
         """Number of agents of both teams."""
         return self.first.agents + self.second.agents
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """The groups of observations that both see."""
-        return tuple(groups_of(self.first, self.second))
 
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns the initial recurrent states of both."""
@@ -104,7 +96,7 @@ class BothTeams:
 
 
 @dataclasses.dataclass(frozen=True)
-class MixedTeam:
+class MixedTeam(Composed):
     """A team whose agents follow different policies of the whole team, as one policy.
 
     Each agent takes its own action from what its policy does for all. Trained policies of equal architecture are
@@ -116,20 +108,7 @@ class MixedTeam:
     seats: Any
     """Index of each agent's policy (A,), an array that may be traced."""
 
-    @property
-    def task(self) -> str:
-        """Id of the task."""
-        return self.policies[0].task
-
-    @property
-    def agents(self) -> int:
-        """Number of agents of the team."""
-        return self.policies[0].agents
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """The groups of observations that the policies see."""
-        return tuple(groups_of(*self.policies))
+    _parts = property(lambda self: self.policies)
 
     @functools.cached_property
     def _kinds(self) -> list[list[int]]:

@@ -15,31 +15,18 @@ from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import SKILLS
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import Policy, check_policy
+from mqe_jax.train.policy import Composed, Policy, check_policy
 
 
 @dataclasses.dataclass(frozen=True)
-class Translated:
+class Translated(Composed):
     """A trained policy whose actions mean `own`, as a policy of a task whose actions mean `here`."""
 
     policy: Trained
     own: Commander = dataclasses.field(repr=False)
     here: Commander = dataclasses.field(repr=False)
 
-    @property
-    def task(self) -> str:
-        """Id of the task."""
-        return self.policy.task
-
-    @property
-    def agents(self) -> int:
-        """Number of agents of the team."""
-        return self.policy.agents
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """The group of observations that it sees."""
-        return self.policy.groups
+    _parts = property(lambda self: (self.policy,))
 
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns the initial recurrent state of the policy."""

@@ -50,8 +50,7 @@ class Guard(Outer):
     Every step sends the fields on which it depends to the host, which keeps the last `STEPS`.
     """
 
-    written: list[Path]
-    """Files written."""
+    written: list[Path]  # files written
 
     def __init__(self, inner: Any, folder: Path) -> None:
         super().__init__(inner)

@@ -146,15 +146,7 @@ def tournament(
     return Standings(single.name, names, results, league.rate(results, names.index(references[0])))
 
 
-@check_arguments(
-    episodes=Candidates,
-    seconds=ClipLength,
-    seed=Seed,
-    view=Camera | None,
-    width=ImageWidth | None,
-    fps=FrameRate | None,
-    speed=Speed,
-)
+@check_arguments("width", "fps", "speed", episodes=Candidates, seconds=ClipLength, seed=Seed, view=Camera | None)
 def render(
     task: str | Path | QuadrupedEnv,
     policy: Player = None,
@@ -167,9 +159,9 @@ def render(
     deterministic: bool = False,
     seed: int = 0,
     view: str | None = None,
-    width: int | None = None,
-    fps: float | None = None,
-    speed: float = 1.0,
+    width: ImageWidth | None = None,
+    fps: FrameRate | None = None,
+    speed: Speed = 1.0,
 ) -> "Clip":
     """Records an episode as a clip, which shows itself in a notebook and can be saved.
 

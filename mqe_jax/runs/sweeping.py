@@ -21,24 +21,15 @@ from mqe_jax.study.sweep import Job, Measurement, load_part
 from mqe_jax.train.config import TrainConfig
 
 
-@check_arguments(
-    file=PathText,
-    folder=PathText,
-    part=str | None,
-    cells=Sequence[str],
-    seeds=Sequence[Seed],
-    time_limit=Positive | None,
-    impl=str,
-    dry_run=bool,
-)
+@check_arguments("part", "cells", "seeds", "time_limit", "impl", "dry_run", file=PathText, folder=PathText)
 def sweep(
     file: str | Path,
     folder: str | Path,
     *,
     part: str | None = None,
     cells: Sequence[str] = (),
-    seeds: Sequence[int] = (),
-    time_limit: float | None = None,
+    seeds: Sequence[Seed] = (),
+    time_limit: Positive | None = None,
     impl: str = "auto",
     dry_run: bool = False,
 ) -> dict[str, Any]:

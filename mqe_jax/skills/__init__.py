@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, known_name, nearest
 from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
@@ -105,11 +105,8 @@ class Skill(abc.ABC):
     def index(self, names: Sequence[str]) -> np.ndarray:
         """Returns the positions of commands in the vector of commands; InputError for an unknown name."""
         known = [command.name for command in self.commands]
-        for name in names:
-            if name not in known:
-                hint = nearest(name, known)
-                raise InputError(f"{self.name} command: unknown name {name!r}{hint}; allowed: {', '.join(known)}")
-        return np.array([known.index(name) for name in names], int)
+        wrong = f"{self.name} command: unknown name"
+        return np.array([known.index(known_name(wrong, name, known)) for name in names], int)
 
     def column(self, field: str, names: Sequence[str]) -> np.ndarray:
         """Returns a field of `Command`, such as 'gain', of the named commands (n,)."""
@@ -146,10 +143,7 @@ class Skill(abc.ABC):
         limit, default = self.column("limit", names), default[self.index(names)]
         changes = np.stack([-limit, limit], axis=-1)
         for name, (low, high) in ranges.items():
-            if name not in names:
-                hint = nearest(name, names)
-                raise InputError(f"command_ranges: unknown command {name!r}{hint}; allowed: {', '.join(names)}")
-            i = list(names).index(name)
+            i = list(names).index(known_name("command_ranges: unknown command", name, names))
             if not low <= default[i] <= high or low == high:
                 allowed = f"lowest < highest, with the default {default[i]:g} between"
                 raise InputError(f"command_ranges.{name}: {(low, high)} is not allowed; it must be {allowed}")
@@ -183,9 +177,7 @@ class Skill(abc.ABC):
         """Checks the commands that the action sets; the InputError names the allowed ones."""
         allowed = [command.name for command in self.commands if command.gain]
         for name in names:
-            if name not in allowed:
-                hint = nearest(name, allowed)
-                raise InputError(f"commands: unknown command {name!r}{hint}; allowed: {', '.join(allowed)}")
+            known_name("commands: unknown command", name, allowed)
         if not names or len(set(names)) != len(names):
             raise InputError(f"commands: {tuple(names)} must be one or more distinct commands")
 
@@ -225,6 +217,4 @@ def make(name: str | Sequence[str], robot: Robot) -> Skill:
 
     if not isinstance(name, str):
         return Choice(robot, [make(each, robot) for each in name])
-    if name not in SKILLS:
-        raise InputError(f"skill: unknown name {name!r}{nearest(name, SKILLS)}; allowed: {', '.join(SKILLS)}")
-    return SKILLS[name](robot)
+    return SKILLS[known_name("skill: unknown name", name, SKILLS)](robot)

@@ -56,12 +56,9 @@ _SCALE = np.array([command.scale for command in COMMANDS], np.float32)
 class AgileMemory:
     """Recurrent state of one robot's agile skill."""
 
-    frames: jax.Array
-    """Frames of the last steps, oldest first (9, 39); zeros after a reset."""
-    action: jax.Array
-    """Action that the last joint targets amount to (12,)."""
-    gait: jax.Array
-    """Phase of the gait cycle () in [0, 1)."""
+    frames: jax.Array  # frames of the last steps, oldest first (9, 39); zeros after a reset
+    action: jax.Array  # action that the last joint targets amount to (12,)
+    gait: jax.Array  # phase of the gait cycle () in [0, 1)
 
 
 def _pace(velocity: jax.Array) -> jax.Array:

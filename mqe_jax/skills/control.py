@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.settings import fail
 from mqe_jax.physics.robots.index import Proprioception, scatter
 from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
@@ -33,9 +33,7 @@ MODES = ("command", "position", "torque")
 
 def check_mode(mode: str) -> str:
     """Returns the mode, or raises an InputError that names the allowed ones."""
-    if mode not in MODES:
-        raise InputError(f"control: unknown mode {mode!r}{nearest(mode, MODES)}; allowed: {', '.join(MODES)}")
-    return mode
+    return known_name("control: unknown mode", mode, MODES)
 
 
 @jax.tree_util.register_dataclass
@@ -46,20 +44,16 @@ class ControlState:
     skill: Any
     """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of agents and NPC robots, if
     these have another skill."""
-    delayed: jax.Array
-    """Past actuator targets, newest first (lag + 1, R, 12)."""
+    delayed: jax.Array  # past actuator targets, newest first (lag + 1, R, 12)
 
 
 @dataclasses.dataclass(frozen=True)
 class Commander:
     """What an agent's actions mean in the mode `command`."""
 
-    skill: Skill
-    """Skill of the agents."""
-    commands: tuple[str, ...]
-    """Commands that the action sets, in order."""
-    default_commands: np.ndarray
-    """Default commands of the skill (C,)."""
+    skill: Skill  # skill of the agents
+    commands: tuple[str, ...]  # commands that the action sets, in order
+    default_commands: np.ndarray  # default commands of the skill (C,)
     ranges: Mapping[str, tuple[float, float]]
     """Lowest and highest value of some of `commands`; the others have the skill's default ranges."""
 
@@ -118,22 +112,14 @@ class Commander:
 class Controller(Commander):
     """Computes actuator targets from actions."""
 
-    mode: str
-    """Action mode: one of `MODES`."""
-    robot: Robot
-    """Robot type shared by all R robots."""
-    num_robots: int
-    """Number of robots R."""
-    num_agents: int
-    """Number of agents A: the first A robots."""
-    skill_params: Any
-    """Parameters of the skill, or None if no robot uses it."""
-    npc: tuple[Skill, Any] | None = None
-    """Skill of the NPC robots and its parameters if it is another one."""
-    lag: int = 0
-    """Maximum action lag, environment steps."""
-    position_scale: float = 1.0
-    """Factor on the range of the joint targets in the mode `position`."""
+    mode: str  # action mode: one of `MODES`
+    robot: Robot  # robot type shared by all R robots
+    num_robots: int  # number of robots R
+    num_agents: int  # number of agents A: the first A robots
+    skill_params: Any  # parameters of the skill, or None if no robot uses it
+    npc: tuple[Skill, Any] | None = None  # skill of the NPC robots and its parameters if it is another one
+    lag: int = 0  # maximum action lag, environment steps
+    position_scale: float = 1.0  # factor on the range of the joint targets in the mode `position`
 
     @property
     def action_size(self) -> int:

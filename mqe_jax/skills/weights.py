@@ -38,10 +38,8 @@ def layers(params: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precisio
 class Networks:
     """The networks of a skill."""
 
-    skill: str
-    """Name of the skill."""
-    title: str
-    """What messages call it."""
+    skill: str  # name of the skill
+    title: str  # what messages call it
     widths: Mapping[str, tuple[int, ...]]
     """Widths of each part from input to output, by name; the last part outputs the action."""
 

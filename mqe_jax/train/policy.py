@@ -25,6 +25,7 @@ from mqe_jax.core.types import (
     PyTree,
     RandomKey,
     VectorEnv,
+    shapes_of,
     teams_of,
 )
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
@@ -64,6 +65,27 @@ def groups_of(*policies: Any) -> set[str]:
     return {name for policy in policies for name in getattr(policy, "groups", ())}
 
 
+class Composed:
+    """What policies made of others share: the task and the agents of the first, and the groups of all."""
+
+    _parts: Any  # the policies
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return self._parts[0].task
+
+    @property
+    def agents(self) -> int:
+        """Number of agents of the team."""
+        return self._parts[0].agents
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of observations that the policies see."""
+        return tuple(groups_of(*self._parts))
+
+
 class PolicyArrays(NamedTuple):
     """The arrays in which trained policies of one architecture differ."""
 
@@ -99,7 +121,7 @@ class TrainedPolicy:
         check("deterministic", self.deterministic, bool)
         given = {"params": self.params, "normalizer": self.normalizer}
         for name, expected in _template(self.dims, self.config.network).items():
-            if _shapes(given[name]) != _shapes(expected):
+            if shapes_of(given[name]) != shapes_of(expected):
                 fail(name, given[name], f"arrays that fit the network and {self.dims}")
 
     def __repr__(self) -> str:
@@ -184,10 +206,6 @@ def _template(dims: EnvDims, settings: NetworkSettings) -> dict[str, Any]:
         return {"params": params, "normalizer": running_init(dims.observation)}
 
     return jax.eval_shape(arrays)
-
-
-def _shapes(tree: Any) -> Any:
-    return jax.tree.structure(tree), [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
 
 
 @functools.lru_cache(maxsize=32)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import known_name
 from mqe_jax.viz.framing import Camera, fit, goal_points, hidden, smooth, targets
 from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, posed, robot_bases
 from mqe_jax.viz.recording import Episode
@@ -33,9 +33,7 @@ def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 /
 
 def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 16 / 9) -> list[Camera]:
     """Returns the camera of every frame of an episode, for a view of `VIEWS`; InputError for an unknown view."""
-    if view not in VIEWS:
-        raise InputError(f"view: unknown name {view!r}{nearest(view, VIEWS)}; allowed: {', '.join(VIEWS)}")
-    if view == "scene":
+    if known_name("view: unknown name", view, VIEWS) == "scene":
         return [default_camera(model, episode, aspect)] * len(episode)
     if view == "side":
         return _beside(model, episode)

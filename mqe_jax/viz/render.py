@@ -159,27 +159,17 @@ def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
         raise InputError("episode: its coordinates hold NaN or infinite numbers")
 
 
-@check_arguments(
-    env=AnySingle,
-    episode=Episode,
-    path=PathText,
-    view=str | None,
-    size=_SIZE | None,
-    fps=FrameRate | None,
-    speed=Speed,
-    at=Time | None,
-    backend=_BACKEND,
-)
+@check_arguments("episode", "view", "size", "fps", "speed", "at", env=AnySingle, path=PathText, backend=_BACKEND)
 def render_episode(
     env: QuadrupedEnv,
     episode: Episode,
     path: Path,
     *,
     view: str | None = None,
-    size: tuple[int, int] | None = None,
-    fps: float | None = None,
-    speed: float = 1.0,
-    at: float | None = None,
+    size: tuple[Pixels, Pixels] | None = None,
+    fps: FrameRate | None = None,
+    speed: Speed = 1.0,
+    at: Time | None = None,
     backend: str | None = "auto",
 ) -> str:
     """Renders an episode to a file (format by suffix) and returns the renderer used (`egl`, `osmesa`, `matplotlib`).

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import walk_policy
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import known_name
 from mqe_jax.core.limits import Environments, Seed
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check_arguments
@@ -214,15 +214,7 @@ def _frequency(height: np.ndarray) -> float:
     return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
 
 
-@check_arguments(
-    skill=str,
-    weights=PathText | None,
-    robot=str,
-    impl=str,
-    episodes=Environments,
-    seed=Seed,
-    scenarios=Sequence[str] | None,
-)
+@check_arguments("skill", "robot", "impl", "scenarios", weights=PathText | None, episodes=Environments, seed=Seed)
 def evaluate_skill(
     skill: str,
     weights: str | Path | None = None,
@@ -259,8 +251,7 @@ def evaluate_skill(
     known = [name for name, scenario in SCENARIOS.items() if skill in scenario.skills]
     names = known if scenarios is None else list(scenarios)
     for name in names:
-        if name not in known:
-            raise InputError(f"scenario: unknown name {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
+        known_name("scenario: unknown name", name, known)
     env = make_env(skill, body, impl, episodes)
     results = {}
     for name in names:

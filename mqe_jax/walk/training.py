@@ -52,16 +52,7 @@ SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {"walk": (WALK, WalkTask()),
 """Settings and task of each skill that can be trained."""
 
 
-@check_arguments(
-    skill=str,
-    run_dir=PathText,
-    config=TrainConfig | None,
-    task=WalkTask | None,
-    robot=str,
-    weights=PathText | None,
-    impl=str,
-    resume=bool,
-)
+@check_arguments("skill", "config", "task", "robot", "impl", "resume", run_dir=PathText, weights=PathText | None)
 def train_skill(
     skill: str,
     run_dir: str | Path,

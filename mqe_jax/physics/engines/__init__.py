@@ -12,7 +12,7 @@ from typing import Any
 
 import mujoco
 
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.physics.engines.engine import STATE_FIELDS, Engine
 
 __all__ = ["ENGINES", "STATE_FIELDS", "Engine", "make", "resolve"]
@@ -28,10 +28,7 @@ on this machine."""
 
 def resolve(impl: str = "auto") -> str:
     """Returns the name of an engine that can run here; `auto` is warp on an NVIDIA GPU, c on a CPU, else jax."""
-    allowed = ("auto", *ENGINES)
-    if impl not in allowed:
-        raise InputError(f"impl: unknown engine {impl!r}{nearest(impl, allowed)}; allowed: {', '.join(allowed)}")
-    if impl == "auto":
+    if known_name("impl: unknown engine", impl, ("auto", *ENGINES)) == "auto":
         return next(name for name in ENGINES if pkgutil.resolve_name(ENGINES[name]).is_preferred())
     if (obstacle := pkgutil.resolve_name(ENGINES[impl]).obstacle()) is not None:
         raise InputError(f"impl {impl!r} {obstacle}")

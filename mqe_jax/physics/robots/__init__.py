@@ -1,6 +1,6 @@
 """Robots: the `Robot` type, robot data, body tree, index tables and kinematics; the registry of robots by name."""
 
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.go2 import GO2
@@ -12,9 +12,7 @@ ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
 @check_arguments(name=str)
 def get(name: str) -> Robot:
     """Returns a robot by name; InputError for an unknown name, with the nearest known one."""
-    if name not in ROBOTS:
-        raise InputError(f"robot: unknown name {name!r}{nearest(name, ROBOTS)}; allowed: {', '.join(ROBOTS)}")
-    return ROBOTS[name]
+    return ROBOTS[known_name("robot: unknown name", name, ROBOTS)]
 
 
 @check_arguments(robot=Robot)
