@@ -6,13 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
 import pytest
 from fake_env import SMALL
 
 from mqe_jax import cli
-from mqe_jax.cli import commands
 from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.runs import build, learning
 from mqe_jax.train.nn import mlp_init
@@ -155,31 +155,18 @@ def test_wrong_flags_are_named_by_tyro(arguments: list[str], said: list[str], tm
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_training_that_became_nan_ends_with_1(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
-    def stop(*arguments: Any, **named: Any) -> None:
-        raise NonFiniteError("run: update 3 made loss/value NaN or infinite")
-
-    monkeypatch.setattr(learning, "open_training", stop)
-    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 1
-    assert capfd.readouterr().err.splitlines()[-1] == "mqe: run: update 3 made loss/value NaN or infinite"
-
-
-def test_a_file_that_cannot_be_written_ends_with_2(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
-    def stop(*arguments: Any, **named: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/metrics.csv")
-
-    monkeypatch.setattr(learning, "open_training", stop)
-    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 2
-    assert capfd.readouterr().err == "mqe: run/metrics.csv: No space left on device\n"
-
-
-def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
-    def stop(arguments: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(commands.Tasks, "run", stop)
-    assert cli.main(["tasks"]) == 130
-    assert "Traceback" not in capfd.readouterr().err
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (NonFiniteError("run: update 3 made loss/value NaN"), 1, "run: update 3 made loss/value NaN"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/a"), 2, "run/a: No space left on device"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_what_ends_a_training_has_its_exit_code(error: Any, code: int, said: str, monkeypatch: Any, capfd: Any) -> None:
+    monkeypatch.setattr(learning, "open_training", mock.Mock(side_effect=error))
+    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == code
+    assert capfd.readouterr().err == f"mqe: {said}\n"
 
 
 @pytest.mark.parametrize(

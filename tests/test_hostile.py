@@ -297,9 +297,6 @@ def test_memory_is_compared_before_it_is_allocated(made: dict[str, Any], monkeyp
     refuses("rollout_steps: 10000 needs", train, batch, config, "run")
 
 
-LONGEST = 1200  # characters of a message: what is allowed may be a list of names
-
-
 @contextlib.contextmanager
 def refusing(*names: str) -> Iterator[None]:
     """Accepts an InputError of one line that has one of the names, if any; nothing else may be raised."""
@@ -307,7 +304,7 @@ def refusing(*names: str) -> Iterator[None]:
         yield
     except InputError as error:
         text = str(error)
-        assert "\n" not in text and len(text) <= LONGEST, text
+        assert "\n" not in text and len(text) <= inputs.LONGEST, text
         assert not names or any(name in text for name in names), text
 
 
@@ -325,10 +322,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str, Any]) -> None:
     """In every record: training, sweeps, walking, networks and the parameters of all tasks."""
     name, field, value = case
-    with pytest.raises(InputError) as refused:
-        build(inputs.records()[name], {field: value} | ({"tasks": ("go1gate",)} if name == "sweep" else {}))
-    text = str(refused.value)
-    assert field.split(".")[-1] in text and "\n" not in text and len(text) <= LONGEST, text
+    needed = {"tasks": ("go1gate",)} if name == "sweep" else {}
+    refuses(field.split(".")[-1], build, inputs.records()[name], {field: value} | needed)
 
 
 @inputs.CASES
@@ -344,22 +339,14 @@ def test_flags_are_parsed_or_refused(words: list[str]) -> None:
             parse_overrides(getattr(command, "set", []))
 
 
+@pytest.mark.parametrize(("kind", "read"), [(TrainConfig, load_config), (Sweep, load_sweep)])
 @inputs.CASES
-@given(inputs.yaml_text(TrainConfig))
-def test_yaml_of_settings_is_read_or_refused(folder: Path, text: str) -> None:
-    file = folder / "settings.yaml"
-    file.write_text(text, encoding="utf-8", errors="replace")
+@given(data=st.data())
+def test_yaml_of_settings_is_read_or_refused(kind: Any, read: Any, folder: Path, data: st.DataObject) -> None:
+    file, needed = folder / "settings.yaml", "tasks: [go1gate]\n" if kind is Sweep else ""
+    file.write_text(needed + data.draw(inputs.yaml_text(kind)), encoding="utf-8", errors="replace")
     with refusing(file.name):
-        load_config(file)
-
-
-@inputs.CASES
-@given(inputs.yaml_text(Sweep))
-def test_a_sweep_file_is_read_or_refused(folder: Path, text: str) -> None:
-    file = folder / "sweep.yaml"
-    file.write_text(f"tasks: [go1gate]\n{text}", encoding="utf-8", errors="replace")
-    with refusing(file.name):
-        load_sweep(file)
+        read(file)
 
 
 TREE = {"weights": jnp.arange(12.0).reshape(3, 4), "count": jnp.int32(7)}

@@ -11,7 +11,7 @@ import pytest
 
 from mqe_jax import cli
 from mqe_jax.core import interrupts
-from mqe_jax.train.checkpoint import list_checkpoints
+from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from tests import fake_env
 from tests.training import assert_same_run, rows, without_progress
 
@@ -81,7 +81,7 @@ def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, mo
     wait_for(lambda: updates(stopped) >= 3, process)
     (line,) = end(process, signal.SIGTERM)
     assert line == f"mqe: terminated; resume with the same command and --resume; the run is in {stopped}"
-    saved = int(list_checkpoints(stopped)[-1].stem.removeprefix("step_")) // 16
+    saved = checkpoint_step(list_checkpoints(stopped)[-1]) // 16
     assert updates(stopped) - 1 <= saved <= updates(stopped) < 300, "the last complete update is not saved"
     assert cli.main([*FAKE, "--run-dir", str(stopped), "--resume"]) == 0
     assert cli.main([*FAKE, "--run-dir", str(whole)]) == 0

@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,14 +16,14 @@ from mqe_jax.core import files
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import lock, replacing, write_atomically
 from mqe_jax.train import runner
-from mqe_jax.train.checkpoint import list_checkpoints
+from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, Stop, rows, settings, stop_after
+from tests.training import Probe, Stop, largest_file, rows, settings, stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
@@ -161,7 +160,7 @@ def test_seeds_killed_between_two_checkpoints_resume(tmp_path: Path, monkeypatch
     monkeypatch.setattr(runner, "save_checkpoint", killed)
     with pytest.raises(Stop):
         train_seeds(PROBE, configs, folders)
-    newest = [int(list_checkpoints(folder)[-1].stem.removeprefix("step_")) for folder in folders]
+    newest = [checkpoint_step(list_checkpoints(folder)[-1]) for folder in folders]
     assert newest == [48, 32]
     monkeypatch.setattr(runner, "save_checkpoint", save)
     states = train_seeds(PROBE, configs, folders, resume=True)
@@ -177,11 +176,6 @@ def test_a_seed_without_a_checkpoint_is_named(tmp_path: Path) -> None:
     folders = [tmp_path / "old", tmp_path / "new"]
     refuses("old 80, new none", train_seeds, PROBE, [seeded(1), seeded(2)], folders, resume=True)
     assert not (tmp_path / "new").exists()
-
-
-def test_seeds_must_have_the_same_settings(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="only in the seed"):
-        train_seeds(PROBE, [seeded(0), seeded(1, ppo__clip=0.3)], [tmp_path / "a", tmp_path / "b"])
 
 
 def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_path: Path) -> None:
@@ -204,7 +198,9 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
         assert best["deterministic"]["average_step_reward"] != best["sampled"]["average_step_reward"]
 
 
-def test_evaluation_needs_environments(tmp_path: Path) -> None:
+def test_seeds_need_the_same_settings_and_evaluation_needs_environments(tmp_path: Path) -> None:
+    seeds = [seeded(0), seeded(1, ppo__clip=0.3)]
+    refuses("only in the seed", train_seeds, PROBE, seeds, [tmp_path / "a", tmp_path / "b"])
     refuses(r"evaluation\.every", train, PROBE, seeded(0, evaluation__every=2), tmp_path)
 
 
@@ -213,13 +209,9 @@ def test_a_compiled_program_is_stored_whole_or_not_at_all(tmp_path: Path) -> Non
     from jax._src.lru_cache import LRUCache
 
     programs.write_whole()
-    cache, (soft, hard) = LRUCache(str(tmp_path), max_size=-1), resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            cache.put("jit_step-1", bytes(1000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    cache = LRUCache(str(tmp_path), max_size=-1)
+    with largest_file(100), pytest.raises(OSError, match="File too large"):
+        cache.put("jit_step-1", bytes(1000))
     assert cache.get("jit_step-1") is None and list(tmp_path.iterdir()) == []
     cache.put("jit_step-1", bytes(1000))
     assert cache.get("jit_step-1") == bytes(1000)

@@ -19,7 +19,7 @@ from mqe_jax.physics.engines import c
 from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import foot_positions, knee_positions
-from mqe_jax.physics.robots.motors import Motors, leg_response
+from mqe_jax.physics.robots.motors import leg_response
 from mqe_jax.physics.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
@@ -185,17 +185,9 @@ def test_missing_walk_weights_say_how_to_make_them() -> None:
         del robots.ROBOTS["new"]
 
 
-SOAK = pytest.mark.soak
-
-
-def motors_of(name: str) -> Motors:
-    scene = Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1, robot=robots.get(name))
-    return compile_scene(scene).motors
-
-
 @pytest.mark.parametrize("name", ["go1", "go2"])
 def test_idle_motors_keep_their_control_and_have_no_armature(name: str) -> None:
-    motors = motors_of(name)
+    motors = compiled(robots.get(name)).motors
     random = np.random.default_rng(0)
     scale = random.uniform(0.0, 1.2, (2, 4000, 1))
     shares = (scale * random.uniform(-1.0, 1.0, (2, 4000, 12))).astype(np.float32)
@@ -249,7 +241,7 @@ def test_a_step_that_is_interrupted_leaves_no_armature(monkeypatch: Any) -> None
 
 
 def test_the_clamp_keeps_angle_and_speed_consistent() -> None:
-    motors = motors_of("go1")
+    motors = compiled(GO1).motors
     velocity = np.where(np.arange(12) == 2, 3.0, 0.5) * motors.speed
     position, clamped = motors.clamp(np.zeros(12), velocity)
     assert clamped[2] == pytest.approx(1.09 * motors.speed[2]) and np.all(np.delete(clamped == velocity, 2))
@@ -269,7 +261,7 @@ def test_joints_in_the_air_start_along_their_torque_line() -> None:
             assert 0.75 < row[name] / row[f"line_{name}"] < 1.35, (joint, row)
 
 
-@pytest.mark.parametrize("robot", ["go1", pytest.param("go2", marks=SOAK)])
+@pytest.mark.parametrize("robot", ["go1", pytest.param("go2", marks=pytest.mark.soak)])
 def test_engines_agree_where_motors_saturate(robot: str) -> None:
     states = {}
     for impl in ("c", "jax"):

@@ -178,7 +178,9 @@ class Bending:
         return jnp.broadcast_to(0.01 * memory[:, None, None], (*obs.shape[:2], 12)), memory + 1.0
 
 
-def test_a_demonstrator_needs_episodes_of_sixteen_steps() -> None:
+def test_a_demonstrator_needs_assistance_and_episodes_of_sixteen_steps() -> None:
+    with pytest.raises(InputError, match=r"curriculum\.assistance.*above 0"):
+        build(TrainConfig, {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}})
     task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.2)
     refuses(r"episode_length: 0\.2 .*at least 16 steps with a demonstrator", Demonstrated, task, N, Bending())
 
@@ -222,12 +224,9 @@ def test_episodes_start_in_demonstrated_states(rollout: Any) -> None:
     assert np.all(np.asarray(step) <= env.max_episode_steps)
 
 
-def test_without_assistance_episodes_start_as_the_task_does(rollout: Any) -> None:
+def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> None:
     _, (step, _, done) = rollout[1]["none"]
     assert np.asarray(done).any() and not np.asarray(step)[np.asarray(done)].any()
-
-
-def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> None:
     demonstrations, (_, qpos, done) = rollout[1]["few"]
     moments = {tuple(np.asarray(q)) for q in demonstrations["data"]["qpos"]}
     starts = [tuple(np.asarray(qpos[t, i])) in moments for t, i in np.argwhere(np.asarray(done))]
@@ -241,8 +240,3 @@ def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> N
     assert len(step) == 128 * 16 and len(set(step.tolist())) > 8
     bent = (ctrl - env.env.controller.neutral.ravel()) / np.tile(env.env.robot.action_scale, env.num_agents)
     np.testing.assert_allclose(bent, 0.01 * np.tile(step[:, None], bent.shape[1]), atol=1e-5)
-
-
-def test_a_demonstrator_needs_assistance() -> None:
-    with pytest.raises(InputError, match=r"curriculum\.assistance.*above 0"):
-        build(TrainConfig, {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}})

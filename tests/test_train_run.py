@@ -2,9 +2,7 @@
 
 import contextlib
 import dataclasses
-import resource
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
-from mqe_jax.train.checkpoint import latest, list_checkpoints, save_tree
+from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints, save_tree
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
@@ -29,7 +27,7 @@ from mqe_jax.train.runner import train
 from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, Stop, assert_same, assert_same_run, rows, settings, stop_after
+from tests.training import Probe, Stop, assert_same, assert_same_run, largest_file, rows, settings, stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 KEY = jax.random.PRNGKey(0)
@@ -139,17 +137,6 @@ def test_an_interrupted_evaluation_is_made_when_the_run_resumes(tmp_path: Path, 
     assert [evaluation["env_steps"] for evaluation in read_evaluations(tmp_path)["evaluations"]] == [32, 64, 80]
 
 
-@contextlib.contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Writes beyond `size` bytes of any file fail, as on a full disk, with EFBIG in place of ENOSPC."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_a_writer_that_fails_ends_the_training_and_is_named(straight: Any, tmp_path: Path, monkeypatch: Any) -> None:
     """Every time the lock is released, nothing half-written stays, and the run resumes exactly."""
     pytest.importorskip("tensorboardX", reason="needs the extra log")
@@ -192,8 +179,7 @@ def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path)
         train(env, settings(total_steps=100 * 16, network={"recurrent": False, "log_std_init": -0.5}), tmp_path)
     logged = rows(tmp_path)
     assert len(logged) >= 1 and all(row["loss/value"] != "nan" for row in logged)
-    newest = latest(tmp_path)
-    assert newest is not None and int(newest.stem.removeprefix("step_")) <= int(logged[-1]["env_steps"])
+    assert checkpoint_step(list_checkpoints(tmp_path)[-1]) <= int(logged[-1]["env_steps"])
     read_policy(tmp_path)
 
 
@@ -206,9 +192,7 @@ def spoil(path: Path, kind: str) -> None:
 def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     shutil.copytree(straight[0], run_dir)
-    newest = latest(run_dir)
-    assert newest is not None
-    spoil(newest, "checkpoint")
+    spoil(list_checkpoints(run_dir)[-1], "checkpoint")
     spoil(run_dir / "policy.safetensors", "policy")
     refuses(r"policy.safetensors: .*weight holds nan", read_policy, run_dir)
     refuses(r"step_000000000080.safetensors: .*weight holds nan", train, PROBE, settings(), run_dir, resume=True)
@@ -259,6 +243,4 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
 
 def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     refuses(r"policy.safetensors: no such file", read_policy, tmp_path)
-    newest = latest(straight[0])
-    assert newest is not None
-    refuses("holds a checkpoint; a policy is needed", read_policy, newest)
+    refuses("holds a checkpoint; a policy is needed", read_policy, list_checkpoints(straight[0])[-1])

@@ -5,9 +5,11 @@ and last checkpoint. It exits with 1 and names the first difference of each kind
 """
 
 import argparse
+import contextlib
 import csv
 import functools
 import re
+import resource
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -205,6 +207,17 @@ def updated(env: Any, config: TrainConfig, count: int, seed: int = 0, **options:
     assert len(traces) == 1
     assert_same(first, metrics[0])
     return jax.block_until_ready(states), metrics  # while the environment exists
+
+
+@contextlib.contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Writes beyond `size` bytes of any file fail, as on a full disk, with EFBIG in place of ENOSPC."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 class Stop(Exception):

@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy
 from mqe_jax.runs import playing
 from mqe_jax.study.runs import table
-from mqe_jax.study.sweep import Measurement
+from mqe_jax.study.sweep import Measurement, for_task
 from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.policy import TrainedPolicy
 
@@ -42,7 +42,7 @@ def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
     items = []
     for task in part.tasks:
         for variant, changes in part.variants.items():
-            arguments = {"impl": impl, **_fill({**part.arguments, **changes}, task_id(task))}
+            arguments = {"impl": impl, **for_task({**part.arguments, **changes}, task_id(task))}
             for name in arguments.keys() - known.keys():
                 fail(f"arguments.{name}", arguments[name], f"an argument of {part.measure}: {', '.join(known)}")
             items.append(Item(task, variant, arguments, folder / "results" / task / variant / RESULT))
@@ -72,15 +72,6 @@ def measure(part: Measurement, folder: Path, impl: str = "auto", *, dry_run: boo
     ]
     total = {"steps_left": 0, "seconds": None}
     return {"left": {"jobs": left, **total}, "report": [str(folder / RATES)] if rows else []}
-
-
-def _fill(value: Any, task: str) -> Any:
-    """Returns arguments in which {task} stands for the task's id."""
-    if isinstance(value, str):
-        return value.replace("{task}", task)
-    if isinstance(value, Mapping):
-        return {name: _fill(x, task) for name, x in value.items()}
-    return [_fill(x, task) for x in value] if isinstance(value, list | tuple) else value
 
 
 def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:

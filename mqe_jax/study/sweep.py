@@ -24,7 +24,7 @@ from mqe_jax.core.limits import Seed, SeedCount
 from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, record, to_mapping
 from mqe_jax.core.types import Cast
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
-from mqe_jax.train.checkpoint import list_checkpoints
+from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_folders
 from mqe_jax.train.runner import train_seeds
@@ -153,7 +153,7 @@ def plan(
         config = _override(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
         named = {"start": config.start, "opponents": config.opponents}
         if "{task}" in str(named):
-            config = override(config, _for_task(named, cell.task))
+            config = override(config, for_task(named, cell.task))
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not finished(_run(folder, cell, seed))]
         size = sweep.seeds_together or len(sweep.seeds)
@@ -170,12 +170,12 @@ def plan(
     return jobs
 
 
-def _for_task(values: Any, task: str) -> Any:
+def for_task(values: Any, task: str) -> Any:
     """Returns values with the task's id in place of {task}, in strings at any depth."""
     if isinstance(values, Mapping):
-        return {name: _for_task(value, task) for name, value in values.items()}
-    if isinstance(values, tuple):
-        return tuple(_for_task(value, task) for value in values)
+        return {name: for_task(value, task) for name, value in values.items()}
+    if isinstance(values, list | tuple):
+        return [for_task(value, task) for value in values]
     return values.replace("{task}", task) if isinstance(values, str) else values
 
 
@@ -193,7 +193,7 @@ def _override(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> Tra
 def _job(folder: Path, cell: Cell, config: TrainConfig, seeds: Sequence[int]) -> Job:
     folders = tuple(_run(folder, cell, seed) for seed in seeds)
     configs = tuple(override(config, {"seed": seed}) for seed in seeds)
-    steps = [[int(path.stem.removeprefix("step_")) for path in list_checkpoints(run)] for run in folders]
+    steps = [[checkpoint_step(path) for path in list_checkpoints(run)] for run in folders]
     return Job(cell, configs, folders, min(max(own, default=0) for own in steps))
 
 
