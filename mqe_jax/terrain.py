@@ -55,6 +55,8 @@ class Anchor:
     """Mean position (2,), m."""
     spread: tuple[float, float]
     """Half-widths of the uniform range in x and y (2,), m."""
+    kind: str = "gate"
+    """What sensors take the gap at this point for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,6 +133,8 @@ class Gate(TerrainBlock):
     """Thickness of the wall along x, m."""
     random: tuple[float, float] = (0.0, 0.0)
     """Half-widths of the range of the gap's centre, sampled at reset (x, y), m."""
+    kind: str = "gate"
+    """What sensors take the gap for."""
 
     def layout(self, start: float, track: "Track", number: int) -> Layout:
         gap, depth, height = self.width, self.depth, track.wall_height
@@ -143,7 +147,7 @@ class Gate(TerrainBlock):
             Wall(f"gate{number}_{side}", (0.0, sign * (gap + reach) / 2, height / 2), (depth, reach, height), anchor=0)
             for side, sign in (("right", -1.0), ("left", 1.0))
         )
-        return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random),))
+        return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random, self.kind),))
 
 
 @dataclasses.dataclass(frozen=True)

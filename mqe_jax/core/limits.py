@@ -49,6 +49,7 @@ Depth = Annotated[int, Gt(0), Le(16)]  # layers or blocks of a network
 Widths = Annotated[tuple[Width, ...], MinLen(1), MaxLen(16)]  # of all layers
 Pixels = Annotated[int, Ge(16), Le(4096)]  # of one side of an image
 ImageWidth = Annotated[int, Ge(27), Le(4096)]  # at 16:9, whose height has 16 pixels or more
+Rays = Annotated[int, Gt(0), Le(1024)]  # of a lidar
 Port = Annotated[int, Gt(0), Lt(65536)]
 
 # -- texts, settings and files -----------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.index import RobotState, read_robots, scatter
 from mqe_jax.physics.rotation import euler_to_quaternion
 from mqe_jax.physics.scene import build_model, compile_scene
+from mqe_jax.sensors.scene import SensedScene, Snapshot
 from mqe_jax.skills.control import Controller, check_mode
 
 if TYPE_CHECKING:
@@ -172,6 +173,11 @@ class QuadrupedEnv(Task[S, P]):
         """Rendering model: the physics model plus visual geoms; qpos and mocap layouts are identical."""
         return build_model(self._scene, visual=True)[0]
 
+    @functools.cached_property
+    def sensed(self) -> SensedScene:
+        """What there is to sense."""
+        return SensedScene(self.compiled, self.entities, self.teams, self.action_size, self.dt)
+
     @property
     def max_steps(self) -> int:
         """Environment steps until the time limit."""
@@ -292,6 +298,12 @@ class QuadrupedEnv(Task[S, P]):
             seen[name] = jnp.where(state.active[:, None], _clip(obs), 0.0)
         privileged = self.observe_privileged(state, robots)
         return dataclasses.replace(state, obs=seen.pop("policy"), privileged_obs=_clip(privileged), groups=seen)
+
+    def snapshot(self, state: State[S], robot_state: RobotState) -> Snapshot:
+        """Returns what there is to sense in a state."""
+        pose = self.own_frame(robot_state.base_info[: self.num_agents])[:, [0, 1, 5]]
+        action = jnp.zeros((self.num_agents, self.action_size))
+        return self.sensed.snapshot(state.data, robot_state, state.anchors, pose, action)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
         """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""

@@ -15,6 +15,7 @@ from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.objects import Platform
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
+from mqe_jax.sensors.scene import Entity
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
@@ -104,6 +105,11 @@ class Go1Bridge(Duel[None, BridgeParams]):
         """One robot on each platform, facing the bridge."""
         first, second = self.params.spawn_x
         return (first, 0.0, 0.0), (second, 0.0, np.pi)
+
+    @property
+    def entities(self) -> tuple[Entity, ...]:
+        """The two platforms."""
+        return Entity("platform", "platform0"), Entity("platform", "platform1")
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         out = self.eliminated(after.robots)

@@ -86,7 +86,7 @@ class Football(QuadrupedEnv[S, F]):
 
     def scene(self) -> Scene:
         params = self.params
-        goal = Gate(_GOAL_DEPTH, width=params.goal_width, depth=_GOAL_DEPTH)
+        goal = Gate(_GOAL_DEPTH, width=params.goal_width, depth=_GOAL_DEPTH, kind="goal")
         length = float(GOALS[0, 0] - GOALS[1, 0])
         track = Track(
             blocks=(SpawnArea(1.0), goal, Plane(length), goal, EndWall()),

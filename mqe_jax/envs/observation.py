@@ -9,41 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.blocks import Block as Block
+from mqe_jax.core.blocks import by_entity as by_entity
+from mqe_jax.core.blocks import entities as entities
 from mqe_jax.core.settings import fail
 from mqe_jax.envs.returned import check_names, check_shape
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
-
-
-@dataclasses.dataclass(frozen=True)
-class Entities:
-    """What a block holds of each of several entities of one kind, such as the teammates."""
-
-    kind: str
-    """Kind, such as robot or sheep; networks may share parameters between blocks of one kind."""
-    count: int
-    """Number of entities, at most."""
-    width: int
-    """Number of entries of each, without its mask."""
-    masked: bool = False
-    """Whether a last entry of each says if it is there, 1 or 0; the others of one that is not there are 0."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Block:
-    """One block of an observation."""
-
-    name: str
-    """Name, unique in the layout."""
-    width: int
-    """Number of entries."""
-    meaning: str = ""
-    """Meaning, with unit and frame."""
-    categorical: bool = False
-    """Whether the entries encode a category, such as a one-hot, and get no observation noise."""
-    entities: Entities | None = None
-    """What the entries are, one entity after the other; None if they are not of several entities."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,17 +77,6 @@ class ObservationLayout:
 
     def __str__(self) -> str:
         return " | ".join(f"{block.name} {block.width}" for block in self.blocks) + f" = {self.size}"
-
-
-def entities(name: str, kind: str, count: int, width: int, meaning: str = "", *, masked: bool = False) -> Block:
-    """Returns the block of several entities of a kind; `by_entity` fills a masked one."""
-    return Block(name, count * (width + masked), meaning, entities=Entities(kind, count, width, masked))
-
-
-def by_entity(values: jax.Array, there: jax.Array) -> jax.Array:
-    """Returns a masked block (A, count (width + 1)) from entries (A, count, width) and who is there (A, count)."""
-    rows = jnp.concatenate([jnp.where(there[..., None], values, 0.0), there[..., None].astype(values.dtype)], axis=-1)
-    return rows.reshape(len(rows), -1)
 
 
 BASE_INFO = "position, m, and roll, pitch, yaw, rad; environment frame"

@@ -17,6 +17,7 @@ from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.physics.robots.index import RobotIndex, RobotState
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.scene import CompiledScene, ObjectIndex, Scene
+from mqe_jax.sensors.scene import Entity, entities_of
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -140,6 +141,15 @@ class Task(Generic[S, P]):
         """Returns what policies that see a group of observations need of the task, beside its name and sizes."""
         layout = {"policy": self.observation_layout, **self.groups}[group]
         return {"version": self.version, **self.params.actions(self.control), "layout": str(layout)}
+
+    @property
+    def entities(self) -> tuple[Entity, ...]:
+        """What sensors tell apart besides robots and walls: by default the scene's objects and gaps."""
+        return entities_of(self.compiled)
+
+    def own_frame(self, info: jax.Array) -> jax.Array:
+        """Maps the agents' base information (A, 6) to each agent's own (possibly mirrored) frame."""
+        return info
 
     def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of one of `groups` by name (A, width)."""

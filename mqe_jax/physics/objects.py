@@ -1,7 +1,7 @@
 """Scene objects: records, which a task's parameters may nest, that add one body each to a scene; SI units."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,8 +25,31 @@ _HELD = {"contype": OBJECT_BIT, "conaffinity": WALL_BIT | OBJECT_BIT}
 _FLOOR = {"contype": GROUND_BIT, "conaffinity": 0}
 
 
+class Circle(NamedTuple):
+    """An outline about the origin of a body."""
+
+    radius: float  # m
+
+
+class Rectangle(NamedTuple):
+    """An outline about the origin of a body."""
+
+    length: float  # along the body's x, m
+    width: float  # along its y, m
+
+
 class Object:
     """Base of all objects."""
+
+    @property
+    def kind(self) -> str:
+        """What sensors take it for."""
+        return type(self).__name__.lower()
+
+    @property
+    def outline(self) -> Circle | Rectangle | None:
+        """What planar sensors see of it; None if robots pass or stand on it."""
+        return None
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         """Adds the body `name` to a scene, with its purely visual geoms if `visual`; no actuator, no mocap body."""
@@ -69,6 +92,10 @@ class Box(Object):
     friction: Friction = 1.0
     """Sliding friction; takes precedence over the ground's."""
 
+    @property
+    def outline(self) -> Rectangle:
+        return Rectangle(*self.size[:2])
+
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         x, y, z = np.square(self.size)
         body = add_body(spec, name, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
@@ -91,6 +118,10 @@ class Ball(Object):
     """Linear damping, N s/m."""
     angular_damping: Damping = 0.0003
     """Angular damping, N m s/rad."""
+
+    @property
+    def outline(self) -> Circle:
+        return Circle(self.radius)
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         # A thin shell on three slides and a ball joint: a free joint has a single damping coefficient.
@@ -119,6 +150,10 @@ class Cylinder(Object):
     reach: Length = 1.8
     """Maximum |y|, m."""
 
+    @property
+    def outline(self) -> Circle:
+        return Circle(self.radius)
+
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         body = add_body(spec, name, (self.x, 0.0, 0.0), self.mass, (1.0, 1.0, 1.0))
         limits = {"limited": True, "range": (-self.reach, self.reach)}
@@ -144,6 +179,10 @@ class Door(Object):
     """Inertia about the hinge, kg m^2."""
     damping: Damping = 0.5
     """Damping of the hinge, N m s/rad."""
+
+    @property
+    def outline(self) -> Rectangle:
+        return Rectangle(*self.size[:2])
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         body = add_body(spec, name, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia))
@@ -195,6 +234,11 @@ class Platform(Object):
     column: Distance = 0.0
     """Radius of the supporting column, m; none if 0."""
 
+    @property
+    def outline(self) -> Circle | None:
+        """The column."""
+        return Circle(self.column) if self.column else None
+
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         x, y, top = self.center
         body = spec.worldbody.add_body(name=name, pos=(x, y, top - self.size[2] / 2))
@@ -245,6 +289,10 @@ class Sheep(Object):
     """Height, m."""
     mass: Mass = 5.0
     """Mass, kg."""
+
+    @property
+    def outline(self) -> Circle:
+        return Circle(self.radius)
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         # The lower end of the capsule is below the ground, so that it is cylindrical at ground level.

@@ -1,0 +1,60 @@
+"""Sensors: what robots measure, as blocks of an observation; their registry.
+
+A sensor is a settings record derived from `Sensor` in its own file, registered by `register`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import jax
+import mujoco
+
+from mqe_jax.core.blocks import Block
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import fail, is_record
+from mqe_jax.sensors.scene import SensedScene, Snapshot
+
+
+class Sensor:
+    """Base of all sensors: functions of one environment, for all its agents."""
+
+    name: Any
+    """Name in the registry, a `Literal` field with its value as the default."""
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        """Adds what the sensor needs, such as sites or cameras, to the scene of the physics before it is compiled."""
+
+    def layout(self, scene: SensedScene) -> tuple[Block, ...]:
+        """Returns the blocks of its readings: names, widths, meaning with unit and frame."""
+        raise NotImplementedError(f"sensor {type(self).__name__}: layout() is not defined")
+
+    def init_memory(self, scene: SensedScene) -> Any:
+        """Returns its recurrent state at the start of an episode, a pytree of arrays."""
+        return ()
+
+    def observe(
+        self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
+    ) -> tuple[dict[str, jax.Array], Any]:
+        """Returns the readings of all agents by block (A, width), each in its own frame, and the next memory."""
+        raise NotImplementedError(f"sensor {type(self).__name__}: observe() is not defined")
+
+
+SENSORS: dict[str, type[Sensor]] = {}
+"""Settings records of sensors by name."""
+
+S = TypeVar("S", bound=type[Sensor])
+
+
+def register(sensor: S) -> S:
+    """Registers a record under the default of its field `name`, and returns it; a class decorator.
+
+    Raises:
+        InputError: for anything else, or if another class is registered under the name.
+    """
+    if not (isinstance(sensor, type) and issubclass(sensor, Sensor) and is_record(sensor)):
+        fail("sensor", sensor, "a record derived from Sensor")
+    name = sensor().name
+    if SENSORS.setdefault(name, sensor) is not sensor:
+        raise InputError(f"sensor: the name {name!r} is already registered")
+    return sensor

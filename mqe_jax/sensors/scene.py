@@ -1,0 +1,167 @@
+"""What sensors sense: robots, walls and entities of a scene, as points and planar shapes in the environment frame."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.physics.kinematics import poses
+from mqe_jax.physics.objects import Circle, Rectangle
+from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.rotation import quaternion_to_euler
+from mqe_jax.physics.scene import CompiledScene
+from mqe_jax.sensors.planar import sides
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+
+class Entity(NamedTuple):
+    """Something besides robots and walls that sensors can tell apart."""
+
+    kind: str
+    """Kind, such as sheep or gate."""
+    place: str | int
+    """Name of an object of the scene, or number of an anchor of its track."""
+
+
+def entities_of(compiled: CompiledScene) -> tuple[Entity, ...]:
+    """Returns a scene's objects and the gaps in the walls of its track."""
+    objects = [Entity(item.kind, name) for name, item in compiled.scene.objects.items()]
+    gaps = [Entity(anchor.kind, number) for number, anchor in enumerate(compiled.layout.anchors)]
+    return *objects, *gaps
+
+
+class Snapshot(NamedTuple):
+    """What sensors sense at one time, of R robots, the first A of them agents, and E entities."""
+
+    data: mjx.Data
+    """Physics state."""
+    robots: RobotState
+    """State of the robots."""
+    pose: jax.Array
+    """Poses x, y, yaw of the agents, each in its own (possibly mirrored) frame (A, 3), m and rad."""
+    action: jax.Array
+    """The agents' last actions, each in its own frame (A, D)."""
+    places: jax.Array
+    """Poses x, y, yaw of the robots and the entities (R + E, 3), m and rad."""
+    circles: jax.Array
+    """Circles x, y, radius of the robots, then of entities (C, 3), m."""
+    segments: jax.Array
+    """Ends of the sides of walls and entities (S, 2, 2), m."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SensedScene:
+    """What does not change: who senses, and what there is to sense."""
+
+    compiled: CompiledScene
+    entities: tuple[Entity, ...]
+    """The entities. A match lists those of one kind in an order that its symmetry reverses."""
+    teams: tuple[tuple[int, ...], ...]
+    """Agents of each team; other robots are opponents of all."""
+    action_size: int
+    """Length of an action D."""
+    dt: float
+    """Environment step, s."""
+    reflected: bool = False
+    """Whether the second team's frame is a reflection of the first's."""
+
+    @property
+    def num_agents(self) -> int:
+        """Number of agents A."""
+        return sum(map(len, self.teams))
+
+    @property
+    def num_robots(self) -> int:
+        """Number of robots R."""
+        return self.compiled.index.num_robots
+
+    @functools.cached_property
+    def mirror(self) -> np.ndarray:
+        """-1 for agents whose left is the robot's right, 1 for the others (A,)."""
+        return np.concatenate(
+            [np.full(len(t), -1.0 if n and self.reflected else 1.0) for n, t in enumerate(self.teams)]
+        )
+
+    @functools.cached_property
+    def targets(self) -> dict[str, np.ndarray]:
+        """What each agent may detect by kind, as rows of `Snapshot.places` (A, count)."""
+        robots = np.arange(self.num_robots)
+        mates = [[other for other in team if other != agent] for team in self.teams for agent in team]
+        rivals = [np.setdiff1d(robots, team) for team in self.teams for _ in team]
+        found = {"mates": np.array(mates, int), "opponents": np.array(rivals, int)}
+        for kind in dict.fromkeys(entity.kind for entity in self.entities):
+            rows = np.flatnonzero([entity.kind == kind for entity in self.entities]) + self.num_robots
+            found[kind] = np.array([rows[::-1] if n else rows for n, team in enumerate(self.teams) for _ in team])
+        return {kind: rows for kind, rows in found.items() if rows.shape[1]}
+
+    @functools.cached_property
+    def _outlines(self) -> dict[int, Circle | Rectangle]:
+        """Outlines of entities by their rows of `Snapshot.places`."""
+        objects, found = self.compiled.scene.objects, {}
+        for row, entity in enumerate(self.entities, start=self.num_robots):
+            if isinstance(entity.place, str) and (outline := objects[entity.place].outline) is not None:
+                found[row] = outline
+        return found
+
+    @functools.cached_property
+    def owners(self) -> np.ndarray:
+        """The row of `Snapshot.places` of each circle and each segment (C + S,); -1 for walls."""
+        circles = [row for row, outline in self._outlines.items() if isinstance(outline, Circle)]
+        walls = len(self.compiled.layout.barriers) + 4 * len(self.compiled.layout.walls)
+        rectangles = [row for row, outline in self._outlines.items() if isinstance(outline, Rectangle)]
+        return np.array([*range(self.num_robots), *circles, *[-1] * walls, *np.repeat(rectangles, 4)], int)
+
+    def snapshot(
+        self, data: mjx.Data, robots: RobotState, anchors: jax.Array, pose: jax.Array, action: jax.Array
+    ) -> Snapshot:
+        """Returns what there is to sense in a state; arguments as the fields of `State` and `Snapshot`."""
+        every = jnp.concatenate([_planar(robots.position_w, robots.quaternion), *self._entities(data, anchors)])
+        radius = float(np.hypot(*self.compiled.scene.robot.leg_root))  # at which the hips are
+        circles = dict.fromkeys(range(self.num_robots), radius)
+        circles |= {row: shape.radius for row, shape in self._outlines.items() if isinstance(shape, Circle)}
+        radii = np.array([*circles.values()], np.float32)[:, None]
+        rectangles = {row: shape for row, shape in self._outlines.items() if isinstance(shape, Rectangle)}
+        places, sizes = every[np.array([*rectangles], int)], np.reshape([*rectangles.values()], (-1, 2))
+        return Snapshot(
+            data=data,
+            robots=robots,
+            pose=pose,
+            action=action,
+            places=every,
+            circles=jnp.concatenate([every[np.array([*circles]), :2], radii], axis=-1),
+            segments=jnp.concatenate([self._walls(anchors), sides(places, sizes)]),
+        )
+
+    def _entities(self, data: mjx.Data, anchors: jax.Array) -> list[jax.Array]:
+        """Returns the pose x, y, yaw of each entity (1, 3), m and rad."""
+        found: dict[str | int, jax.Array] = {n: jnp.append(anchors[n], 0.0) for n in range(len(anchors))}
+        names = [entity.place for entity in self.entities if isinstance(entity.place, str)]
+        if names:
+            bodies = [self.compiled.objects[name].body for name in names]
+            found |= zip(names, _planar(*poses(self.compiled.model, data, bodies)), strict=True)
+        return [found[entity.place][None] for entity in self.entities]
+
+    def _walls(self, anchors: jax.Array) -> jax.Array:
+        """Returns the ends of the walls' sides (S', 2, 2), m."""
+        barriers, walls = self.compiled.layout.barriers, self.compiled.layout.walls
+        along = np.reshape([(-barrier.normal[1], barrier.normal[0]) for barrier in barriers], (-1, 1, 2))
+        half = np.reshape([barrier.length / 2 for barrier in barriers], (-1, 1, 1)) * np.array([[-1.0], [1.0]])
+        ends = np.reshape([barrier.point for barrier in barriers], (-1, 1, 2)) + along * half
+        center = jnp.asarray(np.reshape([wall.center[:2] for wall in walls], (-1, 2)), jnp.float32)
+        moving = np.flatnonzero([wall.anchor is not None for wall in walls])
+        if len(moving):
+            center = center.at[moving].add(anchors[self.compiled.mocap_anchor])
+        boxes = sides(jnp.pad(center, ((0, 0), (0, 1))), np.reshape([wall.size[:2] for wall in walls], (-1, 2)))
+        return jnp.concatenate([jnp.asarray(ends, jnp.float32), boxes])
+
+
+def _planar(position: jax.Array, quaternion: jax.Array) -> jax.Array:
+    """Returns x, y, yaw (..., 3), m and rad, of poses (..., 3), (..., 4)."""
+    return jnp.concatenate([position[:, :2], quaternion_to_euler(quaternion)[:, 2:]], axis=-1)
