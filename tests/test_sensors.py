@@ -5,6 +5,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,11 +15,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.envs import State
+from mqe_jax.core.errors import InputError
+from mqe_jax.envs import State, VectorEnv, make
+from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.physics.objects import Circle
+from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
+from mqe_jax.sensors.detections import Detections
 from mqe_jax.sensors.lidar import Lidar
-from tests.states import made
+from mqe_jax.sensors.proprioception import Proprioception
+from tests.states import initial, made, placed
 
 SENSING = [task for task in SHIPPED if task != "go1plane"]
 COUNTS = [5, pytest.param(500, marks=pytest.mark.soak)]
@@ -35,9 +42,7 @@ def scattered(task: str, count: int) -> State:
     track = env._scene.track
 
     def places(n: int) -> tuple[np.ndarray, np.ndarray]:
-        spot = rng.uniform(
-            [0.05, -track.width / 2 + 0.05], [track.length - 0.05, track.width / 2 - 0.05], (count, n, 2)
-        )
+        spot = rng.uniform([0.15, 0.15 - track.width / 2], [track.length - 0.15, track.width / 2 - 0.15], (count, n, 2))
         half = rng.uniform(-np.pi, np.pi, (count, n)) / 2
         return spot, np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
 
@@ -87,6 +92,7 @@ class Shapes:
             add(-1, (*wall.center[:2], 0.0, wall.anchor), type=box, size=size)
         self.model = spec.compile()
         self.data, self.scene = mujoco.MjData(self.model), mujoco.MjData(env.compiled.model)
+        self.groups = np.array([1, 1, 1, 1, 1, 0], np.uint8)
 
     def place(self, qpos: np.ndarray, anchors: np.ndarray) -> None:
         """Moves the shapes to where they are in a state."""
@@ -103,14 +109,16 @@ class Shapes:
             self.data.mocap_quat[number] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
         mujoco.mj_kinematics(self.model, self.data)
 
-    def ray(self, origin: np.ndarray, angle: float, exclude: int) -> float:
-        """Returns the distance along a ray, without the shape of a body of the scene; infinite if there is none."""
-        return ray(self.model, self.data, origin, angle, self.bodies.index(exclude) + 1)
+    def ray(self, origin: np.ndarray, angle: float, *bodies: int) -> float:
+        """Returns the distance along a ray, without the shapes of bodies of the scene; infinite if there is none."""
+        self.model.geom_group = [5 * (body in bodies) for body in self.bodies]
+        return ray(self.model, self.data, origin, angle, self.groups)
 
 
-def ray(model: Any, data: Any, origin: np.ndarray, angle: float, body: int, groups: Any = None) -> float:
+def ray(model: Any, data: Any, origin: np.ndarray, angle: float, groups: np.ndarray) -> float:
+    """Returns the distance along a horizontal ray to a geom of some groups, infinite if there is none."""
     direction = np.array([np.cos(angle), np.sin(angle), 0.0])
-    distance = mujoco.mj_ray(model, data, origin, direction, groups, True, body, np.zeros(1, np.int32))
+    distance = mujoco.mj_ray(model, data, origin, direction, groups, True, -1, np.zeros(1, np.int32))
     return distance if distance >= 0 else np.inf
 
 
@@ -118,7 +126,7 @@ def readings(env: Any, states: State, sensor: Any) -> np.ndarray:
     """What a sensor without memory and noise reads (N, A, width)."""
 
     def read(state: State) -> dict[str, jax.Array]:
-        return sensor.observe(env.sensed, env.snapshot(state, env.read(state.data)), (), state.key)[0]
+        return sensor.observe(env.suite.scene, env.snapshot(state, env.read(state.data)), (), state.key)[0]
 
     (values,) = jax.jit(jax.vmap(read))(states).values()
     return np.asarray(values)
@@ -148,6 +156,44 @@ def test_the_lidar_agrees_with_mujoco_on_the_declared_shapes(task: str, count: i
             assert np.all((read[number, agent] > low - 1e-4) & (read[number, agent] < high + 1e-4))
 
 
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("task", SENSING)
+def test_visibility_agrees_with_mujoco_on_the_declared_shapes(task: str, count: int) -> None:
+    """Outside of 1 cm of an edge: where no line of sight with its ends 1 cm beside differs."""
+    env, states, shapes, sensor = made(task), scattered(task, count), Shapes(made(task)), Detections()
+    scene, checked = env.suite.scene, set()
+
+    def see(state: State) -> jax.Array:
+        return sensor.visible(scene, env.snapshot(state, env.read(state.data)))
+
+    seen = np.asarray(jax.jit(jax.vmap(see))(states))
+    for number in range(count):
+        anchors = np.asarray(states.anchors[number], float)
+        shapes.place(np.asarray(states.data.qpos[number], float), anchors)
+        names = [entity.place for entity in env.entities]
+        bodies = [*env.index.trunk_body, *(-2 if isinstance(x, int) else env.objects[x].body for x in names)]
+        spots = [shapes.scene.xpos[body, :2] if body >= 0 else None for body in bodies]
+        spots = [anchors[x] if at is None else at for x, at in zip([*env.index.trunk_body, *names], spots, strict=True)]
+        for agent, row in itertools.product(range(env.num_agents), range(len(spots))):
+            if row == agent:
+                continue
+            base = np.asarray(states.data.qpos[number, env.index.base_qpos[agent]], float)
+            views = []
+            for near, far, along in itertools.product((-0.01, 0, 0.01), repeat=3):
+                way = spots[row] - spots[agent]
+                ahead = way / np.linalg.norm(way)
+                side = np.array([-ahead[1], ahead[0]])
+                start, end = spots[agent] + near * side, spots[row] + far * side + along * ahead
+                distance, angle = np.linalg.norm(end - start), np.arctan2(*(end - start)[::-1])
+                bearing = np.abs((angle - 2 * np.arctan2(base[6], base[3]) + np.pi) % (2 * np.pi) - np.pi)
+                free = shapes.ray(np.array([*start, 0.0]), angle, bodies[agent], bodies[row]) > distance
+                views.append(bool(free and distance < 6.0 and np.degrees(bearing) < 60))
+            if len({*views}) == 1:
+                checked |= {views[0]}
+                assert seen[number, agent, row] == views[0]
+    assert checked == {True, False}
+
+
 def deviation(task: str, count: int) -> np.ndarray:
     """Returns how far the lidar deviates from rays against the scene's own geoms at the height of the trunk, m."""
     env, states = made(task), scattered(task, count)
@@ -160,10 +206,110 @@ def deviation(task: str, count: int) -> np.ndarray:
             model.geom_group[:] = 0
             model.geom_group[env.index.geoms[agent]] = 5  # its own geoms
             seen = np.array([1, 1, 1, 1, 1, 0], np.uint8)
-            real = np.minimum([ray(model, data, origin, angle, -1, seen) for angle in angles], RANGE)
+            real = np.minimum([ray(model, data, origin, angle, seen) for angle in angles], RANGE)
             apart.append(np.abs(real - read[number, agent]))
     model.geom_group[:] = groups
     return np.concatenate(apart)
+
+
+# ---------------------------------------------------------------- Memory, mirrored frames, settings
+
+EXACT = (Proprioception(drift=0.0, yaw_drift=0.0), Detections(position_noise=0.0, yaw_noise=0.0, misses=0.0), Lidar())
+
+
+def sense(env: Any, sensor: Any) -> Any:
+    """The compiled reading of a sensor from a state and its memory."""
+
+    def read(state: State, memory: Any) -> Any:
+        return sensor.observe(env.suite.scene, env.snapshot(state, env.read(state.data)), memory, state.key)
+
+    return jax.jit(read)
+
+
+def test_a_detection_is_kept_with_its_age() -> None:
+    env, sensor = made("go1gate"), EXACT[1]
+    layout, see = ObservationLayout(sensor.layout(env.suite.scene)), sense(env, sensor)
+
+    def mate(position: Any, yaw: float, memory: Any) -> tuple[list[float], bool, Any]:
+        blocks, memory = see(placed(env, [position, [2.0, 0.5, 0.3]], [[0, 0, yaw], [0, 0, 0.5]]), memory)
+        (entry,), (there,) = layout.entities(layout.pack(blocks)[0], "mates")
+        return np.asarray(entry).round(5).tolist(), bool(there), memory
+
+    entry, there, memory = mate([1.0, 0.5, 0.3], np.pi, sensor.init_memory(env.suite.scene))
+    assert not there and entry == [0, 0, 0, 0, 0]  # behind
+    entry, there, memory = mate([1.0, 0.5, 0.3], 0.5, memory)
+    first = [np.cos(0.5), -np.sin(0.5), 1.0, 0.0]  # m and of no relative yaw
+    assert there and entry == pytest.approx([*first, 0.0], abs=1e-5)
+    for steps in (1, 2):
+        entry, there, memory = mate([1.5, 0.5, 0.3], np.pi, memory)
+        assert there and entry == pytest.approx([*first, steps * env.dt], abs=1e-5)
+    entry, there, _ = mate([1.5, 0.5, 0.3], 0.0, memory)
+    assert there and entry == pytest.approx([0.5, 0.0, np.cos(0.5), np.sin(0.5), 0.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("task", ["go1revolvingdoor", "go1bridge"])
+def test_sensors_of_the_second_team_are_mirrored_as_its_frame(task: str) -> None:
+    """The second robot is the image of the first: everything reads alike. Odometry follows the true pose."""
+    env, rng = made(task), np.random.default_rng(0)
+    state, reflect = initial(env), task == "go1revolvingdoor"
+    joints, speeds = GO1.default_joints + rng.normal(0, 0.2, 12), rng.normal(size=12)
+    image = lambda x: x[MIRRORED_JOINTS] * MIRRORED_SIGNS if reflect else x  # noqa: E731
+    spin, sign = np.array([0.3, -0.4, 0.5]), np.array([-1, 1, -1]) if reflect else np.ones(3)
+    position, euler = np.array([1.1, 0.5, 0.3]), np.array([0.1, 0.2, 0.4])
+    middle = np.array([*env.center, 0.0])
+    other = position * [1, -1, 1] if reflect else 2 * middle - position + [0, 0, 0.6]
+    turned = euler * sign if reflect else euler + np.array([0, 0, np.pi])
+    state = placed(env, [position, other], [euler, turned])
+    qpos, qvel = np.array(state.data.qpos), np.array(state.data.qvel)
+    qpos[env.index.joint_qpos], qvel[env.index.joint_qvel] = [joints, image(joints)], [speeds, image(speeds)]
+    qvel[env.index.base_qvel[:, 3:]] = [spin, spin * sign]
+    state = dataclasses.replace(state, data=state.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)))
+    for sensor in EXACT:
+        blocks, _ = sense(env, sensor)(state, sensor.init_memory(env.suite.scene))
+        for name, (first, second) in blocks.items():
+            np.testing.assert_allclose(first, second, atol=1e-5, err_msg=name)
+
+
+def test_senses_add_a_group_and_change_nothing_else() -> None:
+    """Their memory advances once a step, with or without final observations, and restarts with the episode."""
+    options: Any = {"impl": "c", "control": "position", "num_envs": 2}
+    blind, env = make("go1bridge", **options), make("go1bridge", **options, senses=EXACT)
+    batches = [VectorEnv(blind, 2), VectorEnv(env, 2).with_groups(["onboard"])]
+    batches.append(VectorEnv(env, 2, final=()).with_groups(["onboard"]))
+    states = [jax.jit(batch.reset)(jax.random.PRNGKey(0)) for batch in batches]
+    action = jnp.full((2, 2, 12), 0.3)
+    for step in range(4):
+        if step == 2:
+            late = jnp.array([env.max_steps - 1, 0])
+            states = [dataclasses.replace(state, step=late) for state in states]
+        states = [jax.jit(batch.step)(state, action) for batch, state in zip(batches, states, strict=True)]
+        plain, seeing, lean = states
+        for name in ("data", "obs", "reward", "key"):
+            jax.tree.map(np.testing.assert_array_equal, getattr(plain, name), getattr(seeing, name))
+        np.testing.assert_allclose(seeing.groups["onboard"], lean.groups["onboard"], atol=1e-5)
+        read = env.groups["onboard"].split(seeing.groups["onboard"])
+        x, y, _, _, _, yaw = jnp.moveaxis(jax.vmap(env.own_frame)(jax.vmap(env.read)(seeing.data).base_info), -1, 0)
+        np.testing.assert_allclose(read["odometry"], jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw)], -1), atol=1e-4)
+        fresh = step == 2
+        np.testing.assert_allclose(read["action"][0], 0.0 if fresh else 0.3)
+        assert seeing.final_groups["onboard"].shape == (2, 2, env.group_sizes["onboard"])
+    assert states[0].senses == () and "onboard" not in blind.groups
+
+
+@pytest.mark.parametrize(
+    ("senses", "message"),
+    [
+        ("onbord", r"senses: 'onbord' .*full, onboard.*did you mean 'onboard'"),
+        (["lidr"], r"senses: 'lidr' .*proprioception, detections, lidar|lidar.*did you mean 'lidar'"),
+        ([{"name": "lidar", "rays": 0}], r"senses.*rays: 0 .*greater than 0"),
+        ([{"name": "lidar", "beams": 8}], r"senses.*beams: unknown name"),
+        (["lidar", "lidar"], r"senses: .*sensors of different names"),
+        (3, r"senses: 3 .*full, onboard"),
+    ],
+)
+def test_bad_senses_are_named(senses: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make("go1gate", impl="c", senses=senses)
 
 
 if __name__ == "__main__":

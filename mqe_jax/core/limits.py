@@ -18,6 +18,7 @@ Length = Annotated[float, Ge(1e-3), Le(1e3)]  # of a body or a scene, m
 Distance = Annotated[float, Ge(0), Le(1e3)]  # m
 Coordinate = Annotated[float, Ge(-1e3), Le(1e3)]  # in the environment's frame, m
 Mass = Annotated[float, Ge(1e-3), Le(1e4)]  # kg, or a moment of inertia, kg m^2
+Degrees = Annotated[float, Ge(0), Le(360)]
 Damping = Annotated[float, Ge(0), Le(1e5)]  # N s/m, or N m s/rad
 Friction = Annotated[float, Ge(0), Le(100)]
 PositiveFriction = Annotated[float, Ge(1e-3), Le(100)]

@@ -154,5 +154,6 @@ class VectorEnv(EnvBatch):
         """Advances one environment, and resets it to `start` if its episode ended; see `autoreset`."""
         state = self.env.advance(state, action)
         if self.final:
-            state = self._with_final(self.env.with_observations(state, self.groups))
+            seen = self._with_final(self.env.with_observations(state, self.groups))
+            state = dataclasses.replace(seen, senses=state.senses)  # sensors observe once a step
         return autoreset(self.env, state, start, self.groups)

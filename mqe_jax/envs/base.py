@@ -23,7 +23,7 @@ from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, check_arguments, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
-from mqe_jax.envs.observation import ObservationLayout, box
+from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
@@ -36,14 +36,14 @@ from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.index import RobotState, read_robots, scatter
 from mqe_jax.physics.rotation import euler_to_quaternion
 from mqe_jax.physics.scene import build_model, compile_scene
-from mqe_jax.sensors.scene import SensedScene, Snapshot
+from mqe_jax.sensors.suite import ONBOARD
 from mqe_jax.skills.control import Controller, check_mode
 
 if TYPE_CHECKING:
-    from gymnasium.spaces import Box
     from mujoco import mjx
 
 _NOISE = 7919  # folded into a state's key for the noise of its observations
+_SENSING = 7907  # and for its sensors
 
 
 class QuadrupedEnv(Task[S, P]):
@@ -78,6 +78,7 @@ class QuadrupedEnv(Task[S, P]):
             torque_robots=torque_robots,
             max_contacts=self.params.contacts_per_robot * scene.num_robots,
             foot_sensors=self.params.privileged_contact_forces,
+            edits=tuple(sensor.edit_spec for sensor in self.params.senses),
         )
         self.compiled = compile_scene(self._scene)
         self.index, self.objects = self.compiled.index, self.compiled.objects
@@ -144,11 +145,6 @@ class QuadrupedEnv(Task[S, P]):
         return f"<{self.name}: {', '.join(facts)}>"
 
     @property
-    def action_size(self) -> int:
-        """Length of an agent's action."""
-        return self.controller.action_size
-
-    @property
     def privileged_layout(self) -> ObservationLayout:
         """The blocks of the privileged observation, in order; physical units, not normalised."""
         return self.privileged.layout
@@ -158,25 +154,10 @@ class QuadrupedEnv(Task[S, P]):
         """Length of the privileged observation P."""
         return self.privileged_layout.size
 
-    @property
-    def action_space(self) -> Box:
-        """All agents' actions (A, action_size), within `action_limit`."""
-        return box(self.action_limit, (self.num_agents, self.action_size))
-
-    @property
-    def observation_space(self) -> Box:
-        """All agents' observations (A, O)."""
-        return box(np.inf, (self.num_agents, self.observation_size))
-
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
         """Rendering model: the physics model plus visual geoms; qpos and mocap layouts are identical."""
         return build_model(self._scene, visual=True)[0]
-
-    @functools.cached_property
-    def sensed(self) -> SensedScene:
-        """What there is to sense."""
-        return SensedScene(self.compiled, self.entities, self.teams, self.action_size, self.dt)
 
     @property
     def max_steps(self) -> int:
@@ -230,6 +211,7 @@ class QuadrupedEnv(Task[S, P]):
             frozen_steps=self._sample_frozen_steps(freeze_key, assistance),
             key=next_key,
             active=jnp.ones(self.num_agents, bool),
+            senses=self.suite.reset() if self.params.senses else (),
         )
         state = dataclasses.replace(state, task=self.reset_task(task_key, state, robot_state))
         now = Moment(state, robot_state)
@@ -257,7 +239,8 @@ class QuadrupedEnv(Task[S, P]):
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
         still = (state.step < state.frozen_steps) | ~state.active
-        action = self.unmirror_action(jnp.where(still[:, None], 0.0, action))
+        own_action = jnp.where(still[:, None], 0.0, action)
+        action = self.unmirror_action(own_action)
         key, push_key, _, npc_key = jax.random.split(state.key, 4)
 
         before = Moment(state, self.read(state.data, state.active))
@@ -278,32 +261,33 @@ class QuadrupedEnv(Task[S, P]):
         else:
             data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
         robot_state = self.read(data, state.active)
-        moved = {"data": data, "control": control, "actuators": actuators}
+        senses = state.senses._replace(action=own_action) if self.params.senses else ()
+        moved = {"data": data, "control": control, "actuators": actuators, "senses": senses}
         state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
         state = self.judge(before, Moment(state, robot_state), bad_action)
         return dataclasses.replace(state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)})
 
     @jax.named_scope("task")
     def with_observations(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
-        """Returns the state with the observations that belong to it, and those of further groups."""
+        """Returns the state with the observations that belong to it, and those of further groups; once a step."""
         robots, noise, seen = self.read(state.data, state.active), self.params.randomization.observation_noise, {}
         for number, (name, layout) in enumerate({"policy": self.observation_layout, **self.groups}.items()):
             if name != "policy" and name not in groups:
                 continue
-            blocks = self.observe(state, robots) if name == "policy" else self.observe_group(name, state, robots)
+            if name == ONBOARD:
+                key = jax.random.fold_in(state.key, _SENSING)
+                blocks, senses = self.suite.observe(self.snapshot(state, robots), state.senses, key)
+                state = dataclasses.replace(state, senses=senses)
+            else:
+                blocks = self.observe(state, robots) if name == "policy" else self.observe_group(name, state, robots)
             obs = layout.pack(blocks, self.num_agents)
             if noise:
                 key = jax.random.fold_in(state.key, _NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
             seen[name] = jnp.where(state.active[:, None], _clip(obs), 0.0)
         privileged = self.observe_privileged(state, robots)
-        return dataclasses.replace(state, obs=seen.pop("policy"), privileged_obs=_clip(privileged), groups=seen)
-
-    def snapshot(self, state: State[S], robot_state: RobotState) -> Snapshot:
-        """Returns what there is to sense in a state."""
-        pose = self.own_frame(robot_state.base_info[: self.num_agents])[:, [0, 1, 5]]
-        action = jnp.zeros((self.num_agents, self.action_size))
-        return self.sensed.snapshot(state.data, robot_state, state.anchors, pose, action)
+        seen = {"obs": seen.pop("policy"), "privileged_obs": _clip(privileged), "groups": seen}
+        return dataclasses.replace(state, **seen)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
         """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""

@@ -4,8 +4,6 @@ A match is symmetric under a half turn about its centre ("turn") or a reflection
 the second half of the agents, observes in the transformed frame, so that one policy can control either team.
 """
 
-import dataclasses
-import functools
 from typing import Any, ClassVar
 
 import jax
@@ -20,7 +18,6 @@ from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
-from mqe_jax.sensors.scene import SensedScene
 
 
 class Match(QuadrupedEnv[S, P]):
@@ -97,12 +94,12 @@ class Match(QuadrupedEnv[S, P]):
         other = jnp.array([-1.0, -1.0, 1.0] if self.symmetry == "turn" else [1.0, -1.0, 1.0])
         return jnp.stack([vectors, vectors * other])
 
+    @property
+    def reflected(self) -> bool:
+        return self.symmetry == "reflect"
+
     def own_frame(self, info: jax.Array) -> jax.Array:
         return self.views(info)[self.team_of, np.arange(self.num_agents)]
-
-    @functools.cached_property
-    def sensed(self) -> SensedScene:
-        return dataclasses.replace(super().sensed, reflected=self.symmetry == "reflect")
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
         """Reflects the actions (A, action_size) of team 1 where its frame is reflected."""

@@ -23,6 +23,7 @@ from mqe_jax.core.limits import (
 from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, record
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.physics import robots
+from mqe_jax.sensors.suite import Senses
 from mqe_jax.skills import agile  # noqa: F401  (skills register themselves
 from mqe_jax.skills.control import Commander
 
@@ -94,6 +95,10 @@ class TaskParams:
     the throughput."""
     randomization: Randomization = Randomization()
     """Domain randomisation."""
+    senses: Senses = ()
+    """Sensors of the group of observations `onboard`: `onboard`, `full` for none, or a list of sensors, by names or as
+    mappings of settings.
+    """
     frozen_time: Time = 4.0
     """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
     first learn sequential subtasks one at a time. Inactive at assistance 0."""

@@ -9,21 +9,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout
+from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout, box
 from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.returned import weights_of
 from mqe_jax.envs.reward import fade, weigh
+from mqe_jax.envs.sensing import Sensing
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.physics.robots.index import RobotIndex, RobotState
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.scene import CompiledScene, ObjectIndex, Scene
-from mqe_jax.sensors.scene import Entity, entities_of
+from mqe_jax.sensors.suite import ONBOARD
 
 if TYPE_CHECKING:
+    from gymnasium.spaces import Box
     from mujoco import mjx
 
 
-class Task(Generic[S, P]):
+class Task(Sensing, Generic[S, P]):
     """Interface of a task and its defaults; `QuadrupedEnv` steps it.
 
     A task must override `scene`, `observation_layout`, `observe` and `rewards`, and may override the others. All
@@ -123,6 +125,16 @@ class Task(Generic[S, P]):
         """Length of an agent's observation O."""
         return self.observation_layout.size
 
+    @property
+    def action_space(self) -> Box:
+        """All agents' actions (A, action_size), within `action_limit`."""
+        return box(self.action_limit, (self.num_agents, self.action_size))
+
+    @property
+    def observation_space(self) -> Box:
+        """All agents' observations (A, O)."""
+        return box(np.inf, (self.num_agents, self.observation_size))
+
     def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the observation's blocks by name (A, width)."""
         raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
@@ -130,7 +142,8 @@ class Task(Generic[S, P]):
     @property
     def groups(self) -> Mapping[str, ObservationLayout]:
         """Layouts of further groups of observations by name, which are computed if a policy or a critic names them."""
-        return {"proprioception": PROPRIOCEPTION}
+        sensed = {ONBOARD: ObservationLayout(self.suite.blocks)} if self.params.senses else {}
+        return {"proprioception": PROPRIOCEPTION, **sensed}
 
     @property
     def group_sizes(self) -> dict[str, int]:
@@ -141,15 +154,6 @@ class Task(Generic[S, P]):
         """Returns what policies that see a group of observations need of the task, beside its name and sizes."""
         layout = {"policy": self.observation_layout, **self.groups}[group]
         return {"version": self.version, **self.params.actions(self.control), "layout": str(layout)}
-
-    @property
-    def entities(self) -> tuple[Entity, ...]:
-        """What sensors tell apart besides robots and walls: by default the scene's objects and gaps."""
-        return entities_of(self.compiled)
-
-    def own_frame(self, info: jax.Array) -> jax.Array:
-        """Maps the agents' base information (A, 6) to each agent's own (possibly mirrored) frame."""
-        return info
 
     def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of one of `groups` by name (A, width)."""

@@ -1,7 +1,7 @@
 """A scene: a track, N robots and movable objects, compiled to a MuJoCo model with its index tables."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,8 @@ class Scene:
     """Whether the robots' joints have rotor inertia, damping and dry friction."""
     foot_sensors: bool = False
     """Whether to add contact force sensors to the feet."""
+    edits: tuple[Callable[[mujoco.MjSpec], None], ...] = ()
+    """Functions that add to the specification, such as sensors' sites."""
     timestep: float = 0.005
     """Physics step, s."""
     solver_iterations: int = 4
@@ -138,6 +140,8 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
     for name, item in scene.objects.items():
         _add_object(spec, name, item, visual)
     add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
+    for edit in scene.edits:
+        edit(spec)
     if visual:
         add_light(spec, (scene.track.length / 2, 0, 8))
     return spec, layout

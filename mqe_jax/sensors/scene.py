@@ -102,7 +102,7 @@ class SensedScene:
         return {kind: rows for kind, rows in found.items() if rows.shape[1]}
 
     @functools.cached_property
-    def _outlines(self) -> dict[int, Circle | Rectangle]:
+    def outlines(self) -> dict[int, Circle | Rectangle]:
         """Outlines of entities by their rows of `Snapshot.places`."""
         objects, found = self.compiled.scene.objects, {}
         for row, entity in enumerate(self.entities, start=self.num_robots):
@@ -113,9 +113,9 @@ class SensedScene:
     @functools.cached_property
     def owners(self) -> np.ndarray:
         """The row of `Snapshot.places` of each circle and each segment (C + S,); -1 for walls."""
-        circles = [row for row, outline in self._outlines.items() if isinstance(outline, Circle)]
+        circles = [row for row, outline in self.outlines.items() if isinstance(outline, Circle)]
         walls = len(self.compiled.layout.barriers) + 4 * len(self.compiled.layout.walls)
-        rectangles = [row for row, outline in self._outlines.items() if isinstance(outline, Rectangle)]
+        rectangles = [row for row, outline in self.outlines.items() if isinstance(outline, Rectangle)]
         return np.array([*range(self.num_robots), *circles, *[-1] * walls, *np.repeat(rectangles, 4)], int)
 
     def snapshot(
@@ -125,9 +125,9 @@ class SensedScene:
         every = jnp.concatenate([_planar(robots.position_w, robots.quaternion), *self._entities(data, anchors)])
         radius = float(np.hypot(*self.compiled.scene.robot.leg_root))  # at which the hips are
         circles = dict.fromkeys(range(self.num_robots), radius)
-        circles |= {row: shape.radius for row, shape in self._outlines.items() if isinstance(shape, Circle)}
+        circles |= {row: shape.radius for row, shape in self.outlines.items() if isinstance(shape, Circle)}
         radii = np.array([*circles.values()], np.float32)[:, None]
-        rectangles = {row: shape for row, shape in self._outlines.items() if isinstance(shape, Rectangle)}
+        rectangles = {row: shape for row, shape in self.outlines.items() if isinstance(shape, Rectangle)}
         places, sizes = every[np.array([*rectangles], int)], np.reshape([*rectangles.values()], (-1, 2))
         return Snapshot(
             data=data,

@@ -78,7 +78,7 @@ def record_episodes(
         state, memory = carry
         seen = jax.vmap(functools.partial(env.with_observations, groups=groups))(state) if groups else state
         action, memory = act(observations(seen), memory, key)
-        state = jax.vmap(env.step)(state, action)
+        state = jax.vmap(env.step)(dataclasses.replace(seen, groups=state.groups), action)
         done = state.terminated | state.truncated
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))
         success = state.outcome.success
