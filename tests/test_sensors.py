@@ -15,15 +15,19 @@ import mujoco
 import numpy as np
 import pytest
 
+from mqe_jax.core.blocks import Entities
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import override, to_mapping
 from mqe_jax.envs import State, VectorEnv, make
-from mqe_jax.envs.observation import ObservationLayout
+from mqe_jax.envs.gate import GateParams
+from mqe_jax.envs.observation import ObservationLayout, entities
 from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.physics.objects import Circle
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 from mqe_jax.sensors.detections import Detections
 from mqe_jax.sensors.lidar import Lidar
+from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.sensors.proprioception import Proprioception
 from tests.states import initial, made, placed
 
@@ -296,6 +300,43 @@ def test_senses_add_a_group_and_change_nothing_else() -> None:
     assert states[0].senses == () and "onboard" not in blind.groups
 
 
+def test_a_pipeline_delays_drops_and_keeps_readings() -> None:
+    block = entities("mates", "robot", 2, 1, masked=True)
+    pipeline = Pipeline(noise=0.1, clip=(0.0, 3.0), scale=2.0, delay=2, dropout=0.3, history=2)
+    assert pipeline.block(block) == dataclasses.replace(block, width=8, entities=Entities("robot", 4, 1, True))
+
+    def play(pipeline: Pipeline, readings: np.ndarray) -> np.ndarray:
+        def step(memory: Any, given: Any) -> Any:
+            out, memory = pipeline.apply(block, given[0], memory, given[1])
+            return memory, out
+
+        keys = jax.random.split(jax.random.PRNGKey(0), len(readings))
+        return np.asarray(jax.lax.scan(step, pipeline.init_memory(block, 2), (readings, keys))[1])
+
+    steps = 400
+    rows = np.stack([np.arange(steps) % 7.0, np.arange(steps) % 3 > 0, np.ones(steps), np.ones(steps)], axis=-1)
+    readings = np.stack([rows, rows + 0.5], axis=1).astype(np.float32)
+    exact = play(Pipeline(delay=2, history=2), readings)
+    np.testing.assert_array_equal(exact[:3, :, :4], readings[[0, 0, 0]])
+    np.testing.assert_array_equal(exact[3:, :, :4], readings[1:-2])
+    np.testing.assert_array_equal(exact[1:, :, 4:], exact[:-1, :, :4])
+    lossy = play(Pipeline(dropout=0.3), readings)
+    kept = np.all(lossy == readings, axis=-1)
+    assert 0.6 < kept.mean() < 0.8 and np.any(kept[:, 0] != kept[:, 1]) and kept[0].all()
+    np.testing.assert_array_equal(lossy[1:][~kept[1:]], lossy[:-1][~kept[1:]])
+    noisy = play(Pipeline(noise=0.1, clip=(0.0, 3.0), scale=2.0), readings)
+    np.testing.assert_array_equal(noisy[..., [1, 3]], readings[..., [1, 3]])  # masks
+    assert noisy[..., 0].max() == 6.0 and noisy[..., 0].min() == 0.0
+    assert np.std(noisy[:, 0, 2]) == pytest.approx(0.2, rel=0.2)
+
+
+def test_senses_are_settings() -> None:
+    senses = [{"name": "lidar", "rays": 8, "pipeline": {"all": {"noise": 0.1}}}, "detections"]
+    params = make("go1gate", impl="c", senses=senses).params
+    assert params.senses == (Lidar(rays=8, pipeline={"all": Pipeline(noise=0.1)}), Detections())
+    assert override(GateParams(), {"senses": to_mapping(params)["senses"]}) == params
+
+
 @pytest.mark.parametrize(
     ("senses", "message"),
     [
@@ -305,11 +346,12 @@ def test_senses_add_a_group_and_change_nothing_else() -> None:
         ([{"name": "lidar", "beams": 8}], r"senses.*beams: unknown name"),
         (["lidar", "lidar"], r"senses: .*sensors of different names"),
         (3, r"senses: 3 .*full, onboard"),
+        ([{"name": "lidar", "pipeline": {"lida": {}}}], r"senses.lidar.pipeline: 'lida' .*one of all, lidar"),
     ],
 )
 def test_bad_senses_are_named(senses: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        make("go1gate", impl="c", senses=senses)
+        _ = make("go1gate", impl="c", senses=senses).groups
 
 
 if __name__ == "__main__":

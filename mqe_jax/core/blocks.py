@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +35,14 @@ class Block:
     """Whether the entries encode a category, such as a one-hot, and get no observation noise."""
     entities: Entities | None = None
     """What the entries are, one entity after the other; None if they are not of several entities."""
+
+    @property
+    def continuous(self) -> np.ndarray:
+        """1 where an entry is a continuous quantity, 0 where it is categorical or a mask (width,)."""
+        row = np.full(self.width, not self.categorical, np.float32)
+        if self.entities is not None and self.entities.masked:
+            row.reshape(self.entities.count, -1)[:, -1] = 0.0
+        return row
 
 
 def entities(name: str, kind: str, count: int, width: int, meaning: str = "", *, masked: bool = False) -> Block:

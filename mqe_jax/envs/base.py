@@ -140,7 +140,9 @@ class QuadrupedEnv(Task[S, P]):
         size, actions = self.observation_size, f"{self.control} {self.action_size}"
         actions += f" ({self.params.commanded_text()})" if self.control == "command" else ""
         agents = " vs ".join(str(len(team)) for team in self.teams)
-        changed = [f"{name}={value!r}" for name, value in differences(self.params, self.Params()).items()]
+        changed = differences(self.params, self.Params())
+        changed |= {"senses": [sensor.name for sensor in self.params.senses]} if self.params.senses else {}
+        changed = [f"{name}={value!r}" for name, value in changed.items()]
         facts = [f"{agents} agents", f"observation {size}", f"action {actions}", f"engine {self.impl}", *changed]
         return f"<{self.name}: {', '.join(facts)}>"
 

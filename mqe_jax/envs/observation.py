@@ -39,11 +39,7 @@ class ObservationLayout:
     @functools.cached_property
     def continuous(self) -> np.ndarray:
         """1 where an entry is a continuous quantity, 0 where it is categorical (size,)."""
-        rows = [np.full(block.width, not block.categorical, np.float32) for block in self.blocks]
-        for row, block in zip(rows, self.blocks, strict=True):
-            if block.entities is not None and block.entities.masked:
-                row.reshape(block.entities.count, -1)[:, -1] = 0.0
-        return np.concatenate(rows)
+        return np.concatenate([block.continuous for block in self.blocks])
 
     def slice(self, name: str) -> slice:
         """Returns the position of a block in the vector; KeyError if there is no such block."""

@@ -15,6 +15,7 @@ from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.objects import Platform, Ring
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
+from mqe_jax.sensors.scene import Entity
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
@@ -102,6 +103,11 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
             return qpos, qvel
         side = self.params.head_start * assistance * jax.random.uniform(key, minval=-1.0)
         return qpos.at[self.index.base_qpos[:, 1]].add(side), qvel
+
+    @property
+    def entities(self) -> tuple[Entity, ...]:
+        """The ring, in whose centre the platform is too."""
+        return (Entity("ring", "ring"),)
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         outward = self.distance(after.robots) - self.distance(before.robots)

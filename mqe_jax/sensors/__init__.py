@@ -5,6 +5,7 @@ A sensor is a settings record derived from `Sensor` in its own file, registered 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -12,15 +13,23 @@ import mujoco
 
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import fail, is_record
+from mqe_jax.core.settings import FrozenMapping, fail, is_record, record
+from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.sensors.scene import SensedScene, Snapshot
 
 
+@record
 class Sensor:
     """Base of all sensors: functions of one environment, for all its agents."""
 
-    name: Any
-    """Name in the registry, a `Literal` field with its value as the default."""
+    name: str = ""
+    """Name in the registry; of a subclass, a `Literal` with its value as the default."""
+    pipeline: Mapping[str, Pipeline] = FrozenMapping()
+    """What happens to the readings of its blocks, by their names; of those not named, what `all` has."""
+
+    def pipeline_of(self, block: Block) -> Pipeline:
+        """Returns what happens to the readings of a block."""
+        return self.pipeline.get(block.name, self.pipeline.get("all", Pipeline()))
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         """Adds what the sensor needs, such as sites or cameras, to the scene of the physics before it is compiled."""

@@ -1,0 +1,59 @@
+"""What happens to a sensor's readings between the sensor and the policy."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mqe_jax.core.blocks import Block
+from mqe_jax.core.limits import Few, Fraction, Lag, NonNegative, Positive
+from mqe_jax.core.settings import Range, record
+
+
+@record
+class Pipeline:
+    """What happens to the readings of one block, in this order; masks are delayed and dropped only."""
+
+    noise: NonNegative = 0.0
+    """Standard deviation of normal noise, in the block's unit."""
+    clip: Range | None = None
+    """Lowest and highest value, in the block's unit."""
+    scale: Positive = 1.0
+    """Factor."""
+    delay: Lag = 0
+    """Delay, environment steps."""
+    dropout: Fraction = 0.0
+    """Share of readings of an agent that are lost: the last one takes their place."""
+    history: Few = 1
+    """Number of readings of which the block consists, newest first."""
+
+    def block(self, block: Block) -> Block:
+        """Returns the block that comes out."""
+        entities = block.entities and dataclasses.replace(block.entities, count=self.history * block.entities.count)
+        return dataclasses.replace(block, width=self.history * block.width, entities=entities)
+
+    def init_memory(self, block: Block, agents: int) -> Any:
+        """Returns the readings on their way (D, A, W), those last delivered (H, A, W), and whether there are any."""
+        return (
+            jnp.zeros((self.delay, agents, block.width)),
+            jnp.zeros((self.history, agents, block.width)),
+            jnp.zeros((), bool),
+        )
+
+    def apply(self, block: Block, reading: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        """Returns what comes out of a reading (A, W), and the next memory; an episode's first reading comes at once."""
+        underway, delivered, started = memory
+        noise_key, drop_key = jax.random.split(key)
+        value = reading + self.noise * jax.random.normal(noise_key, reading.shape) if self.noise else reading
+        value = value if self.clip is None else jnp.clip(value, *self.clip)
+        value = jnp.where(block.continuous > 0, self.scale * value, reading)
+        line = jnp.concatenate([value[None], jnp.where(started, underway, value)])
+        now = line[-1]
+        if self.dropout:
+            lost = jax.random.bernoulli(drop_key, self.dropout, (len(reading), 1)) & started
+            now = jnp.where(lost, delivered[0], now)
+        delivered = jnp.concatenate([now[None], jnp.where(started, delivered, now)])[: self.history]
+        return jnp.moveaxis(delivered, 0, 1).reshape(len(reading), -1), (line[:-1], delivered, jnp.ones((), bool))
