@@ -29,6 +29,7 @@ from mqe_jax.sensors.detections import Detections
 from mqe_jax.sensors.lidar import Lidar
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.sensors.proprioception import Proprioception
+from mqe_jax.viz import recording
 from tests.states import initial, made, placed
 
 SENSING = [task for task in SHIPPED if task != "go1plane"]
@@ -328,6 +329,28 @@ def test_a_pipeline_delays_drops_and_keeps_readings() -> None:
     np.testing.assert_array_equal(noisy[..., [1, 3]], readings[..., [1, 3]])  # masks
     assert noisy[..., 0].max() == 6.0 and noisy[..., 0].min() == 0.0
     assert np.std(noisy[:, 0, 2]) == pytest.approx(0.2, rel=0.2)
+
+
+class Watcher:
+    """A policy that acts only if the last two readings of its lidar differ."""
+
+    task, agents, groups = "go1gate", 2, ("onboard",)
+
+    def initial_memory(self, num_envs: int) -> Any:
+        return ()
+
+    def act(self, obs: Any, memory: Any, key: Any = None) -> Any:
+        now, before = jnp.split(obs.groups["onboard"], 2, axis=-1)
+        return jnp.tile((now != before).astype(jnp.float32), 3), memory
+
+
+def test_a_recorded_policy_has_sensors_with_memory() -> None:
+    senses = [Lidar(rays=4, pipeline={"all": Pipeline(history=2)})]
+    env = make("go1gate", impl="c", control="position", num_envs=1, senses=senses)
+    key = jax.random.PRNGKey(0)
+    policies: list[Any] = [Watcher(), lambda obs, key: jnp.zeros((1, 2, 12))]
+    watched, still = (recording.record_episodes(env, each, key, seconds=0.2)[0].qpos for each in policies)
+    assert np.abs(watched - still).max() > 0.01
 
 
 def test_senses_are_settings() -> None:
