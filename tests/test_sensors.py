@@ -348,7 +348,7 @@ def test_a_recorded_policy_has_sensors_with_memory() -> None:
     senses = [Lidar(rays=4, pipeline={"all": Pipeline(history=2)})]
     env = make("go1gate", impl="c", control="position", num_envs=1, senses=senses)
     key = jax.random.PRNGKey(0)
-    policies: list[Any] = [Watcher(), lambda obs, key: jnp.zeros((1, 2, 12))]
+    policies: list[Any] = [Watcher(), lambda obs, memory, key: (jnp.zeros((1, 2, 12)), memory)]
     watched, still = (recording.record_episodes(env, each, key, seconds=0.2)[0].qpos for each in policies)
     assert np.abs(watched - still).max() > 0.01
 
