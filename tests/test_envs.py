@@ -23,13 +23,8 @@ from tests.states import ending, initial, made, placed, stepper
 
 Array = jax.Array
 
-
 gate = pytest.fixture(scope="module")(lambda: made("go1gate"))
-
-
 fresh = pytest.fixture(scope="module")(lambda gate: initial(gate))
-
-
 gate_step = pytest.fixture(scope="module")(lambda gate: stepper(gate.name))
 
 
@@ -240,8 +235,8 @@ def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any
 
 
 def test_a_taken_or_missing_id_is_refused() -> None:
-    with pytest.raises(ValueError, match="the id 'go1gate' is already registered by Go1Gate"):
-        register_task(type("Other", (TASKS["go1plane"],), {"name": "go1gate"}))
+    other = type("Other", (TASKS["go1plane"],), {"name": "go1gate"})
+    refuses("the id 'go1gate' is already registered by Go1Gate", register_task, other)
     refuses("its `name` is empty", register_task, type("Nameless", (TASKS["go1plane"],), {"name": ""}))
     for other in (3, int):
         refuses("must be a class derived from QuadrupedEnv", register_task, other)

@@ -70,6 +70,7 @@ def test_teams_may_see_different_groups_of_observations() -> None:
     np.testing.assert_allclose(state.groups["proprioception"][..., :3], robots.projected_gravity, atol=1e-6)
     assert less.groups == {}
     both = BothTeams(seeing, blind)
+    assert {*both.groups} == {"policy", "proprioception"}
     memory, keys = both.initial_memory(2), jax.random.split(KEY)
     action, _ = both.act(observations(state), memory, KEY)
     own, _ = blind.act(state.groups["proprioception"][:, 1:], memory[1], keys[1])

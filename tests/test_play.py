@@ -226,15 +226,11 @@ def test_the_page_in_webassembly_agrees_with_the_environment(page: Path, built: 
     assert report["20"]["object position, m or rad"] < 1e-3
 
 
-class Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
-
-
 @contextlib.contextmanager
 def opened(folder: Path, query: str, width: int = 1280, height: int = 800, *, touch: bool = False) -> Iterator[Any]:
     """Serves a folder and opens its page in Chromium; asserts that nothing was reported to its console as an error."""
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
+    quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(quiet, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         with open_page(width, height, touch=touch) as tab:

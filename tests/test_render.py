@@ -247,13 +247,11 @@ def test_episodes_start_over_and_the_record_keeps_the_last_seconds() -> None:
 
 
 def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Path) -> None:
-    for name, task in (("b", "go1gate"), ("a", "go1tug"), ("no task", None)):
+    settings = {"b": "task: go1gate", "a": "task: go1tug", "no task": "task: null", "unreadable": ": ["}
+    for name, text in settings.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "policy.safetensors").touch()
-        (tmp_path / name / CONFIG_FILE).write_text(f"task: {task or 'null'}\n")
-    (tmp_path / "unreadable").mkdir()
-    (tmp_path / "unreadable" / "policy.safetensors").touch()
-    (tmp_path / "unreadable" / CONFIG_FILE).write_text(": [")
+        (tmp_path / name / CONFIG_FILE).write_text(text)
     (tmp_path / "unfinished").mkdir()
     runs = find_runs([tmp_path, tmp_path])
     assert {Path(run).name: task for run, task in runs.items()} == {"a": "go1tug", "b": "go1gate"}

@@ -7,6 +7,7 @@ import math
 import runpy
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -122,17 +123,11 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
     assert all(sorted(order) == list(range(8)) for order in drawn)
 
 
-class Recurrent:
-    act = None
-
-    def initial_memory(self, num_envs: int) -> Any:
-        return jnp.zeros(num_envs)
-
-
 def test_settings_must_fit_the_environment() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
+    recurrent = SimpleNamespace(act=None, initial_memory=jnp.zeros)
     with pytest.raises(InputError, match=r"^imitation\.teacher: 'scripted' is not allowed; .* without recurrent state"):
-        make_learner(env, small(num_envs=4, imitation__teacher="scripted"), teacher=Recurrent())
+        make_learner(env, small(num_envs=4, imitation__teacher="scripted"), teacher=recurrent)
     for values, message in (
         ({}, "num_envs: 32 is not allowed; it must be equal to the environment's num_envs, 4"),
         ({"num_envs": 4, "ppo__minibatches": 7}, "ppo.minibatches: 7 is not allowed; it must be a divisor"),
@@ -147,14 +142,8 @@ def test_settings_must_fit_the_environment() -> None:
         refuses(f"^{message}", make_learner, env, small(**values))
 
 
-class WrongSize(Probe):
-    @property
-    def observation_size(self) -> int:
-        return 7
-
-
 def test_a_wrong_observation_size_is_named() -> None:
-    env = WrongSize(probes.show_hidden, probes.pay_one, num_envs=4)
+    env = type("WrongSize", (Probe,), {"observation_size": 7})(probes.show_hidden, probes.pay_one, num_envs=4)
     refuses(r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)", make_learner, env, small(num_envs=4))
 
 
