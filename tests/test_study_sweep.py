@@ -19,7 +19,7 @@ from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast
 from mqe_jax.policies import zoo
 from mqe_jax.runs import build as setup
-from mqe_jax.runs import measuring
+from mqe_jax.runs import exploiting, measuring, playing
 from mqe_jax.runs.presets import preset
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs
@@ -297,7 +297,7 @@ def test_a_part_measures_policies(
             raise KeyboardInterrupt
         return SimpleNamespace(to_dict=lambda: {"success_rate": 0.5, "win_rate": None, "episodes": episodes})
 
-    monkeypatch.setitem(measuring.MEASURES, "evaluate", evaluate)
+    monkeypatch.setattr(playing, "evaluate", evaluate)
     file, folder = tmp_path / "strength.yaml", tmp_path / "out"
     file.write_text(MEASURES)
     arguments = ["sweep", str(file), "--part", "rates", "--folder", str(folder), "--impl", "c"]
@@ -330,3 +330,12 @@ def test_measurements_that_cannot_be_made_are_named(tmp_path: Path, change: str,
     part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
     with pytest.raises(InputError, match=re.escape(message)):
         measuring.plan(build(sweeps.Measurement, part), tmp_path)
+
+
+def test_a_measurement_that_trains_has_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = {"exploitability_lower_bound": {"value": 0.2}}
+    monkeypatch.setattr(exploiting, "exploitability", lambda task, policy, folder, impl: {**found, "folder": folder})
+    part = {"measure": "exploitability", "tasks": ["go1tug"], "arguments": {"policy": "{task}"}}
+    measuring.measure(build(sweeps.Measurement, part), tmp_path)
+    place = tmp_path / "results" / "go1tug" / "plain"
+    assert json.loads((place / "result.json").read_text())["result"] == {**found, "folder": str(place / "runs")}

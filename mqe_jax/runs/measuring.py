@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 import json
 import math
-from collections.abc import Callable
+import pkgutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,14 +14,18 @@ from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail
 from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy
-from mqe_jax.runs import playing
 from mqe_jax.study.runs import table
 from mqe_jax.study.sweep import Measurement, for_task
 from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.policy import TrainedPolicy
 
-MEASURES: dict[str, Callable[..., Any]] = {"evaluate": playing.evaluate, "tournament": playing.tournament}
-"""Functions of the front door by the name in `measure`; their results have `to_dict`."""
+MEASURES = {
+    "evaluate": "mqe_jax.runs.playing:evaluate",
+    "tournament": "mqe_jax.runs.playing:tournament",
+    "exploitability": "mqe_jax.runs.exploiting:exploitability",
+    "double_oracle": "mqe_jax.runs.exploiting:double_oracle",
+}
+"""Functions of the front door by the name in `measure`. Those with a folder get that of the measurement."""
 RESULT, RATES = "result.json", "rates.csv"
 
 
@@ -38,14 +42,16 @@ def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
     """Returns all measurements of a part; InputError for an unknown measure, task or argument."""
     if part.measure not in MEASURES:
         fail("measure", part.measure, f"one of {', '.join(MEASURES)}")
-    known = inspect.signature(MEASURES[part.measure]).parameters
+    known = inspect.signature(pkgutil.resolve_name(MEASURES[part.measure])).parameters
     items = []
     for task in part.tasks:
         for variant, changes in part.variants.items():
+            place = folder / "results" / task / variant
             arguments = {"impl": impl, **for_task({**part.arguments, **changes}, task_id(task))}
+            arguments |= {"folder": str(place / "runs")} if "folder" in known else {}
             for name in arguments.keys() - known.keys():
                 fail(f"arguments.{name}", arguments[name], f"an argument of {part.measure}: {', '.join(known)}")
-            items.append(Item(task, variant, arguments, folder / "results" / task / variant / RESULT))
+            items.append(Item(task, variant, arguments, place / RESULT))
     return items
 
 
@@ -57,8 +63,9 @@ def measure(part: Measurement, folder: Path, impl: str = "auto", *, dry_run: boo
             continue
         try:
             with lock(item.file.parent):
-                result = MEASURES[part.measure](item.task, **_for_robot(item.arguments))
-                content = {"measure": part.measure, "arguments": item.arguments, "result": result.to_dict()}
+                result = pkgutil.resolve_name(MEASURES[part.measure])(item.task, **_for_robot(item.arguments))
+                plain = result if isinstance(result, dict) else result.to_dict()
+                content = {"measure": part.measure, "arguments": item.arguments, "result": plain}
                 write_atomically(item.file, json.dumps(content, indent=1).encode())
         except InUseError:
             echo(f"mqe: skipped, in use by another process: {item.task}/{item.variant}")

@@ -69,7 +69,7 @@ class Measurement:
     """Settings of a part that measures policies: a call for every combination of tasks and variants."""
 
     measure: str
-    """What is called: evaluate or tournament, as in `mqe_jax`."""
+    """What is called: evaluate, tournament, exploitability or double_oracle, as in `mqe_jax`."""
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     arguments: Mapping[str, Any] = FrozenMapping()
