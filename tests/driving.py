@@ -1,18 +1,18 @@
 """How fast joints in the air start from rest: `python -m tests.driving [--robot go1]` prints it."""
 
-import argparse
 import json
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import tyro
 
 from mqe_jax.envs import make
 from mqe_jax.physics.robots.motors import leg_response
 from mqe_jax.physics.robots.robot import JOINTS
 
 
-def start_in_air(robot: str) -> dict[str, dict[str, float]]:
+def start_in_air(robot: str = "go1") -> dict[str, dict[str, float]]:
     """Drives each joint of a leg in the air from rest with its torque limit, on the C engine.
 
     Returns:
@@ -44,6 +44,4 @@ def start_in_air(robot: str) -> dict[str, dict[str, float]]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robot", default="go1")
-    print(json.dumps(start_in_air(parser.parse_args().robot)))
+    print(json.dumps(tyro.cli(start_in_air)))

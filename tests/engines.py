@@ -1,22 +1,23 @@
 """Agreement of two engines on the same episodes.
 
-`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`. With `c`,
-`agree` measures how fast trajectories of one engine separate from initial positions that differ by 1e-6. Options of
-`record`: `--num-envs N` environments of standing robots and as many in play, `--seed S`, `--solver-iterations I`.
+`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`. With `c`, `agree` measures how fast
+trajectories of one engine separate from initial positions that differ by 1e-6. Options of `record`: `--num-envs N`
+environments of standing robots and as many in play, `--seed S`, `--solver-iterations I` in place of the task's.
 """
 
-import argparse
 import dataclasses
 import itertools
 import json
 import pathlib
 import pickle
 import time
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
+from tyro.conf import Positional
 
 from mqe_jax.envs import PLANNERS, TASKS, State, VectorEnv, make
 from mqe_jax.physics import robots
@@ -135,29 +136,27 @@ def covering() -> list[tuple[str, str, str]]:
     return [(task, *pairs[number % len(pairs)]) for number, task in enumerate(TASKS)]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "agree"))
-    parser.add_argument("folder", type=pathlib.Path)
-    parser.add_argument("engine", choices=("jax", "warp", "c"))
-    parser.add_argument("tasks", nargs="*", default=list(TASKS))
-    parser.add_argument("--num-envs", type=int, default=8)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--solver-iterations", type=int, help="default: those of the task")
-    options = parser.parse_intermixed_args()
-    for task in options.tasks:
-        began, file = time.perf_counter(), options.folder / f"{task}.pickle"
+def main(
+    what: Positional[Literal["record", "agree"]],
+    folder: Positional[pathlib.Path],
+    engine: Positional[Literal["jax", "warp", "c"]],
+    tasks: Positional[tuple[str, ...]] = tuple(TASKS),
+    num_envs: int = 8,
+    seed: int = 0,
+    solver_iterations: int | None = None,
+) -> None:
+    for task in tasks:
+        began, file = time.perf_counter(), folder / f"{task}.pickle"
         figures: dict[str, Any] = {}
-        if options.what == "record":
+        if what == "record":
             file.parent.mkdir(parents=True, exist_ok=True)
-            states = record(task, options.num_envs, options.seed, options.solver_iterations)
-            file.write_bytes(pickle.dumps(states))
+            file.write_bytes(pickle.dumps(record(task, num_envs, seed, solver_iterations)))
         else:
-            apart = disagreement(task, options.engine, pickle.loads(file.read_bytes()))
+            apart = disagreement(task, engine, pickle.loads(file.read_bytes()))
             figures = {name: float(f"{value:.4g}") for name, value in apart.items()}
         seconds = round(time.perf_counter() - began)
-        print(json.dumps({"task": task, "engine": options.engine, **figures, "s": seconds}), flush=True)
+        print(json.dumps({"task": task, "engine": engine, **figures, "s": seconds}), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)
