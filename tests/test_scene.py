@@ -69,7 +69,10 @@ def test_parts_have_the_masses_and_inertias_of_a_go1() -> None:
 
 
 @pytest.mark.parametrize("name", list(robots.ROBOTS))
-def test_legs_are_mirror_images(name: str) -> None:
+def test_legs_and_what_is_drawn_of_the_trunk_are_mirror_images(name: str) -> None:
+    drawn = make("go1plane", impl="c", robot=name, control="position").mj_model
+    across = drawn.geom_pos[drawn.geom_bodyid == drawn.body("robot0/trunk").id, 1]
+    np.testing.assert_allclose(np.sort(across), np.sort(-across), atol=1e-9)
     model = compiled(robots.get(name)).model
     for leg in LEGS:
         for link in ("hip", "thigh", "calf"):

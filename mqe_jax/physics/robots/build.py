@@ -88,7 +88,9 @@ def build_robot(
         for visual_shape in robot.visuals if visual else ():
             if visual_shape.link == link:
                 rgba = visual_shape.mix_color(agent_color)
-                _add_geom(body, visual_shape.primitive, left, rgba=rgba, contype=0, conaffinity=0, group=VISUAL_GROUP)
+                for side in (left, -left) if visual_shape.both else (left,):
+                    shown = {"rgba": rgba, "group": VISUAL_GROUP}
+                    _add_geom(body, visual_shape.primitive, side, contype=0, conaffinity=0, **shown)
 
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, robot.stand_height))
     trunk.add_freejoint(name="base")

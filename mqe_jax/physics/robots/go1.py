@@ -45,28 +45,22 @@ _COLLISION = (
 _VISUALS = (
     # Shell with rounded edges in the agent's colour, dark belly.
     VisualShape("trunk", box((0.15, 0.034, 0.052), (0.0, 0, 0.01)), tint=1.0),
-    VisualShape("trunk", capsule(0.024, (-0.145, 0.034, 0.038), (0.145, 0.034, 0.038)), tint=1.0),
-    VisualShape("trunk", capsule(0.024, (-0.145, -0.034, 0.038), (0.145, -0.034, 0.038)), tint=1.0),
+    VisualShape("trunk", capsule(0.024, (-0.145, 0.034, 0.038), (0.145, 0.034, 0.038)), tint=1.0, both=True),
     VisualShape("trunk", box((0.152, 0.058, 0.026), (0.0, 0, 0.012)), tint=1.0),
     VisualShape("trunk", box((0.125, 0.0595, 0.010), (0.0, 0, 0.006)), _SILVER),
     VisualShape("trunk", box((0.155, 0.05, 0.024), (0, 0, -0.034)), _DARK),
     # Motors of the hips, which close the trunk in front and behind.
-    VisualShape("trunk", cylinder(0.044, (0.148, 0.047, 0.0), (0.222, 0.047, 0.0)), _DARK),
-    VisualShape("trunk", cylinder(0.044, (0.148, -0.047, 0.0), (0.222, -0.047, 0.0)), _DARK),
-    VisualShape("trunk", cylinder(0.044, (-0.148, 0.047, 0.0), (-0.222, 0.047, 0.0)), _DARK),
-    VisualShape("trunk", cylinder(0.044, (-0.148, -0.047, 0.0), (-0.222, -0.047, 0.0)), _DARK),
+    VisualShape("trunk", cylinder(0.044, (0.148, 0.047, 0.0), (0.222, 0.047, 0.0)), _DARK, both=True),
+    VisualShape("trunk", cylinder(0.044, (-0.148, 0.047, 0.0), (-0.222, 0.047, 0.0)), _DARK, both=True),
     VisualShape("trunk", box((0.03, 0.04, 0.034), (-0.186, 0, 0.014)), tint=1.0),
     # Rails and handle on the back.
-    VisualShape("trunk", capsule(0.006, (-0.12, 0.026, 0.066), (0.12, 0.026, 0.066)), _DARK),
-    VisualShape("trunk", capsule(0.006, (-0.12, -0.026, 0.066), (0.12, -0.026, 0.066)), _DARK),
+    VisualShape("trunk", capsule(0.006, (-0.12, 0.026, 0.066), (0.12, 0.026, 0.066)), _DARK, both=True),
     VisualShape("trunk", box((0.045, 0.02, 0.006), (-0.06, 0, 0.064)), _SILVER),
     # Neck and head: angular snout, dark face with two cameras.
     VisualShape("trunk", box((0.05, 0.036, 0.03), (0.2, 0, 0.016)), tint=1.0),
-    VisualShape("trunk", capsule(0.032, (0.235, 0.014, 0.034), (0.275, 0.014, 0.036)), tint=1.0),
-    VisualShape("trunk", capsule(0.032, (0.235, -0.014, 0.034), (0.275, -0.014, 0.036)), tint=1.0),
+    VisualShape("trunk", capsule(0.032, (0.235, 0.014, 0.034), (0.275, 0.014, 0.036)), tint=1.0, both=True),
     VisualShape("trunk", ellipsoid((0.022, 0.047, 0.035), (0.296, 0, 0.032)), _BLACK),
-    VisualShape("trunk", cylinder(0.013, (0.29, 0.021, 0.038), (0.315, 0.021, 0.038)), _SILVER),
-    VisualShape("trunk", cylinder(0.013, (0.29, -0.021, 0.038), (0.315, -0.021, 0.038)), _SILVER),
+    VisualShape("trunk", cylinder(0.013, (0.29, 0.021, 0.038), (0.315, 0.021, 0.038)), _SILVER, both=True),
     # Legs: round covers in the agent's colour, tapered thighs, slim shanks, dark feet.
     VisualShape("hip", cylinder(0.044, (0, 0.028, 0), (0, 0.062, 0)), _SILVER),
     VisualShape("hip", cylinder(0.036, (0, 0.02, 0), (0, 0.075, 0)), _DARK),

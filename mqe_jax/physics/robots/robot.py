@@ -146,6 +146,8 @@ class VisualShape:
     """Base colour."""
     tint: float = 0.0
     """Fraction of the agent's colour mixed into the base colour, in [0, 1]."""
+    both: bool = False
+    """Whether its mirror image is on the right side of the trunk too."""
 
     def __post_init__(self) -> None:
         if self.link not in LINKS:
