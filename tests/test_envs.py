@@ -14,7 +14,7 @@ import mqe_jax
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import TASKS, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task, replay
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.envs.observation import Block, ObservationLayout, by_entity, entities
+from mqe_jax.envs.observation import Block, ObservationLayout, by_entity, entities, image
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.envs.registry import SHIPPED
 from tests import engines
@@ -293,6 +293,15 @@ def test_a_block_of_entities_says_who_is_there() -> None:
     with pytest.raises(KeyError, match="'own' has no entities"):
         layout.entities(packed, "own")
     assert [b.entities.kind for b in made("go1sheep-hard").observation_layout.blocks if b.entities] == ["sheep"]
+
+
+def test_a_block_of_an_image_has_its_shape() -> None:
+    layout = ObservationLayout((Block("own", 1), image("depth", 2, 3)))
+    rows = jnp.arange(6.0).reshape(2, 3)
+    packed = layout.pack({"own": jnp.zeros((4, 1)), "depth": jnp.tile(rows.ravel(), (4, 1))})
+    np.testing.assert_array_equal(layout.image(packed, "depth"), np.tile(rows, (4, 1, 1, 1)))
+    with pytest.raises(KeyError, match="'own' is no image"):
+        layout.image(packed, "own")
 
 
 def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:

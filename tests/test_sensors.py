@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.core.blocks import Entities
+from mqe_jax.core.blocks import Block, Entities, image
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override, to_mapping
 from mqe_jax.envs import State, VectorEnv, make
@@ -308,6 +308,7 @@ def test_a_pipeline_delays_drops_and_keeps_readings() -> None:
     block = entities("mates", "robot", 2, 1, masked=True)
     pipeline = Pipeline(noise=0.1, clip=(0.0, 3.0), scale=2.0, delay=2, dropout=0.3, history=2)
     assert pipeline.block(block) == dataclasses.replace(block, width=8, entities=Entities("robot", 4, 1, True))
+    assert pipeline.block(image("depth", 2, 3)) == Block("depth", 12, image=(2, 2, 3))
 
     def play(pipeline: Pipeline, readings: np.ndarray) -> np.ndarray:
         def step(memory: Any, given: Any) -> Any:

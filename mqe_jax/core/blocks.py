@@ -35,6 +35,8 @@ class Block:
     """Whether the entries encode a category, such as a one-hot, and get no observation noise."""
     entities: Entities | None = None
     """What the entries are, one entity after the other; None if they are not of several entities."""
+    image: tuple[int, int, int] | None = None
+    """Channels, height and width of an image, one channel after the other, each row by row from the top left."""
 
     @property
     def continuous(self) -> np.ndarray:
@@ -48,6 +50,11 @@ class Block:
 def entities(name: str, kind: str, count: int, width: int, meaning: str = "", *, masked: bool = False) -> Block:
     """Returns the block of several entities of a kind; `by_entity` fills a masked one."""
     return Block(name, count * (width + masked), meaning, entities=Entities(kind, count, width, masked))
+
+
+def image(name: str, height: int, width: int, meaning: str = "") -> Block:
+    """Returns the block of an image of one channel, whose entries are in [0, 1]."""
+    return Block(name, height * width, meaning, image=(1, height, width))
 
 
 def by_entity(values: jax.Array, there: jax.Array) -> jax.Array:

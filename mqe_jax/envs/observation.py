@@ -12,6 +12,7 @@ import numpy as np
 from mqe_jax.core.blocks import Block as Block
 from mqe_jax.core.blocks import by_entity as by_entity
 from mqe_jax.core.blocks import entities as entities
+from mqe_jax.core.blocks import image as image
 from mqe_jax.core.settings import fail
 from mqe_jax.envs.returned import check_names, check_shape
 
@@ -64,6 +65,13 @@ class ObservationLayout:
             raise KeyError(f"observation block: {name!r} has no entities")
         rows = observation[..., self.slice(name)].reshape(*observation.shape[:-1], found.count, -1)
         return rows[..., : found.width], rows[..., -1] > 0.5 if found.masked else jnp.ones(rows.shape[:-1], bool)
+
+    def image(self, observation: jax.Array, name: str) -> jax.Array:
+        """Returns an image block of observations (..., channels, height, width); KeyError if it is none."""
+        found = next((block.image for block in self.blocks if block.name == name), None)
+        if found is None:
+            raise KeyError(f"observation block: {name!r} is no image")
+        return observation[..., self.slice(name)].reshape(*observation.shape[:-1], *found)
 
     def split(self, observation: jax.Array) -> dict[str, jax.Array]:
         """Returns the blocks (..., width) of observations (..., size) by name; InputError for another size."""

@@ -28,12 +28,13 @@ class Pipeline:
     dropout: Fraction = 0.0
     """Share of readings of an agent that are lost: the last one takes their place."""
     history: Few = 1
-    """Number of readings of which the block consists, newest first."""
+    """Number of readings of which the block consists, newest first; they are channels of an image."""
 
     def block(self, block: Block) -> Block:
         """Returns the block that comes out."""
         entities = block.entities and dataclasses.replace(block.entities, count=self.history * block.entities.count)
-        return dataclasses.replace(block, width=self.history * block.width, entities=entities)
+        image = block.image and (self.history * block.image[0], *block.image[1:])
+        return dataclasses.replace(block, width=self.history * block.width, entities=entities, image=image)
 
     def init_memory(self, block: Block, agents: int) -> Any:
         """Returns the readings on their way (D, A, W), those last delivered (H, A, W), and whether there are any."""
