@@ -31,7 +31,7 @@ class Happo(Stages):
         def turn(before: tuple[Carry, jax.Array], inputs: tuple[jax.Array, jax.Array]) -> Any:
             (carry, factor), (agent, key) = before, inputs
             mine = jnp.arange(agents) == agent
-            own = batch._replace(advantage=batch.advantage * factor[..., None], active=batch.active & mine)
+            own = batch._replace(advantage=batch.advantage * factor[..., None], learners=batch.learners & mine)
             learned, metrics = super(Happo, self).update(carry, own, now, key)
             learned = self._of(mine, learned, carry)
             return (learned, factor * self._ratio(learned, batch)[..., agent]), metrics
@@ -55,7 +55,7 @@ class Happo(Stages):
         seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
         new = self.network.evaluate(carry[0], *seen, batch.action, batch.active)
         ratio = jnp.exp(ratio_per_agent(new.log_prob, batch.log_prob)[..., 0])
-        return jnp.where(batch.active, ratio, 1.0)
+        return jnp.where(batch.learners, ratio, 1.0)
 
 
 def main(updates: int = 20, **settings: object) -> list[float]:

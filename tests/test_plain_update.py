@@ -116,6 +116,7 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         final_obs=normal(T, N, A, size[0]),
         final_privileged_obs=normal(T, N, size[1]),
         active=jnp.ones((T, N, A), bool),
+        learners=jnp.ones((T, N, A), bool),
         action=normal(T, N, A, D),
         log_prob=-1.0 + 0.2 * normal(T, N, A, D),
         reward=normal(T, N, A),
@@ -360,15 +361,23 @@ def test_the_learning_rate_follows_the_kl_divergence_within_its_bounds() -> None
 
 
 @pytest.mark.parametrize("name", [*SETTINGS, "mat"])
-def test_an_agent_that_takes_no_part_counts_nowhere_in_an_update(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever it sees, does and gets, statistics, parameters and metrics stay the same; an active one changes them."""
+def test_an_agent_that_takes_no_part_or_does_not_learn_counts_nowhere_in_an_update(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it sees, does and gets, statistics, parameters and metrics stay the same; an active one changes them.
+
+    What an agent that does not learn does changes nothing either; its reward is part of a joint one.
+    """
     config = config_of("joint" if name == "mat" else name)
     if name == "mat":
         settings = {"ratio": "agent", "value": "agent"}
         config = override(config, {"ppo": settings, "network": {"name": "mat", "width": 4}, "imitation.teacher": None})
+    if config.ppo.ratio == "agent" and name != "mat":
+        config = override(config, {"imitation.teacher": "scripted", "normalization.observations": True})
     random = np.random.default_rng(5)
     (env, state), data = drawn(random, config, 1)
-    data, other = data._replace(active=data.active.at[:, 0, 1].set(False)), {}
+    part = data.active.at[:, 0, 1].set(False)
+    data, other = data._replace(active=part, learners=part), {}
     for field in ("obs", "final_obs", "action", "log_prob", "reward"):
         x = getattr(data, field)
         other[field] = x.at[:, 0, 1].set(jnp.asarray(random.normal(size=x[:, 0, 1].shape), jnp.float32))
@@ -382,6 +391,18 @@ def test_an_agent_that_takes_no_part_counts_nowhere_in_an_update(name: str, monk
         return dataclasses.replace(after, rollout=None), metrics
 
     everyone = jnp.ones_like(data.active)
-    results = [update(state, x) for x in (data, data._replace(**other), data._replace(active=everyone))]
-    assert_same(*results[:2])
-    assert float(results[0][1]["loss/value"]) != float(results[2][1]["loss/value"])
+    with_mate = data._replace(active=everyone)  # agent 1 takes part, but another policy acts for it
+    acted = with_mate._replace(action=other["action"], log_prob=other["log_prob"])
+    more = data._replace(**other), acted, acted._replace(reward=other["reward"]), with_mate._replace(**other)
+    plain, everything, mate, alone, acts, paid, lives = (
+        update(state, x) for x in (data, with_mate._replace(learners=everyone), with_mate, *more)
+    )
+    assert_same(plain, alone)
+    assert_same(mate, acts)
+    if config.ppo.value != "joint":
+        assert_same(mate, paid)
+    if getattr(config.network, "critic_input", "observations") != "observations":
+        assert_same(mate, lives)
+    value = lambda result: float(result[1]["loss/value"])  # noqa: E731
+    assert value(everything) not in (value(plain), value(mate))
+    assert (value(acts) != value(paid)) == (config.ppo.value == "joint")  # the team's mean includes the mate's reward

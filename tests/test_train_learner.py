@@ -45,12 +45,12 @@ VARIANTS = {
 }
 Happo: Any = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "happo.py"))["Happo"]
 TURNS: list[Any] = []
-"""Advantages and active agents, then ratios, of every turn of `NotedHappo`."""
+"""Advantages and learning agents, then ratios, of every turn of `NotedHappo`."""
 
 
 class Noted(Stages):
     def update(self, carry: Any, batch: Batch, now: Any, key: jax.Array) -> Any:
-        jax.debug.callback(lambda *turn: TURNS.append(turn), batch.advantage, batch.active, ordered=True)
+        jax.debug.callback(lambda *turn: TURNS.append(turn), batch.advantage, batch.learners, ordered=True)
         return super().update(carry, batch, now, key)
 
 
@@ -68,8 +68,8 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
     assert float(metrics["ended"]["episode_length"]) == 4.0
     if variant == "happo":
-        (advantage, active), ratio, (next_advantage, _), _ = TURNS[-4:]
-        factor = ratio[..., active[0, 0].argmax(), None]
+        (advantage, learners), ratio, (next_advantage, _), _ = TURNS[-4:]
+        factor = ratio[..., learners[0, 0].argmax(), None]
         np.testing.assert_allclose(next_advantage, advantage * factor, rtol=1e-5)
         assert np.abs(factor - 1).max() > 1e-3
 

@@ -106,7 +106,8 @@ def parse_train(arguments: Sequence[str]) -> Train:
     settings = base_config(task, source.config, source.algorithm)
     if network.name is not None and network.name != settings.network.name:
         settings = override(settings, {"network": {"name": network.name}})
-    if any(word.split("=")[0] == "--opponent" for word in others):  # tyro would append to those of the file
-        settings = override(settings, {"opponents": ()})
+    for flag, name in {"--opponent": "opponents", "--mate": "mates"}.items():
+        if any(word.split("=")[0] == flag for word in others):  # tyro would append to those of the file
+            settings = override(settings, {name: ()})
     default = Train(target=tyro.MISSING, settings=settings, source=source)
     return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=MARKERS)

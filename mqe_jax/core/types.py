@@ -106,8 +106,9 @@ class VectorEnv(Protocol):
     Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
     `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
     which `curriculum.assistance` sets (see `replace_fields`); `state.active` (N, A) bool, the agents that take part: no
-    others enter statistics, losses and results; `state.groups` and `state.final_groups`, further observations by
-    name (N, A, O_g), with `group_sizes`, their lengths. In several processes, `share(parts)` returns the batch of
+    others enter statistics, losses and results; `state.learners` (N, A) bool, the active agents whose actions the
+    policy chooses: it learns from no others; `state.groups` and `state.final_groups`, further observations by name
+    (N, A, O_g), with `group_sizes`, their lengths. In several processes, `share(parts)` returns the batch of
     one, whose states are consecutive rows of those of all (`devices.rows`).
     """
 
@@ -306,6 +307,7 @@ class Transition(NamedTuple):
     log_prob: jax.Array  # log-probabilities of the actions (N, A, D)
     reward: jax.Array  # rewards (N, A)
     active: jax.Array  # which agents took part (N, A) bool
+    learners: jax.Array  # active agents from whose samples the policy learns (N, A) bool
     terminated: jax.Array  # whether the episode terminated (N,) bool
     done: jax.Array  # whether it was terminated or truncated (N,) bool
 
@@ -323,4 +325,5 @@ class Batch(NamedTuple):
     target: jax.Array  # value targets, normalised (L, C, V)
     old_value: jax.Array  # normalised values at collection (L, C, V)
     active: jax.Array  # which agents took part (L, C, A) bool
+    learners: jax.Array  # active agents from whose samples the policy learns (L, C, A) bool
     teacher_action: Any = ()  # actions of the teacher, unscaled (L, C, A, D); empty without one

@@ -22,6 +22,7 @@ from mqe_jax.runs.presets import base_config
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
 from mqe_jax.selfplay.league.sides import BothSides
+from mqe_jax.selfplay.mates import Mates
 from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.train import learner
 from mqe_jax.train.config import TrainConfig
@@ -60,7 +61,8 @@ def prepare(
         settings = for_task(settings_of(task, config), task, env)
     elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
         settings = settings_of("", config)
-        theirs = {"env": env, "opponents": settings.opponents, "demonstrator": settings.curriculum.demonstrator}
+        theirs = {"env": env, "opponents": settings.opponents, "mates": settings.mates}
+        theirs |= {"demonstrator": settings.curriculum.demonstrator}
         for name, value in theirs.items():
             if value:
                 fail(name, value, "left out for a batch of environments, which has its own")
@@ -153,8 +155,10 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
     final = ["groups" if name == "obs" and config.group != "policy" else name for name in config.network.critic_reads]
     both, started = make_env(task, impl, config.training_env, config.num_envs, seeds, final)
+    _check_teams(both, config)
     others = [load_as("opponent", name, both) for name in Roster(opponents).fixed] if len(both.teams) > 1 else []
-    groups = {config.group, *groups_of(*others)}
+    mates = [load_as("mate", name, both) for name in config.mates]
+    groups = {config.group, *groups_of(*others, *mates)}
     demonstrator = config.curriculum.demonstrator
 
     def batch(num_envs: int) -> Any:
@@ -173,10 +177,11 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
         eval_env = eval_env.with_groups(groups)
     if config.train_env:
         _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env, config)
-    _check_teams(both, config)
     league = teacher = None
     if len(both.teams) < 2:
         env = batch(config.num_envs)
+        if mates:
+            env, eval_env = Mates(env, mates), eval_env and Mates(eval_env, mates)
     elif opponents:
         matches = batch(config.num_envs)
         league = League(BothSides(matches) if config.both_sides else matches, opponents, config)
@@ -214,6 +219,8 @@ def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv, config: TrainConfig)
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
     if len(env.teams) < 2 and config.opponents:
         fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
+    if len(env.teams) > 1 and config.mates:
+        fail("mates", list(config.mates), f"empty: {env.name} is a match, whose opponents are `opponents`")
     if config.both_sides and not config.opponents:
         fail("both_sides", True, "false where there are no opponents")
     if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:

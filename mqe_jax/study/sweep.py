@@ -50,7 +50,8 @@ class Sweep:
     config: str | None = None
     """Settings file or shipped name, in which {task} stands for the task's id; none uses that of `mqe train`."""
     settings: Mapping[str, Any] = FrozenMapping()
-    """Settings that override the file's in every run; {task} in `start` and `opponents` stands for the task's id."""
+    """Settings that override the file's in every run; {task} in `start`, `opponents` and `mates` stands for the task's
+    id."""
     variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
     """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `variant`."""
 
@@ -151,7 +152,7 @@ def plan(
     for cell in select(sweep, cells):
         config = _override(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
         config = _override(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
-        named = {"start": config.start, "opponents": config.opponents}
+        named = {name: getattr(config, name) for name in ("start", "opponents", "mates")}
         if "{task}" in str(named):
             config = override(config, for_task(named, cell.task))
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]

@@ -25,6 +25,7 @@ from mqe_jax.core.settings import FileName, FrozenMapping, Parameters, fail, loa
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
+_MATE = tyro.conf.arg(name="mate", metavar="NAME|RUN|FILE")
 
 
 @record
@@ -186,6 +187,10 @@ class TrainConfig:
     the task, the task itself (its shipped policy), a run folder or a policy file; in training also newest (the policy
     itself), older (a member of the league's pool, more often one that is hard to beat) or uniform (any member). Several
     have equal shares of the environments. Without, both teams of each match learn."""
+    mates: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _MATE] = ()
+    """Pool of mates in a task of one team, in training and its evaluations: what `opponents` accept but newest, older
+    and uniform. Each has an equal share of the environments, in which it acts for one robot and the policy learns as
+    the others. In one more share the policy acts for the whole team."""
     both_sides: bool = False
     """Whether the policy plays its opponents as the task's team 1 in half of the environments, in evaluations too."""
     draw_reward: float = 0.0

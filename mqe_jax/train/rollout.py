@@ -44,6 +44,12 @@ def active_of(state: Any) -> jax.Array:
     return jnp.ones(state.reward.shape, bool) if active is None else active
 
 
+def learners_of(state: Any) -> jax.Array:
+    """Returns from which agents of an environment's state the policy learns (N, A) bool: all active ones by default."""
+    active, learners = active_of(state), getattr(state, "learners", None)
+    return active if learners is None else active & learners
+
+
 def mean_of_team(reward: jax.Array, active: jax.Array) -> jax.Array:
     """Returns the mean over the active agents: (..., A) -> (...); 0 without any."""
     count = jnp.sum(active.astype(jnp.float32), axis=-1)
@@ -91,6 +97,7 @@ def rollout(
             log_prob=log_prob,
             reward=after.reward,
             active=active,
+            learners=learners_of(before),
             terminated=after.terminated,
             done=done,
         )

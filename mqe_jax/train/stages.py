@@ -29,9 +29,9 @@ class Stages:
         self.network, self.config = network, config
         self.optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
-    def value_mask(self, active: jax.Array) -> jax.Array:
-        """Returns which values (..., V) count, of agents of which some are active (..., A)."""
-        return jnp.any(active, axis=-1, keepdims=True) if self.config.ppo.value == "joint" else active
+    def value_mask(self, learners: jax.Array) -> jax.Array:
+        """Returns which values (..., V) count, of agents of which some are learners (..., A)."""
+        return jnp.any(learners, axis=-1, keepdims=True) if self.config.ppo.value == "joint" else learners
 
     def advantages(
         self, now: Scheduled, transitions: Transition, value: jax.Array, next_value: jax.Array
@@ -42,7 +42,7 @@ class Stages:
         """
         config, active = self.config, transitions.active
         reward = jnp.where(active, transitions.reward, jnp.zeros_like(transitions.reward))
-        counted = self.value_mask(active)
+        counted = self.value_mask(transitions.learners)
         if config.ppo.value == "joint":
             reward = mean_of_team(reward, active)[..., None]
         advantage, target = gae(
@@ -60,30 +60,30 @@ class Stages:
         return advantage, target
 
     def loss(self, params: Params, batch: Batch, now: Scheduled) -> tuple[jax.Array, Metrics]:
-        """Returns the PPO loss () of a minibatch and its parts, means over active agents."""
-        network, config, ppo, active = self.network, self.config, self.config.ppo, batch.active
+        """Returns the PPO loss () of a minibatch and its parts, means over the agents that learn."""
+        network, config, ppo, learners = self.network, self.config, self.config.ppo, batch.learners
         seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
-        new = network.evaluate(params, *seen, batch.action, active)
-        old, now_taken = (jnp.where(active[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
+        new = network.evaluate(params, *seen, batch.action, batch.active)
+        old, now_taken = (jnp.where(learners[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
         log_ratio = RATIOS[ppo.ratio](now_taken, old)
         surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
-        policy_loss = _mean(jnp.sum(surrogate, axis=-1), active)
+        policy_loss = _mean(jnp.sum(surrogate, axis=-1), learners)
         error = value_loss(new.value, batch.old_value, batch.target, ppo.value_clip, ppo.huber_delta)
-        critic_loss = _mean(error, active)
-        mean_entropy = _mean(new.entropy, active)
+        critic_loss = _mean(error, learners)
+        mean_entropy = _mean(new.entropy, learners)
         per_agent = RATIOS["agent"](now_taken, old)[..., 0]
         metrics = {
             "loss/policy": policy_loss,
             "loss/value": critic_loss,
             "entropy": mean_entropy,
-            "approx_kl": _mean(jnp.exp(per_agent) - 1.0 - per_agent, active),
-            "clip_fraction": _mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32), active),
+            "approx_kl": _mean(jnp.exp(per_agent) - 1.0 - per_agent, learners),
+            "clip_fraction": _mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32), learners),
         }
         metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
         actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
         if config.imitation.teacher is not None:
-            taught = network.evaluate(params, *seen, batch.teacher_action, active)
-            metrics["loss/imitation"] = -_mean(jnp.sum(taught.log_prob, axis=-1), active)
+            taught = network.evaluate(params, *seen, batch.teacher_action, batch.active)
+            metrics["loss/imitation"] = -_mean(jnp.sum(taught.log_prob, axis=-1), learners)
             actor_loss += now.imitation * metrics["loss/imitation"]
         return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
 
@@ -116,12 +116,12 @@ class Stages:
         return carry, jax.tree.map(jnp.mean, metrics)
 
 
-def _mean(x: jax.Array, active: jax.Array) -> jax.Array:
-    """Returns the mean over active agents of values (L, C, A, ...); of a team's, (L, C, 1, ...), over teams with any.
+def _mean(x: jax.Array, learners: jax.Array) -> jax.Array:
+    """Returns the mean over learners of values (L, C, A, ...); of a team's, (L, C, 1, ...), over teams with any.
 
     The count is a mean over processes, over which the gradient is averaged.
     """
-    mask = active if x.shape[:3] == active.shape else jnp.any(active, axis=-1, keepdims=True)
+    mask = learners if x.shape[:3] == learners.shape else jnp.any(learners, axis=-1, keepdims=True)
     mask = jnp.broadcast_to(mask.reshape(*mask.shape, *(1,) * (x.ndim - mask.ndim)), x.shape)
     count = devices.mean(jnp.sum(mask.astype(jnp.float32)))
     return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(count, 1.0)

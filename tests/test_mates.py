@@ -1,0 +1,74 @@
+"""Teams with mates of a pool: who acts in which environment, what mates remember and see, and what is rejected."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.core.settings import build, override
+from mqe_jax.envs import VectorEnv, make
+from mqe_jax.runs import build as setup
+from mqe_jax.selfplay.mates import Mates
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.rollout import learners_of
+from tests import fake_env
+from tests.inputs import refuses
+
+KEY = jax.random.PRNGKey(0)
+
+
+class Batch(fake_env.FakeVectorEnv):
+    teams, max_episode_steps = ((0, 1),), 10
+
+
+@dataclasses.dataclass(frozen=True)
+class Counter:
+    """Acts with a number, plus a tenth of the steps so far and of what the agent's mate sees."""
+
+    number: float
+    task: str = "fake"
+    agents: int = 2
+
+    def initial_memory(self, num_envs: int) -> jax.Array:
+        return jnp.zeros(num_envs)
+
+    def act(self, obs: Any, memory: Any, key: jax.Array) -> Any:
+        action = self.number + 0.1 * memory[:, None, None] + 0.1 * obs[:, ::-1]
+        return jnp.broadcast_to(action, (*obs.shape[:2], 3)), memory + 1.0
+
+
+def test_mates_act_for_each_agent_in_turn_and_forget_at_the_end_of_an_episode() -> None:
+    env = Mates(Batch(fake_env.FakeEnv(), 8), [Counter(2.0), Counter(3.0)])
+    learners = [[1, 1], [0, 1], [0, 1], [1, 1], [1, 0], [1, 0], [1, 1], [0, 1]]
+    number, own = np.array([0, 2, 3, 0, 2, 3, 0, 2]), np.array(learners, bool)
+    step, state = jax.jit(env.step), env.reset(KEY)
+    for steps in range(12):
+        seen = np.asarray(state.obs)
+        assert (np.asarray(learners_of(state)) == own).all() and learners_of(state.inner).all()
+        state = step(state, jnp.full((8, 2, 3), 0.5))
+        theirs = number[:, None, None] + 0.1 * (steps % 10) + 0.1 * seen[:, ::-1]
+        np.testing.assert_allclose(state.action, np.where(own[..., None], 0.5, np.repeat(theirs, 3, -1)), rtol=1e-5)
+        np.testing.assert_array_equal(state.reward, state.inner.reward)
+    refuses(
+        "num_envs: 8 is not allowed; it must be a multiple of 6 for each of 2 processes, with 2 mates", env.share, 2
+    )
+
+
+def test_mates_that_do_not_fit_are_refused() -> None:
+    batch = Batch(fake_env.FakeEnv(), 5)
+    refuses("mates: 2 is not allowed; it must be from 1 to 1 for 5 environments", Mates, batch, [Counter(0.0)] * 2)
+    refuses("mates: a mate needs task 'else'; the environment has 'fake'", Mates, batch, [Counter(0.0, "else")])
+    alone = VectorEnv(make("go1plane", impl="c", num_agents=1), 4)
+    refuses("go1plane has one robot, which has no mate", Mates, alone, [Counter(0.0, "go1plane", 1)])
+    config = build(TrainConfig, {"task": "go1tug", "num_envs": 4, "mates": ["idle"]})
+    for task, mate, error in (
+        ("go1tug", "idle", r"mates: .* it must be empty: go1tug is a match"),
+        ("go1gate", "go1seesaw", r"mate: go1seesaw needs task 'go1seesaw'; the environment has 'go1gate'"),
+    ):
+        changed = override(config, {"task": task, "mates": [mate]})
+        with pytest.raises(setup.InputError, match=error):
+            setup.environments("c", changed, 1)
+    refuses(r"mates: \('idle',\) .* left out for a batch", setup.prepare, batch, {"mates": ["idle"]})
