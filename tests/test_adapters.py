@@ -206,8 +206,8 @@ def test_team_0_plays_the_same_match_and_sees_its_own_half() -> None:
 
 
 def test_a_shipped_opponent_adds_its_memory_to_the_state() -> None:
-    env = mqe_jax.make("go1wrestling", impl="c")
-    team = TeamEnv(env, "go1wrestling")
+    team: Any = task_env("go1wrestling", opponent="go1wrestling", impl="c")
+    assert team.match.params.skill == "agile"
     shapes: Any = jax.eval_shape(team.reset, jax.random.PRNGKey(0))
     assert [x.shape[0] for x in jax.tree.leaves(shapes.rival_memory)] == [1] * len(jax.tree.leaves(shapes.rival_memory))
     after: Any = jax.eval_shape(team.step, shapes, jnp.zeros((1, 3)))

@@ -51,18 +51,18 @@ def new_policy(env: Any, control: str = "command", **network: Any) -> TrainedPol
 
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
-    run, file = zoo.file_of("go1football-defender"), tmp_path / "football.onnx"
+    run, file = zoo.file_of("go1pushbox"), tmp_path / "box.onnx"
     assert cli.main(["export", str(run), "--onnx", str(file), "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
     assert 0.0 < said["largest_error"] < 6e-5
     model = onnx.load(file)
     sizes = shapes(model)
-    assert sizes["inputs"]["obs"] == ["N", 2, 20] and sizes["outputs"]["joint_target"] == ["N", 2, 12]
+    assert sizes["inputs"]["obs"] == ["N", 2, 22] and sizes["outputs"]["joint_target"] == ["N", 2, 12]
     memory = sorted(name for name in sizes["inputs"] if name.startswith("walk_"))
     assert memory == WALK_MEMORY
     assert all(sizes["outputs"][f"next_{name}"] == sizes["inputs"][name] for name in memory)
     properties = {entry.key: entry.value for entry in model.metadata_props}
-    assert (properties["task"], properties["control"]) == ("go1football-defender", "command")
+    assert (properties["task"], properties["control"]) == ("go1pushbox", "command")
     assert properties["period_s"] == "0.02" and properties["opset"] == "17"
     assert file.stat().st_size < 3.9e6  # weights that float16 represents are stored as such
 

@@ -170,7 +170,8 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
         expected |= {"success/way": mean("team0/way", ends), "ending/fall": mean("ending/fall", ends)}
         expected |= {f"{name}_rate": mean(f"team0/{name}", ends) for name in ("win", "draw", "loss")}
         values = result.to_dict()
-        terms = values.pop("terms")
+        terms, intervals = values.pop("terms"), values.pop("intervals")
+        assert intervals["win_rate"] == [*result.win[1:]] and intervals["ending/fall"][0] <= values["ending/fall"]
         assert (values.pop("task"), values.pop("episodes")) == ("probe", 9)
         assert values == pytest.approx(expected, rel=1e-5)
         assert terms == pytest.approx({name: mean(f"reward/{name}", rows) for name in ("pay", "way")}, rel=1e-5)

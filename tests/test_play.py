@@ -169,14 +169,14 @@ def test_the_written_scene_is_the_tasks_physics(built: SimpleNamespace) -> None:
 
 def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     from mqe_jax.policies import zoo
+    from mqe_jax.policies.zoo import population
 
     run = tmp_path / "mine.safetensors"
     shutil.copy(zoo.file_of("go1wrestling"), run)
     (entry,) = entries(["go1wrestling", str(run)])
     assert (entry.name, list(entry.policies)) == ("go1wrestling", ["shipped", "mine", "scripted"])
-    agile = Path(__file__).parents[1] / "results" / "agile" / "go1wrestling-seed1.safetensors"
-    (entry,) = entries(["go1wrestling", str(agile)])
-    assert list(entry.policies) == ["shipped", "go1wrestling-seed1", "scripted"]  # they meet, each with its own skill
+    (entry,) = entries(["go1wrestling", str(population.resolve("population/1/late", "go1wrestling"))])
+    assert list(entry.policies) == ["shipped", "1-go1wrestling-late", "scripted"]  # they meet, each with its own skill
     policy = zoo.heaviest("go1wrestling")
     env = {"ring_radius": 1.5, "randomization.push": 1.0, "randomization.friction": [0.5, 1.0]}
     config = dataclasses.replace(policy.config, env=env)

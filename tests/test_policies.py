@@ -1,6 +1,7 @@
 """Shipped and scripted policies, and skills: a new one is one class, for agents and NPC robots alike."""
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -32,9 +33,9 @@ from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 from tests.inputs import refuses
 
-AGILE = Path(__file__).parents[1] / "results" / "agile"
-POSITION = {"control": "position", "position_scale": 2.0}
 MATCHES = [name for name in zoo.names() if TASKS[name]().num_agents > 1 and hasattr(TASKS[name], "symmetry")]
+RANGES = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
+POSITION = {"control": "position", "position_scale": 2.0}
 
 
 def test_every_task_but_the_plane_has_a_shipped_policy() -> None:
@@ -44,31 +45,35 @@ def test_every_task_but_the_plane_has_a_shipped_policy() -> None:
 
 @pytest.mark.parametrize("task", zoo.names())
 def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> None:
-    env = make(task, impl="c", num_envs=1)
+    env = make(task, impl="c", num_envs=1, **parameters_for(task, task))
     policy, card = load_policy(task, env), zoo.card(task)
     assert isinstance(policy, TrainedPolicy) and policy.task == task
     assert policy.deterministic == (card.mode == "deterministic")
     assert zoo.file_of(task).stat().st_size <= 126_000
-    assert card.episodes >= 512
     assert card.command.startswith((f"mqe train {task} ", "mqe sweep configs/zoo.yaml ")) and task in card.command
     wins = {"win/scripted", "loss/scripted", "win/idle", "win/random"}
-    sides = {f"win/scripted as team {side}" for side in (0, 1)} if task == "go1revolvingdoor" else set()
-    assert set(card.results) == (wins | sides if task in MATCHES else {"success"})
-    assert all(0.0 <= rate <= 1.0 for rate in (*card.results.values(), *card.endings.values()))
-    assert {*card.endings} == {*ENDINGS}
+    assert set(card.results) == (wins if task in MATCHES else {"success"})
+    for found in card.results.values():
+        assert found.episodes >= 512 and found.sides == ("both" if task in MATCHES else None)
+        assert 0.0 <= found.rate.low <= found.value == found.rate.value <= found.rate.high <= 1.0
+    assert all(0.0 <= share <= 1.0 for share in card.endings.values()) and {*card.endings} == {*ENDINGS}
     assert sum(card.endings.values()) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_cards_have_the_rates_of_the_readme(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_readme_and_the_list_have_the_rates_of_the_cards(capfd: pytest.CaptureFixture[str]) -> None:
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\|.* `(go1[\w-]+)`:[^|]*\| ([\d.]+) \| ([\d.]+) \|", readme, re.MULTILINE)
-    assert {row[0] for row in rows} == {*zoo.names()} and cli.main(["zoo"]) == 0
+    rows = re.findall(r"^\|.* `(go1[\w-]+)`:[^|]*\| ([^|]+) \| ([^|]+) \|", readme, re.MULTILINE)
+    assert [row[0] for row in rows] == [task for task in TASKS if task in zoo.names()] and cli.main(["zoo"]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
-    listed = {line.split()[0]: line.split()[1:3] for line in lines if line.startswith("go1")}
-    for task, *rates in rows:
-        count = 2 if task in MATCHES else 1
-        assert [*map(float, listed[task][:count])] == [*map(float, rates[:count])], task
+    listed = {line.split()[0]: line for line in lines if line.startswith("go1")}
+    for task, *shown in rows:
+        names = ("win/scripted", "win/idle") if task in MATCHES else ("success",)
+        rates = [zoo.card(task).results[name].rate.percent for name in names]
+        assert rates == shown[: len(names)] and all(rate in listed[task] for rate in rates), task
+    assert cli.main(["zoo", "go1tug", "--json"]) == 0
+    found = json.loads(capfd.readouterr().out)["policies"]["go1tug"]["results"]["win/scripted"]
+    assert 0.0 < found["low"] < found["value"] <= found["high"] <= 1.0 and found["sides"] == "both"
 
 
 def test_a_shipped_policy_does_what_its_card_says() -> None:
@@ -76,7 +81,7 @@ def test_a_shipped_policy_does_what_its_card_says() -> None:
     env = VectorEnv(make("go1gate", impl="c", num_envs=32), 32)
     policy = load_policy("go1gate", env.env)
     result = evaluate_batch(env, policy, 32, jax.random.PRNGKey(0))
-    assert result.success_rate > zoo.card("go1gate").results["success"] - 4 * 0.02
+    assert result.success_rate > zoo.card("go1gate").results["success"].value - 4 * 0.02
 
 
 def policy_of(target: str, **options: Any) -> Any:
@@ -97,11 +102,11 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
     assert isinstance(alone, BothTeams) and isinstance(alone.second, SimplePolicy)
 
 
-@pytest.mark.parametrize("file", sorted(AGILE.glob("*.safetensors")), ids=lambda file: file.stem)
-def test_a_policy_brings_the_parameters_that_it_needs(file: Path) -> None:
-    env: Any = players(file.stem.rpartition("-")[0], file, impl="c").env
-    assert env.params.skill == "agile" and set(env.params.action_ranges()) == {"vx", "vy", "yaw_rate"}
-    assert env.params.action_ranges()["vx"] == (-1.5, 2.5)
+@pytest.mark.parametrize("task", MATCHES)
+def test_a_shipped_policy_brings_the_skill_that_it_needs(task: str) -> None:
+    assert parameters_for(task, task) == {"skill": "agile", "gait": None, "command_ranges": RANGES}
+    env: Any = players(task, impl="c").env
+    assert env.params.skill == "agile" and dict(env.params.action_ranges()) == RANGES
 
 
 @pytest.mark.parametrize(
@@ -126,9 +131,7 @@ def test_a_batch_evaluates_only_policies_that_fit() -> None:
         evaluate_batch(batch, zoo.load("go1gate"), 1, jax.random.PRNGKey(0))
 
 
-def test_commands_apply_what_a_shipped_policy_needs(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
-    zoo.ship(load_policy(AGILE / "go1tug-seed1.safetensors"), zoo.card("go1tug"), tmp_path)
-    monkeypatch.setattr(zoo, "FOLDER", tmp_path)
+def test_commands_apply_what_a_shipped_policy_needs(capfd: Any) -> None:
     for chosen in ((), ("go1tug",), ("scripted", "go1tug")):
         env = players("go1tug", *chosen, impl="c", env={"episode_length": 5.0} if chosen else {}).env
         assert (env.params.skill, env.params.action_ranges()["vx"]) == ("agile", (-1.5, 2.5))
@@ -343,8 +346,10 @@ def test_who_acts_is_named() -> None:
     def about(**options: Any) -> dict[str, Any]:
         return players(**Eval(impl="c", **options).playing).about
 
-    assert about(target="go1bridge") == {"policy": "go1bridge", "actions": "sampled", "opponent": "go1bridge"}
-    assert about(target="go1bridge", deterministic=True)["actions"] == "mean"
+    match = {"policy": "population/1/middle", "actions": "sampled", "opponent": "idle"}
+    assert about(target="go1wrestling", policy="population/1/middle") == match
+    assert about(target="go1wrestling", policy="population/1/middle", deterministic=True)["actions"] == "mean"
+    assert about(target="go1bridge") == {"policy": "go1bridge", "actions": "mean", "opponent": "go1bridge"}
     assert about(target="go1tug", policy="scripted") == {"policy": "scripted", "opponent": "idle"}
 
 

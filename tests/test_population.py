@@ -1,5 +1,6 @@
 """Fixed opponents by version: their files and names, and results against all of them."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from mqe_jax.policies.zoo import population
 from mqe_jax.runs import playing
 from mqe_jax.selfplay.opponents import versus
 from mqe_jax.train.evaluate import Rate, Result
-from tests.test_opponents import matches, new_policy
+from tests.test_opponents import MATCHES, matches, new_policy
 
 TASK = "go1revolvingdoor"
 
@@ -29,27 +30,40 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def check(name: str) -> None:
-    """Checks that a population is small, and that each member loads."""
-    manifest = json.loads((population.FOLDER / f"{name.removeprefix('population/')}.json").read_text())
-    for task in manifest:
-        members = population.members(name, task)
-        assert 1 <= len(members) <= population.MEMBERS
-        for member in members:
-            env = make(task, impl="c", num_envs=1, **parameters_for(task, member))
-            assert load_policy(member, env).task == task
-    for file in population.FOLDER.glob(f"{name.removeprefix('population/')}-*.safetensors"):
-        assert file.stat().st_size <= population.BYTES
+def check(name: str, task: str, *others: str) -> None:
+    """Checks that a match's members are few and small, and meet each other and further policies in one environment."""
+    members = population.members(name, task)
+    assert 1 <= len(members) <= population.MEMBERS
+    env = make(task, impl="c", num_envs=1, **parameters_for(task, *members, *others))
+    for member in (*members, *others):
+        assert load_policy(member, env).task == task
+        file = Path(population.resolve(member, task))
+        assert not file.suffix or file.stat().st_size <= population.BYTES
 
 
-def test_the_shipped_populations_are_whole() -> None:
-    assert not list(population.FOLDER.glob("*.safetensors")) or population.names()
-    for name in population.names():
-        check(name)
+@pytest.mark.parametrize("task", MATCHES)
+def test_the_shipped_members_meet_the_shipped_policy(task: str) -> None:
+    kinds = [member.rpartition("/")[2] for member in population.members("population/1", task)]
+    assert {*kinds} >= {"scripted", "late", "response-scratch", "response-champion"}
+    check("population/1", task, task)
+
+
+def test_every_file_belongs_to_a_shipped_population() -> None:
+    manifests = (json.loads(file.read_text()) for file in population.FOLDER.glob("*.json"))
+    digests = [digest for manifest in manifests for task in manifest.values() for digest in task.values() if digest]
+    files = [hashlib.sha256(file.read_bytes()).hexdigest() for file in population.FOLDER.glob("*.safetensors")]
+    assert sorted(files) == sorted(digests)
+
+
+def test_the_scripted_member_walks_against_every_policy(fake: Path) -> None:
+    population.add("1", "go1bridge", "scripted")
+    assert parameters_for("go1bridge", "go1bridge", "scripted")["skill"] == "agile"
+    assert parameters_for("go1bridge", "go1bridge", "population/1/scripted")["skill"] == ("walk", "agile")
+    assert parameters_for(TASK, "population/1/scripted") == {}
 
 
 def test_a_population_has_named_and_trained_members(fake: Path) -> None:
-    check("population/1")
+    check("population/1", TASK)
     assert population.names() == ["population/1"]
     assert population.members("population/1", TASK) == ["population/1/idle", "population/1/early"]
     assert population.expand(["a", "population/1"], TASK) == ["a", "population/1/idle", "population/1/early"]

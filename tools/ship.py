@@ -2,14 +2,16 @@
 
 `python tools/ship.py RUN --mode deterministic --command "mqe train go1gate --seed 3" --date 2026-11-27 --note NOTE`
 
-In a match, the card holds the rates against the scripted, an idle and a random team, and how episodes against the
-scripted team end.
+In a match, the card holds the rates on both sides against the scripted, an idle and a random team, and how episodes
+against the scripted team end.
 """
 
 import argparse
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from mqe_jax.cli.commands import Eval
+from mqe_jax import evaluate
+from mqe_jax.core.settings import build
 from mqe_jax.envs import TASKS
 from mqe_jax.envs.match import Match
 from mqe_jax.policies import load_policy, mixture, zoo
@@ -17,20 +19,21 @@ from mqe_jax.policies import load_policy, mixture, zoo
 DIGITS = 4
 
 
-def measure(run: str, task: str, episodes: int, deterministic: bool) -> tuple[dict[str, float], dict[str, float]]:
+def measure(run: str, task: str, episodes: int, deterministic: bool) -> dict[str, Any]:
     """Returns the entries `results` and `endings` of a policy's card."""
     results, endings = {}, {}
     match = issubclass(TASKS[task], Match)
+    sides = "both" if match else None
     for opponent in ("random", "idle", "scripted") if match else (None,):
-        options = {"episodes": episodes, "deterministic": deterministic, "impl": "c", "json": True}
-        shown = Eval(target=run, opponent=opponent, **options).run()
-        found = {name: round(value, DIGITS) for name, value in shown.items() if isinstance(value, float)}
-        if match:
-            results |= {f"{name}/{opponent}": found[f"{name}_rate"] for name in ("win", "loss")}
-        else:
-            results["success"] = found["success_rate"]
-        endings = {name.removeprefix("ending/"): x for name, x in found.items() if name.startswith("ending/")}
-    return {name: x for name, x in results.items() if name not in ("loss/random", "loss/idle")}, endings
+        options = {"episodes": episodes, "deterministic": deterministic, "impl": "c", "sides": sides or "first"}
+        found = evaluate(run, opponent=opponent, **options).to_dict()
+        rates = {f"win/{opponent}": found["win_rate"]} if match else {"success": found["success_rate"]}
+        rates |= {"loss/scripted": found["loss_rate"]} if opponent == "scripted" else {}
+        results |= {
+            x: {"value": round(rate, DIGITS), "episodes": episodes, "sides": sides} for x, rate in rates.items()
+        }
+        endings = {x.removeprefix("ending/"): round(found[x], DIGITS) for x in found if x.startswith("ending/")}
+    return {"results": results, "endings": endings}
 
 
 if __name__ == "__main__":
@@ -45,5 +48,5 @@ if __name__ == "__main__":
     policy = load_policy(given.pop("run"))
     with TemporaryDirectory() as folder:
         rounded = str(mixture.save(folder, policy, half=True))
-        results, endings = measure(rounded, policy.task, given["episodes"], given["mode"] == "deterministic")
-    print(zoo.ship(policy, zoo.Card(results=results, endings=endings, **given)))
+        given |= measure(rounded, policy.task, given.pop("episodes"), given["mode"] == "deterministic")
+    print(zoo.ship(policy, build(zoo.Card, given)))

@@ -17,7 +17,8 @@ from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.settings import check
-from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.envs import ALIASES, QuadrupedEnv, State
+from mqe_jax.policies import parameters_for
 from mqe_jax.train.policy import Policy
 
 
@@ -38,7 +39,8 @@ def task_env(
     """Returns the environment of a task, or with an opponent the `TeamEnv` of a match.
 
     `task` is an id with `overrides` of `make`, or an environment without; `opponent` a policy of team 1, or what
-    `mqe_jax.load_policy` accepts; `max_steps` a time limit in environment steps, which errors name `limit`.
+    `mqe_jax.load_policy` accepts, whose skill and command ranges an id's task gets; `max_steps` a time limit in
+    environment steps, which errors name `limit`.
     """
     if isinstance(task, QuadrupedEnv):
         if overrides or max_steps is not None:
@@ -46,6 +48,7 @@ def task_env(
             raise InputError(f"task: overrides ({names}) need the id of a task, not an environment")
         env = task
     else:
+        overrides = parameters_for(ALIASES.get(task, task), opponent) | overrides
         if max_steps is not None:
             steps: int = check(limit, max_steps, PositiveInt)
             if "episode_length" in overrides:

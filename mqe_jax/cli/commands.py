@@ -16,10 +16,11 @@ from mqe_jax.core.settings import record
 
 _ZOO = Path(__file__).parents[1] / "policies" / "zoo"
 _RATES = {
-    "Success, % of the episodes": {"success": "success"},
-    "Wins on both sides against three teams, and losses to the scripted one, %": {
-        **{f"win/{name}": name for name in ("scripted", "idle", "random")},
-        "loss/scripted": "losses",
+    "Success, % of the episodes (95% interval)": {"success": "success"},
+    "Wins and losses on both sides, % (95% interval)": {
+        "win/scripted": "wins, scripted",
+        "loss/scripted": "losses, scripted",
+        "win/idle": "wins, idle",
     },
 }
 """Rates of the shipped policies that `mqe zoo` lists: title of each table and its columns, by name in the cards."""
@@ -75,37 +76,41 @@ class Zoo:
 
     def run(self) -> dict[str, Any]:
         """Lists the cards of all shipped policies, or prints that of a task."""
-        from mqe_jax.core.settings import to_mapping
         from mqe_jax.policies import zoo
 
         cards = {task: zoo.card(task) for task in (zoo.names() if self.task is None else [self.task])}
-        needs = {task: zoo.load(task).needs for task in cards}
-        plain = {
-            task: {"version": own.version, "skill": own.skill, "commands": dict(own.command_ranges)}
-            | to_mapping(cards[task])
-            for task, own in needs.items()
-        }
+        plain = {task: _plain(card, zoo.load(task).needs) for task, card in cards.items()}
         if self.json:
             return {"policies": plain}
         if self.task is not None:
-            card = plain[self.task]
-            shares = card.pop("results") | {f"ends by {name}": share for name, share in card.pop("endings").items()}
-            rates = {name: f"{100 * share:.1f}%" for name, share in shares.items()}
+            card, shown = plain[self.task], {"task": self.task}
+            for name, found in cards[self.task].results.items():
+                sides = {"both": ", both sides", "first": ", first side"}.get(found.sides or "", "")
+                shown[name] = f"{found.rate}, {found.episodes} episodes{sides}"
+            shown |= {f"ends by {name}": f"{100 * share:.1f}%" for name, share in card.pop("endings").items()}
             ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in card.pop("commands").items())
             card["skill"] = f"{card['skill']}: {', '.join(ranges)}"
-            for name, value in {"task": self.task, **rates, **card}.items():
+            del card["results"]
+            for name, value in {**shown, **card}.items():
                 print(textwrap.fill(f"{name:<22} {value}", 80, subsequent_indent=" " * 23))
             return {}
         for title, columns in _RATES.items():
-            print(f"{title}\n\n{'task':<21}{''.join(f'{name:>9}' for name in columns.values())}   actions  episodes")
+            print(f"{title}\n\n{'task':<20}{''.join(f'{name:>20}' for name in columns.values())}")
             for task, card in cards.items():
                 if columns.keys() <= card.results.keys():
-                    rates = "".join(f"{100 * card.results[name]:>9.1f}" for name in columns)
-                    actions = "mean" if card.mode == "deterministic" else "sampled"
-                    print(f"{task:<21}{rates}   {actions:<7}  {card.episodes:>8}")
+                    print(f"{task:<20}{''.join(f'{card.results[name].rate.percent:>20}' for name in columns)}")
             print()
         print("How one was trained: mqe zoo TASK")
         return {"policies": plain}
+
+
+def _plain(card: Any, needs: Any) -> dict[str, Any]:
+    """Returns a policy's card for JSON, with what the policy needs and the interval of each rate."""
+    from mqe_jax.core.settings import to_mapping
+
+    results = {name: {**to_mapping(found), **found.rate._asdict()} for name, found in card.results.items()}
+    about = {"version": needs.version, "skill": needs.skill, "commands": dict(needs.command_ranges)}
+    return {**about, **to_mapping(card), "results": results}
 
 
 @record

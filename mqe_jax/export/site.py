@@ -146,6 +146,7 @@ def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
     if plain.skill not in ("walk", "agile") or plain.skill_weights or not {*plain.commands} <= {*known}:
         return params
     ranges = dict(zip(known, AgileSkill(robots.get(plain.robot)).trained_ranges(known).tolist(), strict=True))
+    params = {name: value for name, value in params.items() if (name, value) != ("gait", None)}  # any skill's default
     each = [plain.actions("command"), *({"skill": name, "command_ranges": ranges} for name in ("walk", "agile"))]
     return {**params, **together(each)}
 

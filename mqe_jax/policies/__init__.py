@@ -217,22 +217,27 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
     """Returns the parameters, and the control mode, in which what policies need differs from a task's defaults.
 
     Policies of different skills get those with which they can meet. The sources are policies, or what `load_policy`
-    accepts; those that are no trained policy of the task need nothing.
+    accepts; those that are no trained policy of the task need nothing, but the scripted member of a population needs
+    the task's default skill, so that it is the same opponent for all.
     """
     params: dict[str, Any] = {}
     every: list[Needs] = []
+    scripted: list[dict[str, Any]] = []
     for source in sources:
         policy = source
         if isinstance(source, str | Path) and str(source) not in NAMES:
             with contextlib.suppress(InputError):  # `load_as` raises it, where it matters
-                policy = load_policy(population.resolve(source, task))
+                policy = population.resolve(source, task)
+                scripted = [TASKS[task].Params().actions("command")] if policy == "scripted" else scripted
+                policy = load_policy(policy)
         if isinstance(policy, Trained) and policy.needs.control is not None and policy.task == task:
             every.append(policy.needs)
     for needs in every:
         usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
         asked = {name: value for name in usual if (value := getattr(needs, name)) != usual[name]}
         params = asked | {name: value for name, value in params.items() if value is not None}
-    return params | together([needs.by_name() for needs in every])
+    commanding = scripted if all(needs.control == "command" for needs in every) else []
+    return params | together([*(needs.by_name() for needs in every), *commanding])
 
 
 def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:

@@ -3,7 +3,6 @@
 import dataclasses
 import inspect
 import json
-import math
 import pkgutil
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,6 @@ from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy
 from mqe_jax.study.runs import table
 from mqe_jax.study.sweep import Measurement, for_task
-from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.policy import TrainedPolicy
 
 MEASURES = {
@@ -100,13 +98,16 @@ def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
 def _rates(item: Item) -> list[dict[str, Any]]:
     """Returns the rates of an evaluation with their intervals, a row each."""
     result = json.loads(item.file.read_text("utf-8"))["result"]
-    rates = {name: result[name] for name in ("success_rate", "win_rate", "draw_rate", "loss_rate") if name in result}
-    episodes, about = (
-        result.get("episodes"),
-        {name: result.get(name) or "" for name in ("opponent", "sides", "actions")},
-    )
+    about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions", "episodes")}
     return [
-        {"task": item.task, "variant": item.variant, **about, "rate": name, **Rate.of(x, episodes)._asdict()}
-        for name, x in rates.items()
-        if x is not None and math.isfinite(x)
+        {
+            "task": item.task,
+            "variant": item.variant,
+            **about,
+            "rate": name,
+            "value": result[name],
+            "low": low,
+            "high": high,
+        }
+        for name, (low, high) in result.get("intervals", {}).items()
     ]

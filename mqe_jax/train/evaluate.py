@@ -48,6 +48,11 @@ class Rate(NamedTuple):
     def __repr__(self) -> str:
         return f"{100 * self.value:.1f}% ({100 * self.low:.1f} to {100 * self.high:.1f}%)"
 
+    @property
+    def percent(self) -> str:
+        """The percentages alone, such as 97.3 (95.5 to 98.4)."""
+        return repr(self).replace("%", "").replace("100.0", "100")
+
     @classmethod
     @check_arguments(value=Fraction, episodes=PositiveInt)
     def of(cls, value: float, episodes: int) -> "Rate":
@@ -55,7 +60,7 @@ class Rate(NamedTuple):
         spread = _NORMAL**2 / episodes
         middle = (value + spread / 2) / (1 + spread)
         half = math.sqrt(spread * max(value * (1 - value), 0.0) + spread**2 / 4) / (1 + spread)
-        return cls(value, max(middle - half, 0.0), min(middle + half, 1.0))
+        return cls(value, max(min(middle - half, value), 0.0), min(max(middle + half, value), 1.0))
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,28 +107,39 @@ class Result:
     draw = property(lambda self: self._rate("draw_rate"))
     loss = property(lambda self: self._rate("loss_rate"))
 
+    @property
+    def rates(self) -> dict[str, Rate]:
+        """All rates with their intervals, by name as in `to_dict`."""
+        own = {"success_rate": self.success_rate, **self.match}
+        own |= {f"ending/{name}": share for name, share in self.endings.items()}
+        bounded = {name: min(max(value, 0.0), 1.0) for name, value in own.items() if not math.isnan(value)}  # rounding
+        found = {name: Rate.of(value, self.episodes) for name, value in bounded.items()}
+        members = {f"win_rate/{name}": result.rates["win_rate"] for name, result in self.by_opponent.items()}
+        return found | members | ({"worst_win_rate": min(members.values())} if members else {})
+
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; the entries of all mappings but `terms` become top-level keys."""
+        """Returns plain values for JSON; the entries of all mappings but `terms` become top-level keys.
+
+        `intervals` has the ends of the 95% interval of each rate.
+        """
         mappings = ("task", "about", "endings", "outcomes", "match", "by_opponent")
         values = {k: v for k, v in vars(self).items() if k not in mappings}
         named = {"ending": self.endings, "success": self.outcomes}
         flat = {f"{kind}/{name}": value for kind, values in named.items() for name, value in values.items()}
-        flat |= {f"win_rate/{name}": result.match["win_rate"] for name, result in self.by_opponent.items()}
-        worst = [flat[f"win_rate/{name}"] for name in self.by_opponent]
-        match = {**self.match, "worst_win_rate": min(worst)} if worst else self.match
-        return {"task": self.task, **self.about, **values, **match, **flat}
+        rates = self.rates
+        flat |= {name: rate.value for name, rate in rates.items() if "win_rate" in name}
+        intervals = {name: [rate.low, rate.high] for name, rate in rates.items()}
+        return {"task": self.task, **self.about, **values, **self.match, **flat, "intervals": intervals}
 
     def rows(self) -> dict[str, str]:
         """Returns all results as text by name; rates have their intervals."""
-        found = {}
+        found, rates = {}, self.rates
         for name, value in self.to_dict().items():
             if name == "terms":
                 found |= {f"reward/{term}": f"{mean:.4g}" for term, mean in value.items()}
-            elif name == "success_rate" or name in self.match:
-                found[name] = str(Rate.of(value, self.episodes))
-            elif "win_rate" in name:
-                found[name] = str(Rate.of(value, self.episodes // len(self.by_opponent)))
-            else:
+            elif name in rates:
+                found[name] = str(rates[name])
+            elif name != "intervals":
                 found[name] = f"{value:.4g}" if isinstance(value, float) else line(value)
         return found
 

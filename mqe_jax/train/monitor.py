@@ -93,7 +93,7 @@ class Monitor:
 
 def _plain(result: Result) -> dict[str, Any]:
     """Returns a result as JSON values; numbers that are not finite become null."""
-    values = {k: v for k, v in result.to_dict().items() if k not in ("task", "episodes", "terms")}
+    values = {k: v for k, v in result.to_dict().items() if k not in ("task", "episodes", "terms", "intervals")}
     values |= {f"reward/{name}": value for name, value in result.terms.items()}
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 

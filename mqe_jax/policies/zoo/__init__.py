@@ -6,20 +6,36 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from annotated_types import Ge
+from typing import Any, Literal
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import NonNegative
+from mqe_jax.core.limits import Episodes, Fraction, NonNegative
 from mqe_jax.core.settings import PathText, build, check_arguments, record, to_mapping
 from mqe_jax.core.types import AnyTrained
 from mqe_jax.policies import mixture
 from mqe_jax.policies.mixture import Mixture, Trained
 from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.policy import NAMED, TrainedPolicy
 
 FOLDER = Path(__file__).parent
+
+
+@record
+class Measured:
+    """A rate in fresh episodes."""
+
+    value: Fraction
+    """Mean over the episodes."""
+    episodes: Episodes
+    """Number of episodes."""
+    sides: Literal["both", "first"] | None = None
+    """Of a match, the sides that the policy played on, as in `mqe_jax.evaluate`."""
+
+    @property
+    def rate(self) -> Rate:
+        """The rate with its 95% interval."""
+        return Rate.of(self.value, self.episodes)
 
 
 @record
@@ -36,12 +52,10 @@ class Card:
     """Hardware, what shared it, how the policy was chosen."""
     gpu_minutes: NonNegative | None
     """Time on one GPU, min; none where it was not recorded."""
-    episodes: Annotated[int, Ge(1)]
-    """Episodes behind each result."""
-    results: Mapping[str, float]
-    """Rates in fresh episodes, such as success, or win/scripted and loss/scripted."""
+    results: Mapping[str, Measured]
+    """Rates by name, such as success, or win/scripted and loss/scripted."""
     endings: Mapping[str, float]
-    """Shares of episodes by how they end (`mqe_jax.envs.state.ENDINGS`); in a match against the scripted team."""
+    """Shares of these episodes by how they end (`mqe_jax.envs.state.ENDINGS`); in a match against the scripted team."""
 
 
 def names() -> list[str]:
