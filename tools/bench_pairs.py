@@ -1,9 +1,9 @@
-"""Compares the throughput of checkouts on one machine: medians and ratios of interleaved timings.
+"""Compares the throughput of checkouts or parameters on one machine: medians and ratios of interleaved timings.
 
 `python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv FILE` starts
 one process per checkout and case, waits for compilation, and then times them in turn, so that drifts of the machine's
 speed affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few
-calls of 50 environment steps, whole step and bare physics.
+calls of 50 environment steps, whole step and bare physics. `PATH,senses=onboard` is a checkout with a task parameter.
 """
 
 import argparse
@@ -17,10 +17,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import yaml
+
 RATES = ("env_steps_per_s", "bare_env_steps_per_s")
 
 
-def work(case: str, steps: int, repeats: int) -> None:
+def work(case: str, steps: int, repeats: int, params: dict[str, Any]) -> None:
     """Process of one checkout and case: compiles, then answers each line on standard input with one timing."""
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print
@@ -32,8 +34,10 @@ def work(case: str, steps: int, repeats: int) -> None:
     from mqe_jax.runs.throughput import programs
 
     task, impl, count = case.split(":")
-    env = mqe_jax.make(task, impl=impl, num_envs=int(count))
-    vector: Any = mqe_jax.VectorEnv(env, int(count))
+    env = mqe_jax.make(task, impl=impl, num_envs=int(count), **params)
+    vector: Any = mqe_jax.VectorEnv(env, int(count), final=())
+    if getattr(env.params, "senses", ()):
+        vector = vector.with_groups(["onboard"])
     scan, bare_scan = programs(env, vector, steps, lambda state: ())
     whole, bare = jax.jit(lambda carry: scan(carry)[0]), jax.jit(bare_scan)
 
@@ -55,10 +59,13 @@ def work(case: str, steps: int, repeats: int) -> None:
         print(json.dumps({**figures, "device": device, "jax": jax.__version__}), file=output, flush=True)
 
 
-def start(tree: Path, case: str, steps: int, repeats: int) -> subprocess.Popen[str]:
-    """Starts the process that times one case in one checkout."""
+def start(place: str, case: str, steps: int, repeats: int) -> subprocess.Popen[str]:
+    """Starts the process that times one case in one checkout, PATH or PATH,PARAMETER=VALUE,..."""
+    folder, *pairs = place.split(",")
+    tree, params = Path(folder), {name: yaml.safe_load(value) for name, value in (pair.split("=") for pair in pairs)}
     path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     command = [sys.executable, str(Path(__file__).resolve()), "--work", case, str(steps), str(repeats)]
+    command.append(json.dumps(params))
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=tree, env=os.environ | {"PYTHONPATH": path}, **pipes)
 
@@ -77,20 +84,23 @@ def answer(worker: subprocess.Popen[str], ask: bool = True) -> dict[str, Any]:
 def main() -> int:
     """Runs the pairs and prints one JSON object per case."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--trees", nargs="+", metavar="NAME=PATH", help="checkouts; ratios are to the first one")
+    parser.add_argument(
+        "--trees", nargs="+", metavar="NAME=PATH[,PARAMETER=VALUE...]", help="ratios are to the first one"
+    )
     parser.add_argument("--cases", nargs="+", metavar="TASK:ENGINE:ENVS")
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--csv", type=Path)
-    parser.add_argument("--work", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--work", nargs=4, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.work:
-        work(arguments.work[0], int(arguments.work[1]), int(arguments.work[2]))
+        case, steps, repeats, params = arguments.work
+        work(case, int(steps), int(repeats), json.loads(params))
         return 0
     trees = dict(pair.split("=", 1) for pair in arguments.trees)
     workers = {
-        (case, name): start(Path(tree), case, arguments.steps, arguments.repeats)
+        (case, name): start(tree, case, arguments.steps, arguments.repeats)
         for case in arguments.cases
         for name, tree in trees.items()
     }

@@ -13,6 +13,7 @@ from mqe_jax.core.limits import Environments, Horizon, Seed
 from mqe_jax.core.settings import check_arguments, merge
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.runs import build
+from mqe_jax.sensors.suite import ONBOARD
 
 WARM_UP = 4  # calls after the compiling one that are not counted: episodes spread, clocks settle
 
@@ -70,7 +71,7 @@ def bench(
     """Measures throughput in environment steps per second, as `mqe bench`.
 
     An environment step is one step of one environment. `env_steps_per_s` includes everything: control, skill, physics
-    steps, observations, rewards and automatic resets, under random actions sampled inside the same scan.
+    steps, observations, sensors, rewards and automatic resets, under random actions sampled inside the same scan.
     `bare_env_steps_per_s` is the same scene and number of physics steps under constant control, without skill, reward
     and resets. Both are medians; `slowest` and `fastest` are the range of the former. `compile_s` is the first call
     minus the median call. `overflow` counts the environment steps of one call in which the engine may have dropped
@@ -94,6 +95,7 @@ def bench(
         InputError: for a task or parameters that are not allowed.
     """
     made, batch = build.make_env(task, impl, merge(build.parameters_of(task), env or {}), num_envs)
+    batch = batch.with_groups([ONBOARD]) if made.params.senses else batch
     whole, bare = programs(made, batch, steps, lambda state: jnp.sum(state.metrics["overflow"]))
     key = jax.random.PRNGKey(seed)
     state = jax.block_until_ready(jax.jit(batch.reset)(key))
