@@ -34,6 +34,7 @@ from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 from tests.inputs import refuses
 
 MATCHES = [name for name in zoo.names() if TASKS[name]().num_agents > 1 and hasattr(TASKS[name], "symmetry")]
+AGILE = [*MATCHES, "go1football-defender"]
 RANGES = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
 POSITION = {"control": "position", "position_scale": 2.0}
 
@@ -102,7 +103,7 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
     assert isinstance(alone, BothTeams) and isinstance(alone.second, SimplePolicy)
 
 
-@pytest.mark.parametrize("task", MATCHES)
+@pytest.mark.parametrize("task", AGILE)
 def test_a_shipped_policy_brings_the_skill_that_it_needs(task: str) -> None:
     assert parameters_for(task, task) == {"skill": "agile", "gait": None, "command_ranges": RANGES}
     env: Any = players(task, impl="c").env
