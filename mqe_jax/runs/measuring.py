@@ -98,7 +98,7 @@ def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
 def _rates(item: Item) -> list[dict[str, Any]]:
     """Returns the rates of an evaluation with their intervals, a row each."""
     result = json.loads(item.file.read_text("utf-8"))["result"]
-    about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions", "episodes")}
+    about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions")}
     return [
         {
             "task": item.task,
