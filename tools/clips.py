@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 from mqe_jax import make
 from mqe_jax.envs import TASKS
-from mqe_jax.policies import all_agents, load_policy
+from mqe_jax.policies import all_agents, load_policy, parameters_for
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import write_clip
 from mqe_jax.viz.framing import legend
@@ -29,7 +29,7 @@ SIZE, TILE, COLUMNS = (640, 360), (240, 135), 4
 
 def write(task: str) -> None:
     """Writes a task's clip, from a fixed camera."""
-    env = make(task, impl="c", num_envs=EPISODES)
+    env = make(task, impl="c", num_envs=EPISODES, **parameters_for(task, task))
     policy = all_agents(env, load_policy(task, env), load_policy("scripted", env) if len(env.teams) > 1 else None)
     episode = typical(record_episodes(env, policy, jax.random.PRNGKey(0), episodes=EPISODES))
     end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
