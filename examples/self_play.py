@@ -9,18 +9,19 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import numpy as np
 
-from mqe_jax import VectorEnv, make, versus
+from mqe_jax import VectorEnv, load_policy, make, versus
 from mqe_jax.core.settings import build
+from mqe_jax.selfplay.league.tournament import play
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Result, evaluate_batch
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import policy_of
 
 
-def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episodes: int = 32) -> list[Result]:
-    """Trains, and returns evaluations against the last snapshot and the scripted policy."""
-    network = {"recurrent": False, "hidden_sizes": [64, 64], "openrl_layers": True}
+def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5) -> np.ndarray:
+    """Trains, and returns wins, draws and losses against the last snapshot and the scripted policy (2, 3)."""
+    network = {"recurrent": False, "hidden_sizes": [64, 64]}
     settings = {"num_envs": num_envs, "rollout_steps": 64, "ppo": {"epochs": 4}, "network": network}
     config = build(TrainConfig, {**settings, "total_steps": updates * num_envs * 64, "stagger_episodes": True})
     matches = VectorEnv(make("go1wrestling", rewards={"push": 3.0, "approach": 1.0}, num_envs=num_envs), num_envs)
@@ -41,11 +42,10 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5, episode
         state, metrics = update(state)
         print(f"update {i + 1}: average step reward {float(metrics['average_step_reward']):.4f}")
 
-    policy = policy_of(state, env, config)
-    fights = [versus(matches, [opponent]) for opponent in (snapshot, "scripted")]
-    return [evaluate_batch(fight, policy, episodes, jax.random.PRNGKey(1)) for fight in fights]
+    opponents = snapshot, load_policy("scripted", matches.env)
+    return play(matches, policy_of(state, env, config), opponents, jax.random.PRNGKey(1))
 
 
 if __name__ == "__main__":
-    for name, result in zip(("snapshot", "scripted"), main(), strict=True):
-        print(f"against {name}: " + ", ".join(f"{rate} {value:.0%}" for rate, value in result.match.items()))
+    for name, outcomes in zip(("snapshot", "scripted"), main().tolist(), strict=True):
+        print(f"against {name}: {outcomes[0]} wins, {outcomes[1]} draws, {outcomes[2]} losses")

@@ -69,7 +69,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 @pytest.fixture
 def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The task `fake` in addition to the real ones, for `mqe`, and an empty working folder."""
-    import fake_env
+    from tests import fake_env
 
     monkeypatch.chdir(tmp_path)
     fake_env.install(monkeypatch)

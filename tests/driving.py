@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
 
 from mqe_jax.envs import make
@@ -21,15 +22,17 @@ def start_in_air(robot: str = "go1") -> dict[str, dict[str, float]]:
     """
     env: Any = make("go1plane", impl="c", robot=robot, num_agents=1, control="torque", num_envs=3)
     index, own, timestep = env.index, env.robot, env.compiled.model.opt.timestep
-    data = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3)).data
-    qpos = data.qpos.at[:, index.base_qpos[0, 2]].set(2.0).at[:, index.joint_qpos[0]].set(own.default_joints)
-    data = data.replace(qpos=qpos, qvel=jnp.zeros_like(data.qvel))
+    data = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3)).data
+    qpos = np.array(data.qpos)
+    qpos[:, index.base_qpos[0, 2]], qpos[:, index.joint_qpos[0]] = 2.0, own.default_joints
+    data = data.replace(qpos=jnp.asarray(qpos), qvel=jnp.zeros_like(data.qvel))
     step = jax.jit(jax.vmap(lambda data, torque: env.physics.step(data, torque, num_substeps=1)[0]))
     rows = {}
     for j, (name, torque) in enumerate(zip(JOINTS, own.torque_limit, strict=False)):
-        first = step(data, jnp.zeros((3, 12)).at[:, j].set(torque))
-        second = step(first, jnp.zeros((3, 12)).at[:, j].set(torque))
-        speeds = [float(state.qvel[0, index.joint_qvel[0, j]]) for state in (first, second)]
+        full = np.where(np.arange(12) == j, torque, np.zeros((3, 12))).astype(np.float32)
+        first = step(data, full)
+        second = step(first, full)
+        speeds = [float(np.asarray(state.qvel)[0, index.joint_qvel[0, j]]) for state in (first, second)]
         response, top, stall = leg_response(own)[j, j], own.joint_speed_limit[j], own.stall_torque[j]
         line, speed = [], 0.0
         for i in range(2000):

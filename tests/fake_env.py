@@ -22,7 +22,7 @@ from mqe_jax.core.types import Outcome
 from mqe_jax.envs import TASKS, EnvironmentState
 from mqe_jax.runs import build
 
-SMALL = ["--num-envs", "4", "--rollout-steps", "8", "--total-steps", "64", "--ppo.minibatches", "1"]
+SMALL = "--num-envs 4 --rollout-steps 8 --total-steps 64 --ppo.minibatches 1 --network.no-recurrent".split()
 """Flags of a training that ends within seconds."""
 
 LEG = "".join(f'<body pos="0 0 -.01"><joint name="{{robot}}j{i}"/><geom size=".02"/>' for i in range(12))
@@ -71,6 +71,7 @@ class FakeEnv:
     teams = ((0, 1),)
     dt = 0.02
     robot_x = np.array([0, 19])
+    params = SimpleNamespace(senses=())
     overflow_x = 1.21  # m; a step that ends with the first robot beyond it overflows
 
     def __init__(self) -> None:

@@ -29,8 +29,13 @@ def stepper(task: str) -> Any:
 
 
 @functools.cache
+def resetter(env: QuadrupedEnv) -> Any:
+    return jax.jit(env.reset)
+
+
+@functools.cache
 def initial(env: QuadrupedEnv) -> State:
-    return jax.jit(env.reset)(jax.random.PRNGKey(0))
+    return resetter(env)(jax.random.PRNGKey(0))
 
 
 def placed(

@@ -101,8 +101,8 @@ def test_brax_names_wrong_arguments() -> None:
 def test_jaxmarl_names_wrong_arguments() -> None:
     jaxmarl, key = adapter("jaxmarl"), jax.random.PRNGKey(0)
     env, discrete = (jaxmarl.Env(task_env("go1gate"), discrete=wanted) for wanted in (False, True))
-    _, state = env.reset(key)
-    batch: Any = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    _, state = jax.jit(env.reset)(key)
+    batch: Any = jax.tree.map(lambda x: np.stack([x, x]), state)
     some = {"robot_0": jnp.zeros(3), "robot_1": jnp.zeros(3)}
     for name, call in {
         "key: 3": lambda: env.reset(3),

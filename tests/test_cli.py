@@ -6,10 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import fake_env
 import numpy as np
 import pytest
-from fake_env import SMALL, FakeEnv
 
 import mqe_jax
 from mqe_jax import cli
@@ -24,6 +22,8 @@ from mqe_jax.runs import build
 from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import SETTINGS
+from tests import fake_env
+from tests.fake_env import SMALL, FakeEnv
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
 

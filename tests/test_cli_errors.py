@@ -10,12 +10,12 @@ from unittest import mock
 
 import jax
 import pytest
-from fake_env import SMALL
 
 from mqe_jax import cli
 from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.runs import build, learning
 from mqe_jax.train.nn import mlp_init
+from tests.fake_env import SMALL
 
 pytestmark = pytest.mark.usefixtures("fake_tasks")
 

@@ -42,7 +42,7 @@ def test_each_agent_does_what_its_own_policy_does_for_it() -> None:
     def act(seats: jax.Array, memory: Any) -> Any:
         return dataclasses.replace(team, seats=seats).act(obs, memory, KEY)
 
-    memory = jax.tree.map(lambda x: jnp.stack([x] * 16), memory)
+    memory = jax.tree.map(lambda x: np.stack([x] * 16), memory)
     actions = jnp.zeros(())
     for _ in range(2):
         own = [policy.act(obs, now, KEY) for policy, now in zip(policies, memories, strict=True)]

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import fake_env
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -27,6 +26,7 @@ from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.train.config import PPO, TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.rollout import minibatches
+from tests import fake_env
 from tests.inputs import refuses
 from tests.states import made
 from tests.training import assert_same, settings

@@ -44,10 +44,10 @@ def new_policy(env: Any, control: str = "command", **network: Any) -> TrainedPol
     config = build(TrainConfig, settings)
     needs = needs_of(env, config)
     net = config.network.build(needs.dims)
-    keys = jax.random.split(jax.random.PRNGKey(3), 3)
-    params = jax.tree.map(lambda x: x + 0.1, net.policy_params(random_params(net)))
-    mean, spread = (jax.random.normal(key, (env.observation_size,)) for key in keys[1:])
-    return TrainedPolicy(params, RunningStatistics(mean, jnp.square(spread), jnp.float32(9.0)), needs, config, {})
+    params = jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + np.float32(0.1)), net.policy_params(random_params(net)))
+    mean, spread = np.random.default_rng(3).normal(size=(2, env.observation_size)).astype(np.float32)
+    statistics = RunningStatistics(jnp.asarray(mean), jnp.asarray(spread**2), jnp.float32(9.0))
+    return TrainedPolicy(params, statistics, needs, config, {})
 
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
@@ -73,10 +73,11 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
     session = onnxruntime.InferenceSession(to_onnx(policy, env).SerializeToString())
     sizes = {i.name: i.shape[1:] for i in session.get_inputs()}
     memory = {name: np.zeros((1, *sizes[name]), np.float32) for name in WALK_MEMORY}
-    state, step = jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.jit(env.step)
-    now = env.read(state.data)
+    read, act, step = jax.jit(env.read), jax.jit(lambda obs: policy.act(obs, ())[0]), jax.jit(env.step)
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    now = read(state.data)
     for _ in range(20):
-        now = env.read(state.data)
+        now = read(state.data)
         sensed = {
             "obs": state.obs,
             "gravity": now.projected_gravity,
@@ -87,7 +88,7 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
         names = [output.name for output in session.get_outputs()]
         found = dict(zip(names, session.run(names, {**inputs, **memory}), strict=True))
         memory = {name: found[f"next_{name}"] for name in memory}
-        action, _ = policy.act(state.obs, ())
+        action = act(state.obs)
         np.testing.assert_allclose(found["action"][0], action, atol=1e-5)
         state = step(state, action)
         target = np.asarray(state.data.ctrl)[env.index.actuator]
@@ -126,7 +127,7 @@ def test_a_graph_holds_the_skill_of_the_task(skill: Any, commands: Any, memory: 
 def mixture_of(env: Any) -> Mixture:
     """A mixture of policies without and with a recurrent state."""
     one, other = (new_policy(env, "position", hidden_sizes=[16], recurrent=x, gru_size=8) for x in (False, True))
-    third = dataclasses.replace(one, params=jax.tree.map(lambda x: -x, one.params))
+    third = dataclasses.replace(one, params=jax.tree.map(lambda x: jnp.asarray(-np.asarray(x)), one.params))
     return Mixture((one, other, third), (0.5, 0.2, 0.3))
 
 

@@ -27,7 +27,7 @@ def drawn(envs: dict[str, Any]) -> dict[str, State]:
 
 @pytest.fixture(scope="module")
 def fresh(drawn: dict[str, State]) -> dict[str, State]:
-    return {task: jax.tree.map(lambda x: x[0], states) for task, states in drawn.items()}
+    return jax.device_put(jax.tree.map(lambda x: x[0], jax.device_get(drawn)))
 
 
 duel = pytest.fixture(scope="module")(lambda envs: envs["go1football-1vs1"])
@@ -64,8 +64,8 @@ def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str
     away = np.abs(np.asarray(robots.position_w)[..., :2] - np.array(places))
     assert away.max() <= 0.1 + 1e-5 and away.max() > 0.09
     np.testing.assert_allclose(robots.position_w[..., 2], 0.42, atol=1e-6)
-    np.testing.assert_allclose(jnp.cos(robots.euler[..., 2]), np.tile(1 - 2 * np.array(turned), (64, 1)), atol=1e-5)
-    np.testing.assert_allclose(jax.vmap(env.ball)(states.data), np.tile([*ball, 0.1], (64, 1)), atol=1e-6)
+    np.testing.assert_allclose(np.cos(robots.euler[..., 2]), np.tile(1 - 2 * np.array(turned), (64, 1)), atol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.vmap(env.ball))(states.data), np.tile([*ball, 0.1], (64, 1)), atol=1e-6)
     assert env.max_steps == 1000
 
 
@@ -73,7 +73,7 @@ def test_the_ball_can_start_between_the_attackers() -> None:
     changes: dict[str, Any] = {"ball_between": 0.5, "ball_noise": 0.2, "head_start": 0.5}
     env: Any = make("go1football-defender", impl="c", control="position", **changes)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 256))
-    y = np.asarray(jax.vmap(env.ball)(states.data))[:, 1]
+    y = np.asarray(jax.jit(jax.vmap(env.ball))(states.data))[:, 1]
     between = np.abs(y) <= 0.2
     assert 0.4 < between.mean() < 0.6 and np.all(np.abs(y[~between] + 2.1) <= 0.2)
 

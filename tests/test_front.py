@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_env import SMALL, FakeEnv, FakeVectorEnv
 
 import mqe_jax
 from mqe_jax import cli
@@ -23,11 +22,13 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Rate, evaluate_batch
 from mqe_jax.train.runner import Training
 from mqe_jax.train.stages import Stages
+from tests.fake_env import SMALL, FakeEnv, FakeVectorEnv
 from tests.inputs import refuses
 from tests.training import assert_same
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
-FEW: dict[str, Any] = {"num_envs": 4, "rollout_steps": 8, "total_steps": 64, "ppo.minibatches": 1}
+FEW: dict[str, Any] = {"num_envs": 4, "rollout_steps": 8, "total_steps": 64}
+FEW |= {"ppo.minibatches": 1, "network.recurrent": False}
 
 
 @pytest.mark.parametrize(

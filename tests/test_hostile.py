@@ -8,7 +8,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import fake_env
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +46,7 @@ from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy, save_pol
 from mqe_jax.train.runner import train
 from mqe_jax.viz import clips, curves, recording, render
 from mqe_jax.walk.torchscript import read_torchscript
-from tests import inputs
+from tests import fake_env, inputs
 from tests.inputs import refuses
 
 KEY, NAN = jax.random.PRNGKey(0), math.nan

@@ -21,8 +21,9 @@ from mqe_jax.cli.arguments import parse
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.train.checkpoint import list_checkpoints
+from tests import fake_env
 from tests.inputs import refuses
-from tests.test_interrupts import updates, wait_for
+from tests.test_interrupts import PROGRAM, updates, wait_for
 from tests.training import assert_same_run, without_progress
 
 MQE = [sys.executable, "-m", "mqe_jax.cli"]
@@ -91,8 +92,8 @@ def children(process: subprocess.Popen[str]) -> list[int]:
     return list(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
 
 
-def mqe(*words: str) -> None:
-    subprocess.run([*MQE, *words], check=True, capture_output=True, timeout=300)
+def mqe(*words: str, program: list[str] = MQE) -> None:
+    subprocess.run([*program, *words], check=True, capture_output=True, timeout=300)
 
 
 def lines(said: str) -> list[str]:
@@ -100,11 +101,14 @@ def lines(said: str) -> list[str]:
     return list(without_progress(said.splitlines()))
 
 
-def test_two_processes_equal_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", ["fake", pytest.param("go1gate", marks=pytest.mark.soak)])
+def test_two_processes_equal_one(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_env.install(monkeypatch)
     one, two = tmp_path / "one", tmp_path / "two"
-    steps = ["--total-steps", "16"]
-    mqe("launch", *TWO, *TRAIN, *steps, "--run-dir", str(two))
-    assert cli.main([*TRAIN, *steps, "--run-dir", str(one)]) == 0
+    train = ["train", task, *(TRAIN[TRAIN.index("--num-envs") :] if task == "fake" else TRAIN[2:])]
+    train += ["--total-steps", "16", "--run-dir"]
+    mqe("launch", *TWO, *train, str(two), program=PROGRAM if task == "fake" else MQE)
+    assert cli.main([*train, str(one)]) == 0
     assert_same_run(one, two, 1e-5)
     names = [sorted(path.name.partition("tfevents")[0] for path in run.rglob("*")) for run in (one, two)]
     assert names[0] == names[1]

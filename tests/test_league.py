@@ -35,8 +35,8 @@ SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes
 
 
 def config_of(sources: tuple[str, ...] = SOURCES, **settings: Any) -> TrainConfig:
-    whole = {**SETTINGS, "num_envs": 8, "total_steps": 512, "opponents": sources, "league": SMALL, **settings}
-    return build(TrainConfig, whole)
+    whole = {**SETTINGS, "num_envs": 8, "total_steps": 512, "opponents": sources, "league": SMALL}
+    return build(TrainConfig, {**whole, "network": {"recurrent": False, "hidden_sizes": [8]}, **settings})
 
 
 @pytest.fixture(scope="module")

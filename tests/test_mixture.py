@@ -107,10 +107,11 @@ def test_a_mixture_acts_wherever_a_policy_does(members: Any, tmp_path: Path) -> 
 def test_a_training_meets_a_mixture_and_resumes_in_its_episodes(members: Any, tmp_path: Path) -> None:
     env = versus(matches(), [Mixture(members, (0.4, 0.3, 0.3)), "idle"])
     learner = make_learner(env, members[0].config)
-    state = jax.jit(learner.update)(jax.jit(learner.init)(KEY))[0]
+    template = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))[0].rollout.env_state
+    state = jax.jit(env.step)(jax.jit(env.reset)(KEY), jnp.zeros((4, 1, 12)))
     save_tree(tmp_path / "a", state, {}, kind="checkpoint")
-    kept = load_tree(tmp_path / "a", jax.eval_shape(lambda: state), kind="checkpoint").tree
-    assert np.asarray(kept.rollout.env_state.opponents[0].memory["member"]).all()
+    kept = load_tree(tmp_path / "a", template, kind="checkpoint").tree
+    assert np.asarray(kept.opponents[0].memory["member"]).all()
 
 
 def test_a_mixture_acts_with_its_own_skill_in_a_match_of_several() -> None:

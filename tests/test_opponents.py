@@ -181,7 +181,8 @@ def test_the_trainer_sees_one_team(kind: str) -> None:
     inner = matches("go1football-2vs2", 2)
     env = versus(inner, ["random"]) if kind == "versus" else Mirror(inner)
     settings = {"ppo": {"epochs": 1, "ratio": "joint", "value": "joint"}, "stagger_episodes": True, "rollout_steps": 12}
-    config = build(TrainConfig, {**SETTINGS, **settings, "num_envs": env.num_envs})
+    settings |= {"num_envs": env.num_envs, "network": {"recurrent": False, "hidden_sizes": [8]}}
+    config = build(TrainConfig, {**SETTINGS, **settings})
     learner = make_learner(env, config)
     dims = needs_of(env, config).dims
     assert (dims.agents, dims.values) == (inner.num_agents // 2, 1)

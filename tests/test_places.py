@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_env import SMALL
 
 from mqe_jax.cli.arguments import parse
 from mqe_jax.envs import TASKS
 from mqe_jax.policies import load_policy, zoo
 from mqe_jax.runs.presets import named_config
 from mqe_jax.train.policy import save_policy
+from tests.fake_env import SMALL
 from tests.inputs import refuses
 
 TESTS = Path(__file__).parent
@@ -80,11 +80,16 @@ def test_only_drawing_needs_a_gl_library(tmp_path: Path) -> None:
     assert (tmp_path / "clip.png").stat().st_size
 
 
-@pytest.mark.parametrize("words", [["--help"], ["train", "--help"]])
-def test_help_needs_no_docstrings(words: list[str], tmp_path: Path) -> None:
-    code = f"import sys; from mqe_jax.cli import main; sys.exit(main({words}))"
+def test_help_needs_no_docstrings(tmp_path: Path) -> None:
+    code = """
+from contextlib import suppress
+from mqe_jax.cli import main
+for words in (["--help"], ["train", "--help"]):
+    with suppress(SystemExit):
+        main(words)
+"""
     said = run(code, tmp_path, env={**os.environ, "PYTHONOPTIMIZE": "2"}).stdout
-    assert ("--ppo.gae-lambda" if "train" in words else "usage: mqe COMMAND") in said
+    assert "usage: mqe COMMAND" in said and "--ppo.gae-lambda" in said
 
 
 def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

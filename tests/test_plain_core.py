@@ -149,7 +149,8 @@ def test_the_privileged_observation_has_everything_in_its_place() -> None:
     drawn = dataclasses.replace(drawn, action_lag=jnp.int32(2))
     anchors, clock = normal(1, 2), normal(2, 2)
     state = dataclasses.replace(state, data=data, anchors=anchors, randomized=drawn)
-    found = env.privileged_layout.split(env.privileged.observe(env.read(data), state, clock))
+    observe = jax.jit(lambda state: env.privileged.observe(env.read(state.data), state, clock))
+    found = env.privileged_layout.split(observe(state))
     q, v, sensors = (np.asarray(x) for x in (data.qpos, data.qvel, data.sensordata))
     expected: dict[str, Any] = {}
     force = lambda name: np.linalg.norm(sensors[model.sensor(name + "_force").adr[0] :][:3])  # noqa: E731
@@ -183,11 +184,12 @@ def test_the_privileged_observation_has_everything_in_its_place() -> None:
 
 def test_robots_fall_by_roll_and_pitch_of_either_sign_and_by_height() -> None:
     env: Any = make("go1gate", impl="c", num_envs=1, max_roll=0.6, max_pitch=0.4, min_height=0.2, max_height=0.9)
+    fallen = jax.jit(lambda data: env.fallen(env.read(data)))
     rows = ((0.59, 0.39, 0.21, False), (0.61, 0, 0.3, True), (-0.61, 0, 0.3, True), (0, 0.41, 0.3, True))
     for roll, pitch, height, falls in (*rows, (0, -0.41, 0.3, True), (0, 0, 0.19, True), (0, 0, 0.91, True)):
         position = [[1.0, 0.0, 0.5], [2.0, 0.0, height]]
         state = placed(env, position, [[0, 0, 0], [roll, pitch, 2.0]], state=initial(env))
-        assert env.fallen(env.read(state.data)).tolist() == [False, falls], (roll, pitch, height)
+        assert fallen(state.data).tolist() == [False, falls], (roll, pitch, height)
 
 
 def test_a_state_diverges_beyond_1000_in_either_direction() -> None:
@@ -254,9 +256,9 @@ def test_rotations_are_those_of_matrices() -> None:
 
 def test_an_ended_episode_is_replaced_whole_and_another_one_left_alone() -> None:
     env = made("go1tug")
-    shift = lambda tree, by: jax.tree.map(lambda x: x + by if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)  # noqa: E731
     state = initial(env)
-    fresh = dataclasses.replace(shift(state, 0.5), step=jnp.int32(3), key=jax.random.PRNGKey(9))
+    other = jax.tree.map(lambda x: x + np.float32(0.5) if x.dtype == np.float32 else x, jax.device_get(state))
+    fresh = dataclasses.replace(jax.tree.map(jnp.asarray, other), step=jnp.int32(3), key=jax.random.PRNGKey(9))
     for ended in (True, False):
         now = dataclasses.replace(state, truncated=jnp.array(ended), step=jnp.int32(7))
         after = autoreset(env, now, lambda key, assistance: fresh)
@@ -315,7 +317,7 @@ def test_time_limits_are_whole_steps() -> None:
 def test_a_recording_has_the_steps_of_the_last_episode(tmp_path: Path) -> None:
     env = made("go1plane")
     for steps, kept in (([3, 4, 0, 1, 0, 1, 2], 3), ([5, 6, 7], 3), ([0, 1], 2), ([7, 8, 9, 3, 4, 5], 3)):
-        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(steps), *x.shape)), initial(env))  # noqa: B023
+        states = jax.tree.map(lambda x: np.broadcast_to(x, (len(steps), *x.shape)), initial(env))  # noqa: B023
         states = dataclasses.replace(states, step=jnp.array(steps))
         actions = jnp.arange(len(steps) * 24.0).reshape(len(steps), 2, 12)
         replay.save_recording(tmp_path / "some.npz", env, states, actions[:, : env.num_agents])

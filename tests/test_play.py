@@ -128,7 +128,7 @@ def test_a_driven_robot_gets_the_readers_action_in_its_own_frame(built: SimpleNa
     state = state_arrays(jax.jit(built.env.reset)(jax.random.PRNGKey(1)))
     drive, action = jnp.array([[0.5, 0.5, 0.5, 1.0], [0.1, 0.2, 0.3, 1.0]]), -jnp.ones((2, 4))
     given = {"action": action, "drive": drive, "driven": jnp.array([0.0, 1.0]), "noise": jnp.zeros(2)}
-    command = functions.control({**state, **given})["command"]
+    command = jax.jit(functions.control)({**state, **given})["command"]
     expected = built.env.controller.skill_commands(jnp.stack([action[0], drive[1]]))
     np.testing.assert_allclose(command, expected)
     assert built.settings["commands"] == ["vx", "vy", "yaw_rate", "skill"]

@@ -8,7 +8,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from fake_env import FakeEnv
 from viewer import Driven, session
 
 from mqe_jax import cli
@@ -20,6 +19,7 @@ from mqe_jax.view.session import HOLD_TIME, Drive
 from mqe_jax.viz import cameras, framing, geometry, recording, render
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.recording import Episode
+from tests.fake_env import FakeEnv
 from tests.inputs import refuses
 from tests.states import initial, made, placed
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_env import SMALL
 
 from mqe_jax import cli
 from mqe_jax.cli import programs
@@ -22,6 +21,7 @@ from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
+from tests.fake_env import SMALL
 from tests.inputs import refuses
 from tests.training import Probe, Stop, largest_file, rows, settings, stop_after
 

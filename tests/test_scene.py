@@ -126,10 +126,10 @@ def test_poses_of_all_bodies_are_where_mujoco_puts_them(task: str) -> None:
 def test_stands_on_its_default_pose(name: str) -> None:
     robot = robots.get(name)
     env = make("go1plane", impl="c", control="position", robot=name, spawn_velocity=0.0, spawn_joint_scale=(1.0, 1.0))
-    state, step = env.reset(jax.random.PRNGKey(0)), jax.jit(env.step)
+    state, step = jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.jit(env.step)
     for _ in range(100):
-        state = step(state, jnp.zeros((env.num_agents, 12)))
-    robot_state = env.read(state.data)
+        state = step(state, np.zeros((env.num_agents, 12), np.float32))
+    robot_state = jax.jit(env.read)(state.data)
     assert not bool(state.terminated)
     assert float(jnp.abs(robot_state.euler[:, :2]).max()) < 0.1
     assert float(jnp.abs(robot_state.linear_velocity_w).max()) < 0.1
@@ -271,7 +271,9 @@ def test_engines_agree_where_motors_saturate(robot: str) -> None:
         env: Any = make("go1plane", impl=impl, control="torque", robot=robot, num_agents=1, num_envs=4)
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
         speed = 0.9 * env.robot.joint_speed_limit * jax.random.uniform(jax.random.PRNGKey(1), (4, 12), minval=-1.0)
-        data = state.data.replace(qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(speed))
+        qvel = np.array(state.data.qvel)
+        qvel[:, env.index.joint_qvel[0]] = speed
+        data = state.data.replace(qvel=jnp.asarray(qvel))
         torque = jnp.where(speed > 0, 1.0, -1.0) * env.robot.torque_limit
         step = jax.jit(jax.vmap(lambda d, t, env=env: env.physics.step(d, t)[0]))
         states[impl] = step.lower(data, torque).compile(compiler_options=QUICK)(data, torque)

@@ -36,8 +36,19 @@ NAMES = ("vx", "vy", "yaw_rate")
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("weights") / "agile.safetensors"
-    agile.NETWORKS.save(agile.NETWORKS.init(jax.random.PRNGKey(0)), path)
+    agile.NETWORKS.save(jax.jit(agile.NETWORKS.init)(jax.random.PRNGKey(0)), path)
     return str(path)
+
+
+def skill_commands(env: Any, policy: Any, obs: Any) -> np.ndarray:
+    """What the skills of the first team's agents are commanded by a policy (N, C), for observations (N, 1, O)."""
+
+    @jax.jit
+    def commands(obs: jax.Array) -> jax.Array:
+        action, _ = policy.act(obs, policy.initial_memory(len(obs)), jax.random.PRNGKey(2))
+        return env.controller.skill_commands(action.reshape(-1, action.shape[-1]))
+
+    return np.asarray(commands(obs))
 
 
 def controller(skill: str = "walk", commands: tuple[str, ...] = NAMES, **ranges: Any) -> Commander:
@@ -98,14 +109,7 @@ def test_scripted_policies_command_the_same_in_other_ranges(task: str, weights: 
     plain = make(task, impl="c", num_envs=1)
     wide = make(task, impl="c", num_envs=1, skill="agile", skill_weights=weights, command_ranges=WIDE)
     obs = 3.0 * jax.random.normal(jax.random.PRNGKey(1), (40, len(plain.teams[0]), plain.observation_size))
-    first, second = (
-        np.asarray(
-            env.controller.skill_commands(
-                load_policy("scripted", env).act(obs, (), jax.random.PRNGKey(0))[0].reshape(-1, 3)
-            )
-        )
-        for env in (plain, wide)
-    )
+    first, second = (skill_commands(env, load_policy("scripted", env), obs) for env in (plain, wide))
     np.testing.assert_allclose(second, first[:, :3], atol=1e-6)
     assert np.abs(first[:, :3]).max(0) == pytest.approx([1.0, 0.5, 0.5])
 
@@ -119,9 +123,8 @@ def test_npc_robots_keep_the_walk_policy(control: str, size: int, weights: str) 
     for env in (make("go1football-defender", **parameters), agile_env):
         state = jax.jit(env.reset)(jax.random.PRNGKey(0))
         assert env.controller.clock(state.control).shape == (3, 2)
-        sensed = env.read(state.data)
-        act = jax.jit(env.controller.targets)
-        target, control_state, commands = None, state.control, env.npc_commands(state, sensed)
+        act, sensed = jax.jit(env.controller.targets), jax.jit(env.read)(state.data)
+        target, control_state, commands = None, state.control, jax.jit(env.npc_commands)(state, sensed)
         for _ in range(3):
             target, control_state = act(control_state, jnp.ones((2, size)), sensed.proprioception, commands)
         targets.append(np.asarray(target))
@@ -176,7 +179,7 @@ def test_policies_of_other_needs_are_refused(
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
     batch = VectorEnv(make("go1plane", impl="c", num_envs=2, control="position", position_scale=2.0), 2)
-    small = {"total_steps": 16, "rollout_steps": 8, "ppo.minibatches": 1}
+    small = {"total_steps": 16, "rollout_steps": 8, "ppo.minibatches": 1, "network.recurrent": False}
     policy = learn(batch, small).policy
     assert policy.config.env == {"control": "position", "position_scale": 2.0}
     load_as("policy", policy, batch.env)
@@ -291,22 +294,20 @@ def test_scripted_and_idle_policies_use_the_first_skill(skill: Any) -> None:
     env = make(TASK, impl="c", num_envs=1, skill=skill)
     obs = jax.random.normal(jax.random.PRNGKey(1), (8, 1, env.observation_size))
     for name in ("scripted", "idle"):
-        action = load_policy(name, env).act(obs, (), jax.random.PRNGKey(0))[0][:, 0]
-        commands = env.controller.skill_commands(action)
+        commands = skill_commands(env, load_policy(name, env), obs)
         assert skill == "walk" or np.all(commands[:, -1] <= 0.0)
 
 
 def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     batch = VectorEnv(match, 4)
-    for wrapped in (batch, BothSides(batch)):
-        env = versus(wrapped, [policies["walk"], policies["agile"]])
-        own = load_as("policy", policies["agile"], match)
-        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-        action, _ = own.act(observations(state).to(own), own.initial_memory(4), jax.random.PRNGKey(1))
-        state = jax.jit(env.step)(state, action)
-        matches = state.match if wrapped is batch else state.match.inner
-        played = [[1, 0], [1, 1], [1, 0], [1, 1]] if wrapped is batch else [[1, 0], [1, 1], [0, 1], [1, 1]]
-        np.testing.assert_array_equal(matches.control.skill["acting"], played)
+    env, own = (
+        versus(BothSides(batch), [policies["walk"], policies["agile"]]),
+        load_as("policy", policies["agile"], match),
+    )
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    action = jax.jit(own.act)(observations(state).to(own), own.initial_memory(4), jax.random.PRNGKey(1))[0]
+    state = jax.jit(env.step)(state, action)
+    np.testing.assert_array_equal(state.match.inner.control.skill["acting"], [[1, 0], [1, 1], [0, 1], [1, 1]])
     team = TeamEnv(match, policies["agile"])
     state = jax.jit(team.step)(jax.jit(team.reset)(jax.random.PRNGKey(0)), jnp.zeros((1, 4)))
     np.testing.assert_array_equal(state.control.skill["acting"], [0, 1])

@@ -193,15 +193,18 @@ def test_folders_are_checked_before_the_first_cell_trains(make: Any, message: An
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_the_shipped_policies_can_be_planned_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    for part, cell, seed in (
+@pytest.mark.parametrize(
+    ("part", "cell", "seed"),
+    [
         ("published", "go1seesaw/*", 10),
-        ("matches", "go1bridge/*", 10),
+        pytest.param("matches", "go1bridge/*", 10, marks=pytest.mark.soak),
         ("scripted-responses", "go1tug/*", 20),
-    ):
-        sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", part)
-        assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=setup.check_start)
+    ],
+)
+def test_the_shipped_policies_can_be_planned_on_a_gpu(part: str, cell: str, seed: int, monkeypatch: Any) -> None:
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", part)
+    assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=setup.check_start)
 
 
 def test_a_cell_that_fails_is_named_and_the_others_are_trained(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:

@@ -15,8 +15,9 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from fake_env import FakeEnv
 from viewer import Client, Driven, free_port, open_page, session
+
+from tests.fake_env import FakeEnv
 
 pytest.importorskip("mjviser")
 

@@ -119,9 +119,9 @@ def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> Non
 
 def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
     file = tmp_path / "start.safetensors"
-    start = walk_policy.init_params(jax.random.PRNGKey(3))
+    start = jax.jit(walk_policy.init_params)(jax.random.PRNGKey(3))
     walk_policy.save_params(start, file)
-    params = WalkNetwork(weights=str(file)).build(DIMS).init(jax.random.PRNGKey(0))
+    params = jax.jit(WalkNetwork(weights=str(file)).build(DIMS).init)(jax.random.PRNGKey(0))
     jax.tree.map(np.testing.assert_array_equal, params["policy"], start)
     refuses(r"network.name: 'walk' is not allowed", WalkNetwork().build, DIMS._replace(agents=2))
 
@@ -168,7 +168,7 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
 
 
 def test_descending_the_loss_makes_a_policy_symmetric() -> None:
-    params = walk_policy.init_params(jax.random.PRNGKey(0))
+    params = jax.jit(walk_policy.init_params)(jax.random.PRNGKey(0))
     flat = jax.random.normal(jax.random.PRNGKey(1), (8, 2100))
 
     @jax.jit
@@ -182,7 +182,7 @@ def test_descending_the_loss_makes_a_policy_symmetric() -> None:
 
 
 AGILE = agile.AgileSkill(GO1)
-PARAMS = agile.NETWORKS.init(jax.random.PRNGKey(0))
+PARAMS = jax.jit(agile.NETWORKS.init)(jax.random.PRNGKey(0))
 STILL = override(AGILE_TASK, {"randomize": False})
 
 
@@ -248,7 +248,7 @@ def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
 def test_the_trained_network_acts_as_the_skill() -> None:
     env = WalkEnv(GO1, STILL, skill="agile", impl="c", num_envs=1)
     network = AgileNetwork().build(EnvDims(1, env.observation_size, env.privileged_observation_size, 12, 1))
-    params = network.init(jax.random.PRNGKey(1))
+    params = jax.jit(network.init)(jax.random.PRNGKey(1))
     state, seen, memory = (
         jax.jit(env.reset)(jax.random.PRNGKey(2)),
         network.initial_memory(1).actor,
@@ -272,7 +272,7 @@ def test_the_trained_network_acts_as_the_skill() -> None:
 def test_commands_fill_the_ranges_that_the_assistance_leaves(assistance: float, share: float) -> None:
     trainee = trainees.make("agile", GO1)
     keys = jax.random.split(jax.random.PRNGKey(0), 4000)
-    spec = jax.vmap(lambda key: sample_spec(key, AGILE_TASK, trainee, assistance))(keys)
+    spec = jax.jit(jax.vmap(lambda key: sample_spec(key, AGILE_TASK, trainee, assistance)))(keys)
     velocity = np.asarray(spec.commands[:, :3])
     for i, (low, high) in enumerate(AGILE.trained_ranges(("vx", "vy", "yaw_rate"))):
         assert share * low <= velocity[:, i].min() < 0.95 * share * low

@@ -113,7 +113,7 @@ def _flat(state: State) -> dict[str, Any]:
 
 def _restore(env: QuadrupedEnv, recording: Recording) -> State:
     """Returns the recording's first state on the engine of `env`."""
-    blank = env.reset(jax.random.PRNGKey(0))
+    blank = jax.jit(env.reset)(jax.random.PRNGKey(0))
     fields = content(blank)
     leaves = []
     for name, leaf in _flat(blank).items():

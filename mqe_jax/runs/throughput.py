@@ -79,7 +79,7 @@ def bench(
 
     Example:
         ```python
-        mqe_jax.bench("go1gate", num_envs=64, repeats=3)["env_steps_per_s"]
+        mqe_jax.bench("go1gate", num_envs=16, steps=20)["env_steps_per_s"]
         ```
 
     Args:

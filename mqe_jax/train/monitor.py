@@ -74,7 +74,7 @@ class Monitor:
 
         Those of the `absolute` metric are other episodes than those by which its policy was chosen.
         """
-        stacked = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *(policy.arrays for policy in policies))
+        stacked = _twice([policy.arrays for policy in policies])
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
         # The same random keys for every policy and training step, to reduce the variance of comparisons.
         key = jax.random.PRNGKey(self._config.seed)
@@ -89,6 +89,12 @@ class Monitor:
             }
             for i, steps in enumerate(env_steps)
         ]
+
+
+@jax.jit
+def _twice(trees: Sequence[Any]) -> Any:
+    """Returns trees as one with a leading axis, each tree twice in a row."""
+    return jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x), 2, axis=0), *trees)
 
 
 def _plain(result: Result) -> dict[str, Any]:

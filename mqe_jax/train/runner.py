@@ -137,7 +137,7 @@ class Training:
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stack(seeds.shared)
-        self._state = self._stacked.together(seeds.stack([state for state, _ in first]))
+        self._state = self._stacked.together(jax.jit(seeds.stack)([state for state, _ in first]))
         self._update = self._stacked.compile(seeds.map(learner.update), more=True)
         self.env_steps = int(first[0][0].updates) * self._config.steps_per_update  # done by each seed
         self.resumed = checkpoints[0] is not None

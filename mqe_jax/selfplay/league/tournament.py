@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mqe_jax.core.limits import NonNegativeInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check_arguments, fail
-from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, RandomKey, observations
+from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, Memory, Observations, RandomKey, observations
 from mqe_jax.envs import VectorEnv
 from mqe_jax.selfplay.league.games import Analysis, Estimate, Results, analyse, estimate, games_of, resample
 from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
@@ -31,40 +31,55 @@ _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 40
 
 
-@single
 @check_arguments(matches=AnyBatch, policy=AnyPolicy, key=RandomKey)
 def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns a policy's outcomes as team 0 against each of K opponents, in each environment's first episode (K, 3)."""
-    check_policy(policy, matches)
-    env = Versus(matches, opponents)
-
-    def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
-        state, memory, finished, outcome = carry
-        action, memory = policy.act(observations(state).to(policy), memory, key)
-        state = env.step(state, action)
-        done = state.terminated | state.truncated
-        now = state.outcome.result[:, 0] > 0
-        outcome = jnp.where((done & ~finished)[:, None], now, outcome)
-        return (state, memory, finished | done, outcome), None
-
-    @jax.jit
-    def run(key: jax.Array) -> jax.Array:
-        key, reset_key = jax.random.split(key)
-        count = matches.num_envs
-        nothing = jnp.zeros((count,), bool), jnp.zeros((count, 3), bool)
-        start = env.reset(reset_key), policy.initial_memory(count), *nothing
-        (_, _, _, outcome), _ = jax.lax.scan(advance, start, jax.random.split(key, matches.max_episode_steps))
-        return outcome
-
-    return np.asarray(run(key)).reshape(-1, len(opponents), 3).sum(axis=0)
+    return _play(matches, [policy], opponents, [key])[0]
 
 
 @check_arguments(matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey)
 def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
     """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `RESULTS`."""
-    keys = jax.random.split(key, len(policies))
     teams = list(policies.values())
-    return np.stack([play(matches, policy, teams, k) for policy, k in zip(teams, keys, strict=True)])
+    return _play(matches, teams, teams, jax.random.split(key, len(teams)))
+
+
+@single
+def _play(matches: VectorEnv, policies: Sequence[Policy], opponents: Sequence[Policy], keys: Any) -> NDArray[np.int64]:
+    """Returns the outcomes of each of P policies as team 0, with its key, against each of K opponents (P, K, 3).
+
+    One compiled program serves all policies.
+    """
+    for policy in policies:
+        check_policy(policy, matches)
+    env, count = Versus(matches, opponents), matches.num_envs
+
+    def turn(i: int, seen: Observations, memories: tuple[Memory, ...], key: jax.Array) -> tuple[jax.Array, Any]:
+        action, memory = policies[i].act(seen.to(policies[i]), memories[i], key)
+        return action, (*memories[:i], memory, *memories[i + 1 :])
+
+    turns = [functools.partial(turn, i) for i in range(len(policies))]
+
+    @jax.jit
+    def run(number: jax.Array, key: jax.Array) -> jax.Array:
+        def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
+            state, memories, finished, outcome = carry
+            action, memories = jax.lax.switch(number, turns, observations(state), memories, key)
+            state = env.step(state, action)
+            done = state.terminated | state.truncated
+            now = state.outcome.result[:, 0] > 0
+            outcome = jnp.where((done & ~finished)[:, None], now, outcome)
+            return (state, memories, finished | done, outcome), None
+
+        key, reset_key = jax.random.split(key)
+        memories = tuple(policy.initial_memory(count) for policy in policies)
+        nothing = jnp.zeros((count,), bool), jnp.zeros((count, 3), bool)
+        start = env.reset(reset_key), memories, *nothing
+        (_, _, _, outcome), _ = jax.lax.scan(advance, start, jax.random.split(key, matches.max_episode_steps))
+        return outcome
+
+    outcomes = np.stack([run(jnp.int32(number), key) for number, key in enumerate(keys)])
+    return outcomes.reshape(len(policies), -1, len(opponents), 3).sum(axis=1)
 
 
 @check_arguments(results=Results)
