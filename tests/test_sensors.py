@@ -276,6 +276,8 @@ def test_sensors_of_the_second_team_are_mirrored_as_its_frame(task: str) -> None
         blocks, _ = sense(env, sensor)(state, sensor.init_memory(env.suite.scene))
         for name, (first, second) in blocks.items():
             np.testing.assert_allclose(first, second, atol=1e-5, err_msg=name)
+    for name, (first, second) in env.observe_group("proprioception", state, env.read(state.data)).items():
+        np.testing.assert_allclose(first, second, atol=1e-5, err_msg=name)
 
 
 def test_senses_add_a_group_and_change_nothing_else() -> None:

@@ -101,6 +101,15 @@ class Match(QuadrupedEnv[S, P]):
     def own_frame(self, info: jax.Array) -> jax.Array:
         return self.views(info)[self.team_of, np.arange(self.num_agents)]
 
+    def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
+        """Blocks (A, width), each in its agent's own frame."""
+        blocks = super().observe_group(name, state, robot_state)
+        if not self.reflected:
+            return blocks
+        image = {"gravity": blocks["gravity"] * np.array([1.0, -1.0, 1.0], np.float32)}
+        image |= {x: blocks[x][:, MIRRORED_JOINTS] * MIRRORED_SIGNS for x in ("joint_position", "joint_velocity")}
+        return {x: jnp.where(self.team_of[:, None] == 1, image[x], blocks[x]) for x in blocks}
+
     def unmirror_action(self, action: jax.Array) -> jax.Array:
         """Reflects the actions (A, action_size) of team 1 where its frame is reflected."""
         if self.symmetry == "turn":
