@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.cli.train import parse_train
+from mqe_jax.core.blocks import Block, entities
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory, Params
 from mqe_jax.physics.robots.go1 import GO1
@@ -160,6 +161,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
         {"recurrent": False, "hidden_sizes": (4, 4), "action_mean": "tanh", "activation": "elu"},
         {"recurrent": True, "gru_size": 4, "hidden_sizes": (4,), "openrl_layers": True, "share_policy": False},
     ],
+    "blocks": [{"gru_size": 4, "hidden_sizes": (4,), "entity_sizes": (4,), "chunk_length": 2}],
     "mat": [{"width": 8, "heads": 2, "blocks": 1}],
     "walk": [{"chunk_length": 2}],
     "agile": [{"chunk_length": 2}],
@@ -194,7 +196,9 @@ def probe(network: str) -> Any:
     show = functools.partial(show_widely, width)
     teams = (tuple(range(agents)),)
     env = Probe(show, pay_each, 4, agents, action_size=12, features=width, max_episode_steps=3, teams=teams)
-    for name, value in {"dt": 0.02, "control": "torque", "robot": GO1}.items():
+    blocks = (Block("one_hot", 2), entities("pair", "robot", 2, 1, masked=True), Block("rest", 1))
+    described = {"describe": lambda group: {"blocks": blocks}} if network == "blocks" else {}
+    for name, value in {"dt": 0.02, "control": "torque", "robot": GO1, **described}.items():
         object.__setattr__(env, name, value)
     return env
 

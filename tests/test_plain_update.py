@@ -67,7 +67,7 @@ class Teacher:
     def initial_memory(self, num_envs: int) -> tuple[()]:
         return ()
 
-    def act(self, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+    def act(self, obs: Any, memory: Any, key: Any) -> tuple[jax.Array, Any]:
         return jnp.sin(obs[..., -2:]), memory
 
 
@@ -123,6 +123,8 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         terminated=done & (random.random((T, N)) < 0.6),
         done=done,
     )
+    if config.imitation.teacher:
+        transitions = transitions._replace(teacher_action=Teacher().act(transitions.obs, (), None)[0])
     state, transitions = jax.tree.map(jnp.asarray, (state, transitions))
     return (env, state), transitions
 

@@ -1,10 +1,14 @@
-"""Blocks of an observation: what its entries are."""
+"""Blocks of an observation: what its entries are; it imports no JAX before it is needed."""
+
+from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+
+if TYPE_CHECKING:
+    import jax
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,5 +63,7 @@ def image(name: str, height: int, width: int, meaning: str = "") -> Block:
 
 def by_entity(values: jax.Array, there: jax.Array) -> jax.Array:
     """Returns a masked block (A, count (width + 1)) from entries (A, count, width) and who is there (A, count)."""
+    import jax.numpy as jnp
+
     rows = jnp.concatenate([jnp.where(there[..., None], values, 0.0), there[..., None].astype(values.dtype)], axis=-1)
     return rows.reshape(len(rows), -1)

@@ -240,6 +240,15 @@ def differences(settings: Any, default: Any) -> dict[str, Any]:
     return found
 
 
+def leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the dotted names and values of nested settings."""
+    for name, value in mapping.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
 def merge(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
     """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
 

@@ -310,6 +310,7 @@ class Transition(NamedTuple):
     learners: jax.Array  # active agents from whose samples the policy learns (N, A) bool
     terminated: jax.Array  # whether the episode terminated (N,) bool
     done: jax.Array  # whether it was terminated or truncated (N,) bool
+    teacher_action: Any = ()  # actions of the teacher, as the environment would get them (N, A, D); empty without one
 
 
 class Batch(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout, box
 from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.returned import weights_of
@@ -153,7 +155,10 @@ class Task(Sensing, Generic[S, P]):
     def describe(self, group: str) -> dict[str, Any]:
         """Returns what policies that see a group of observations need of the task, beside its name and sizes."""
         layout = {"policy": self.observation_layout, **self.groups}[group]
-        return {"version": self.version, **self.params.actions(self.control), "layout": str(layout)}
+        blocks = tuple(dataclasses.replace(block, meaning="") for block in layout.blocks)
+        senses = tuple(to_mapping(sensor) for sensor in self.params.senses) if group == ONBOARD else ()
+        described = {"version": self.version, **self.params.actions(self.control), "senses": senses}
+        return {**described, "layout": str(layout), "blocks": blocks}
 
     def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of one of `groups` by name (A, width)."""

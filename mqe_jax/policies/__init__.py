@@ -216,6 +216,8 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
 def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
     """Returns the parameters, and the control mode, in which what policies need differs from a task's defaults.
 
+    These include the sensors of policies that see them.
+
     Policies of different skills get those with which they can meet. The sources are policies, or what `load_policy`
     accepts; those that are no trained policy of the task need nothing, but the scripted member of a population needs
     the task's default skill, so that it is the same opponent for all.
@@ -235,6 +237,7 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
     for needs in every:
         usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
         asked = {name: value for name in usual if (value := getattr(needs, name)) != usual[name]}
+        asked |= {"senses": needs.senses} if needs.senses else {}
         params = asked | {name: value for name, value in params.items() if value is not None}
     commanding = scripted if all(needs.control == "command" for needs in every) else []
     return params | together([*(needs.by_name() for needs in every), *commanding])

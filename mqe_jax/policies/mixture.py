@@ -60,11 +60,9 @@ class Mixture:
         for name, value in {"members": members, "weights": weights}.items():
             object.__setattr__(self, name, value)
         check("metadata", self.metadata, Mapping[str, Any])
-        own = self.needs.by_name()
         for i, member in enumerate(self.members):
-            for name, value in member.needs.by_name().items():
-                if value != own[name]:
-                    fail("members", f"{name} {value!r} of member {i}", f"that of member 0, {own[name]!r}")
+            for name, (own, other) in self.needs.mismatches(member.needs).items():
+                fail("members", f"{name} {other!r} of member {i}", f"that of member 0, {own!r}")
 
     def __repr__(self) -> str:
         shares = ", ".join(f"{100 * weight:.0f}%" for weight in self.weights)

@@ -12,17 +12,18 @@ from mqe_jax.core import devices
 from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.train import nn
+from mqe_jax.train.encoder import Encoder, of_team, plain
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import ActorCritic, ChunkResult, EnvDims, Network
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu, "elu": jax.nn.elu, "tanh": jnp.tanh}
 
 
-def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, settings: ActorCritic) -> Params:
+def _trunk_init(key: jax.Array, encoder: Encoder, n_out: int, final_scale: float, settings: ActorCritic) -> Params:
     hidden_key, gru_key, head_key = jax.random.split(key, 3)
     width = settings.hidden_sizes[-1]
     params: Params = {
-        "hidden": nn.mlp_init(hidden_key, (n_in, *settings.hidden_sizes), final_scale=math.sqrt(2.0)),
+        "hidden": nn.mlp_init(hidden_key, (encoder.size, *settings.hidden_sizes), final_scale=math.sqrt(2.0)),
         "head": nn.dense_init(head_key, settings.gru_size if settings.recurrent else width, n_out, final_scale),
     }
     if settings.recurrent:
@@ -31,6 +32,8 @@ def _trunk_init(key: jax.Array, n_in: int, n_out: int, final_scale: float, setti
         params["linear"] = nn.dense_init(jax.random.fold_in(hidden_key, 1), width, width)
         widths = (*settings.hidden_sizes, width, *((settings.gru_size,) if settings.recurrent else ()))
         params["norm"] = {str(i): nn.layer_norm_init(size) for i, size in enumerate(widths)}
+    if encoded := encoder.init(jax.random.fold_in(key, 1)):
+        params["encoder"] = encoded
     return params
 
 
@@ -45,10 +48,10 @@ def _hidden(params: Params, x: jax.Array, settings: ActorCritic) -> jax.Array:
 
 
 def _trunk(
-    params: Params, memory: Memory, is_first: jax.Array, x: jax.Array, settings: ActorCritic
+    params: Params, memory: Memory, is_first: jax.Array, x: jax.Array, encoder: Encoder, settings: ActorCritic
 ) -> tuple[jax.Array, Memory]:
     """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ..., n_out), memory."""
-    x = _hidden(params, x, settings)
+    x = _hidden(params, encoder.apply(params.get("encoder", {}), x), settings)
     if settings.recurrent:
 
         def step(h: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -62,7 +65,9 @@ def _trunk(
     return nn.dense(params["head"], x), memory
 
 
-def network(settings: ActorCritic, dims: EnvDims) -> Network:
+def network(settings: ActorCritic, dims: EnvDims, encoder: Encoder | None = None) -> Network:
+    """Returns the network; `encoder` is that of an agent's observation, by default none."""
+    encoder = encoder or plain(dims.observation)
     agents, share = dims.agents, settings.share_policy
     own = settings.critic_input == "own"
     if own and dims.values != agents:
@@ -70,8 +75,8 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
     if settings.critic_input == "privileged" and not dims.privileged:
         fail("network.critic_input", "privileged", "'observations' or 'own': there is no privileged observation")
     critic_rows = agents if own else 1
-    sizes = {"privileged": dims.privileged, "observations": agents * dims.observation, "own": dims.observation}
-    critic_in = sizes[settings.critic_input]
+    encoders = {"privileged": plain(dims.privileged), "observations": of_team(encoder, agents), "own": encoder}
+    critic_encoder = encoders[settings.critic_input]
     critic_out = 1 if own else dims.values
     critic_shared = share or not own
 
@@ -79,10 +84,10 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         actor_key, critic_key = jax.random.split(key)
 
         def actor_init(k: jax.Array) -> Params:
-            return _trunk_init(k, dims.observation, dims.action, settings.action_gain, settings)
+            return _trunk_init(k, encoder, dims.action, settings.action_gain, settings)
 
         def critic_init(k: jax.Array) -> Params:
-            return _trunk_init(k, critic_in, critic_out, 1.0, settings)
+            return _trunk_init(k, critic_encoder, critic_out, 1.0, settings)
 
         if not share:
             actor_key = jax.random.split(actor_key, agents)
@@ -106,8 +111,10 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
             critic=jnp.zeros((num_envs, critic_rows, settings.gru_size)),
         )
 
-    def run(params: Params, shared: bool, memory: Memory, is_first: jax.Array, x: jax.Array) -> Any:
-        trunk = functools.partial(_trunk, settings=settings)
+    def run(
+        params: Params, encoder: Encoder, shared: bool, memory: Memory, is_first: jax.Array, x: jax.Array
+    ) -> tuple[jax.Array, Memory]:
+        trunk: Any = functools.partial(_trunk, encoder=encoder, settings=settings)
         if not shared:  # a set of parameters for each agent
             trunk = jax.vmap(trunk, in_axes=(0, -2, -1, -2), out_axes=(-2, -2))
         return trunk(params, memory, jnp.broadcast_to(is_first[..., None], x.shape[:-1]), x)
@@ -115,7 +122,7 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
     def distribution(
         params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array
     ) -> tuple[jax.Array, jax.Array, Memory]:
-        mean, memory = run(params["actor"], share, memory, is_first, obs)
+        mean, memory = run(params["actor"], encoder, share, memory, is_first, obs)
         if settings.action_mean == "tanh":
             mean = jnp.tanh(mean)
         log_std = settings.bounded_log_std(params["log_std"])
@@ -138,10 +145,10 @@ def network(settings: ActorCritic, dims: EnvDims) -> Network:
         if settings.critic_input == "privileged":
             x = privileged[..., None, :]
         elif settings.critic_input == "observations":
-            x = obs.reshape(*obs.shape[:-2], 1, critic_in)
+            x = obs.reshape(*obs.shape[:-2], 1, agents * dims.observation)
         else:
             x = obs
-        out, memory = run(params["critic"], critic_shared, memory, is_first, x)
+        out, memory = run(params["critic"], critic_encoder, critic_shared, memory, is_first, x)
         return out.reshape(*out.shape[:-2], critic_rows * critic_out), memory
 
     def evaluate(

@@ -52,12 +52,9 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
 
 
 def check_teacher(config: TrainConfig, teacher: Any) -> None:
-    """Checks that there is a teacher if the settings name one, and that it has no recurrent state."""
-    name = config.imitation.teacher
-    if getattr(teacher, "groups", ()) not in ((), (config.group,)):
-        fail("imitation.teacher", name, f"a policy that sees the group {config.group!r}")
-    if (name is None) != (teacher is None) or (teacher is not None and jax.tree.leaves(teacher.initial_memory(1))):
-        fail("imitation.teacher", name, "a policy without recurrent state, which is the learner's argument `teacher`")
+    """Checks that there is a teacher if and only if the settings name one."""
+    if (config.imitation.teacher is None) != (teacher is None):
+        fail("imitation.teacher", config.imitation.teacher, "a policy, which is the learner's argument `teacher`")
 
 
 def check_divisible(config: TrainConfig, network: Network, processes: int = 1) -> None:

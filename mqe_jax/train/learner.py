@@ -31,6 +31,7 @@ from mqe_jax.train.checks import check_divisible, check_environment, check_teach
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import (
+    Features,
     ValueStatistics,
     running_init,
     running_update,
@@ -88,7 +89,7 @@ def make_learner(
     if not (isinstance(stages, type) and issubclass(stages, Stages)):
         fail("stages", stages, "a subclass of mqe_jax.train.stages.Stages")
     dims = needs_of(env, config).dims
-    network = config.network.build(dims)
+    network, features = config.network.build(dims), config.network.features(dims)
     check_divisible(config, network, processes)
     algorithm = stages(network, config)
 
@@ -104,7 +105,9 @@ def make_learner(
             TrainState(
                 params=params,
                 optimizer=algorithm.optimizer.init(params),
-                obs_normalizer=ObservationNormalizer(running_init(dims.observation), running_init(dims.privileged)),
+                obs_normalizer=ObservationNormalizer(
+                    running_init(dims.observation, features), running_init(dims.privileged)
+                ),
                 value_normalizer=value_init(config.normalization.values),
                 learning_rate=jnp.float32(config.optimizer.learning_rate),
                 rollout=RolloutState(
@@ -113,6 +116,7 @@ def make_learner(
                     is_first=jnp.ones((env.num_envs,), bool),
                     episode_steps=jnp.zeros((env.num_envs,), jnp.int32),
                     episode_return=jnp.zeros((env.num_envs,)),
+                    teacher_memory=() if teacher is None else teacher.initial_memory(env.num_envs),
                 ),
                 key=key,
                 updates=jnp.zeros((), jnp.int32),
@@ -134,12 +138,14 @@ def make_learner(
             rollout_key,
             config.rollout_steps,
             normalize=config.normalization.observations,
+            features=features,
             action_scale=config.action_scale,
             group=config.group,
+            teacher=teacher,
         )
-        batch, value_normalizer, batch_metrics = _prepare(algorithm, now, state, transitions)
+        batch, value_normalizer, batch_metrics = _prepare(algorithm, now, state, transitions, features)
         if teacher is not None:
-            shown = _teacher_actions(teacher, transitions.obs) / config.action_scale
+            shown = transitions.teacher_action / config.action_scale
             batch = batch._replace(teacher_action=chunks(shown, network.chunk_length))
         carry = state.params, begun_anew(state.optimizer, now.actor_begins), state.learning_rate
         carry, loss_metrics = algorithm.update(carry, batch, now, epoch_key)
@@ -149,7 +155,7 @@ def make_learner(
         if config.normalization.observations:
             some = jnp.any(transitions.active, axis=-1)
             obs_normalizer = ObservationNormalizer(
-                running_update(obs_normalizer.obs, transitions.obs, transitions.learners),
+                running_update(obs_normalizer.obs, transitions.obs, transitions.learners, features),
                 running_update(obs_normalizer.privileged, transitions.privileged_obs, some),
             )
         new_state = TrainState(
@@ -191,15 +197,8 @@ def _strongly_typed(state: TrainState) -> TrainState:
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), state)
 
 
-def _teacher_actions(teacher: Any, obs: jax.Array) -> jax.Array:
-    """Returns the teacher's actions (T, N, A, D) for observations (T, N, A, O)."""
-    flat = obs.reshape(-1, *obs.shape[2:])
-    action, _ = teacher.act(flat, teacher.initial_memory(len(flat)), jax.random.PRNGKey(0))
-    return action.reshape(*obs.shape[:2], *action.shape[1:])
-
-
 def _prepare(
-    stages: Stages, now: Scheduled, state: TrainState, transitions: Transition
+    stages: Stages, now: Scheduled, state: TrainState, transitions: Transition, features: Features | None
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
@@ -209,13 +208,15 @@ def _prepare(
     network, config = stages.network, stages.config
     active, normalize = transitions.active, config.normalization.observations
     obs, privileged = normalize_obs(
-        state.obs_normalizer, transitions.obs, transitions.privileged_obs, active, normalize
+        state.obs_normalizer, transitions.obs, transitions.privileged_obs, active, normalize, features
     )
     # What the critic does not read may be missing; these observations take its place.
     last = transitions.obs if transitions.final_obs is None else transitions.final_obs
     last_privileged = transitions.final_privileged_obs
     last_privileged = transitions.privileged_obs if last_privileged is None else last_privileged
-    final_obs, final_privileged = normalize_obs(state.obs_normalizer, last, last_privileged, active, normalize)
+    final_obs, final_privileged = normalize_obs(
+        state.obs_normalizer, last, last_privileged, active, normalize, features
+    )
     pair, _ = network.value(
         state.params,
         transitions.memory.critic,

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mqe_jax.core.limits import PositiveInt
-from mqe_jax.core.settings import FrozenMapping, Range, check_arguments, fail, record
+from mqe_jax.core.settings import FrozenMapping, Parameters, Range, check_arguments, fail, leaves, record
 from mqe_jax.core.types import AnyEnvironment, teams_of
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
@@ -39,14 +39,29 @@ class Needs:
     """Group of observations that the policy sees."""
     layout: str | None = None
     """Blocks of these observations in order, with their widths."""
+    senses: tuple[Parameters, ...] = ()
+    """Settings of the sensors that make these observations."""
     dims: EnvDims
     """Sizes; those that only the critic reads may differ."""
 
     def by_name(self) -> dict[str, Any]:
-        """Returns what must be equal in an environment, by name."""
-        names = ("version", *ACTIONS, "group", "layout")
-        sizes = {"observation": self.dims.observation, "action": self.dims.action}
-        return {"task": self.task, "agents": self.dims.agents, **{x: getattr(self, x) for x in names}, **sizes}
+        """Returns what must be equal in an environment, by name.
+
+        These include each setting of the sensors, and the form of blocks of entities and images, where it is known.
+        """
+        names = ("version", *ACTIONS, "group")
+        needs = {"task": self.task, "agents": self.dims.agents, **{x: getattr(self, x) for x in names}}
+        sensors = {sensor["name"]: sensor for sensor in self.senses}
+        needs |= {"senses": tuple(sensors)} | dict(leaves(sensors, "senses."))
+        forms = {f"layout.{block.name}": block.entities or block.image for block in self.dims.blocks}
+        needs |= {"layout": self.layout} | {name: form for name, form in forms.items() if form}
+        return needs | {"observation": self.dims.observation, "action": self.dims.action}
+
+    def mismatches(self, found: "Needs") -> dict[str, tuple[Any, Any]]:
+        """Returns what these needs and those of an environment differ in: the values of both by name."""
+        own, other = self.by_name(), found.by_name()
+        known = [x for x in dict.fromkeys((*own, *other)) if self.dims.blocks or not x.startswith("layout.")]
+        return {x: (own.get(x), other.get(x)) for x in known if own.get(x) != other.get(x)}
 
 
 @check_arguments(env=AnyEnvironment, config=TrainConfig)
@@ -59,12 +74,13 @@ def needs_of(env: Any, config: TrainConfig) -> Needs:
     if config.group not in sizes:
         fail("group", config.group, f"one of {env.name}: {', '.join(sizes)}")
     task, agents = getattr(env, "env", env), len(teams_of(env)[0])
+    described = task.describe(config.group) if hasattr(task, "describe") else {}
     dims = EnvDims(
         agents=agents,
         observation=sizes[config.group],
         privileged=env.privileged_observation_size,
         action=env.action_size,
         values=1 if config.ppo.value == "joint" else agents,
+        blocks=described.pop("blocks", ()),
     )
-    described = task.describe(config.group) if hasattr(task, "describe") else {}
     return Needs(task=env.name, group=config.group, dims=dims, **described)

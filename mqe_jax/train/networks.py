@@ -22,6 +22,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 
+from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import nearest
 from mqe_jax.core.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
 from mqe_jax.core.settings import build, check, fail, record
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     import jax
 
     from mqe_jax.core.types import Memory, NetworkMemory, Params
+    from mqe_jax.train.normalize import Features
 
 
 class EnvDims(NamedTuple):
@@ -41,6 +43,8 @@ class EnvDims(NamedTuple):
     action: PositiveInt
     values: PositiveInt
     """Number of values V: one per agent, or one of the team."""
+    blocks: tuple[Block, ...] = ()
+    """What an agent's observation consists of; empty if the environment does not describe it."""
 
 
 class ChunkResult(NamedTuple):
@@ -92,6 +96,10 @@ class NetworkSettings:
     def critic_reads(self) -> tuple[str, ...]:
         """The observations on which `Network.value` depends; others may be missing at the end of a step."""
         return "obs", "privileged_obs"
+
+    def features(self, dims: EnvDims) -> Features | None:
+        """Returns which statistics normalise the entries of an observation; None: each entry has its own."""
+        return None
 
     def build(self, dims: EnvDims) -> Network:
         """Returns the network for an environment; InputError if the settings do not fit it."""
@@ -200,6 +208,32 @@ class ActorCritic(GaussianSettings):
         from mqe_jax.train import actor_critic
 
         return actor_critic.network(self, dims)
+
+
+@register_network("blocks")
+class Blocks(ActorCritic):
+    """Settings of an actor and critic that encode an observation by its blocks, as the layout describes them.
+
+    Entities of one kind share parameters, so that the sizes of the actor do not depend on their number; convolutions
+    encode images. Entities of a kind share the statistics of their features, and masks and pixels have none.
+    """
+
+    entity_sizes: Widths = (64, 64)
+    """Widths of the layers that encode each entity; maxima and means over a block's entities follow."""
+    image_channels: Widths = (16, 32)
+    """Channels of the convolutions of images, each of which halves height and width."""
+    image_size: Width = 64
+    """Width of the layer after the convolutions."""
+
+    def features(self, dims: EnvDims) -> Features:
+        from mqe_jax.train.normalize import features_of
+
+        return features_of(dims.blocks)
+
+    def build(self, dims: EnvDims) -> Network:
+        from mqe_jax.train import actor_critic, encoder
+
+        return actor_critic.network(self, dims, encoder.by_block(self, dims))
 
 
 @register_network("mat")

@@ -1,41 +1,85 @@
 """Running statistics: of all observations, and exponentially averaged ones of value targets."""
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.core import devices
+from mqe_jax.core.blocks import Block
 
 _OBSERVATION_MIN_STD = 1e-2
 _VALUE_MIN_STD = 1e-3  # of the root mean square
 _TINY = 1e-12
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Features:
+    """Which statistics normalise the entries of an observation: entries of one feature share them."""
+
+    index: np.ndarray
+    """Feature of each entry (size,); `count` for entries that are not normalised."""
+    mask: np.ndarray
+    """Entry that says whether an entry counts (size,); `size` if it always does."""
+    count: int
+    """Number of features F."""
+
+
+def features_of(blocks: Sequence[Block]) -> Features:
+    """Returns the features of blocks: entities of a kind share theirs; masks and pixels are not normalised."""
+    names: dict[tuple[str, int, int], int] = {}
+    index, mask = [], []
+    size = sum(block.width for block in blocks)
+    for block in blocks:
+        entities, start = block.entities, len(index)
+        length = block.width if entities is None else entities.width + entities.masked
+        for entry in range(block.width):
+            column = entry % length
+            hidden = block.image is not None or (entities is not None and column == entities.width)
+            kind = ("", start, entry) if entities is None else (entities.kind, entities.width, column)
+            index.append(-1 if hidden else names.setdefault(kind, len(names)))
+            masked = entities is not None and entities.masked and not hidden
+            mask.append(start + entry - column + length - 1 if masked else size)
+    count = len(names)
+    return Features(np.where(np.array(index, int) < 0, count, index), np.array(mask, int), count)
+
+
 class RunningStatistics(NamedTuple):
-    """Mean and variance (size,) of all samples so far and their number () float32."""
+    """Mean and variance (size,) of all samples so far, and their number () float32.
+
+    With `Features` of each of these (F,).
+    """
 
     mean: jax.Array
     variance: jax.Array
     samples: jax.Array
 
 
-def running_init(size: int) -> RunningStatistics:
+def running_init(size: int, features: Features | None = None) -> RunningStatistics:
     """Returns statistics that leave data unchanged until the first update."""
-    return RunningStatistics(jnp.zeros((size,)), jnp.ones((size,)), jnp.zeros(()))
+    shape = (size,) if features is None else (features.count,)
+    return RunningStatistics(jnp.zeros(shape), jnp.ones(shape), jnp.zeros(() if features is None else shape))
 
 
-def running_update(statistics: RunningStatistics, batch: jax.Array, active: jax.Array) -> RunningStatistics:
+def running_update(
+    statistics: RunningStatistics, batch: jax.Array, active: jax.Array, features: Features | None = None
+) -> RunningStatistics:
     """Merges the samples (..., size) of a batch that are active (...) bool into the statistics.
 
     Source: Chan, Golub and LeVeque 1979, the parallel form of Welford's algorithm.
     """
     batch = batch.reshape(math.prod(batch.shape[:-1]), batch.shape[-1])
     mask = jnp.broadcast_to(active.reshape(-1, 1), batch.shape)
-    batch_samples = devices.total(jnp.sum(active.astype(jnp.float32)))
-    batch_mean = devices.mean_where(batch, mask, axis=0)
-    batch_variance = devices.variance(batch, mask, axis=0)
+    if features is None:
+        batch_samples = devices.total(jnp.sum(active.astype(jnp.float32)))
+        batch_mean = devices.mean_where(batch, mask, axis=0)
+        batch_variance = devices.variance(batch, mask, axis=0)
+    else:
+        batch_samples, batch_mean, batch_variance = _moments(batch, mask, features)
     samples = statistics.samples + batch_samples
     fraction = batch_samples / jnp.maximum(samples, 1.0)
     shift = batch_mean - statistics.mean
@@ -48,10 +92,27 @@ def running_update(statistics: RunningStatistics, batch: jax.Array, active: jax.
     return RunningStatistics(mean, variance, samples)
 
 
-def running_normalize(statistics: RunningStatistics, x: jax.Array) -> jax.Array:
+def _moments(batch: jax.Array, mask: jax.Array, features: Features) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns number, mean and variance of each feature (F,) in a batch (B, size), of entries with a mask (B, size)."""
+    one_hot = np.asarray(features.index[:, None] == np.arange(features.count), np.float32)
+
+    def by_feature(x: jax.Array) -> jax.Array:
+        return devices.total(jnp.matmul(jnp.sum(x, axis=0), one_hot, precision="highest"))
+
+    mask = mask & (jnp.pad(batch, ((0, 0), (0, 1)), constant_values=1.0)[:, features.mask] > 0.5)
+    samples = by_feature(mask.astype(jnp.float32))
+    mean = by_feature(jnp.where(mask, batch, 0.0)) / jnp.maximum(samples, 1.0)
+    deviation = jnp.where(mask, batch - jnp.append(mean, 0.0)[features.index], 0.0)
+    return samples, mean, by_feature(jnp.square(deviation)) / jnp.maximum(samples, 1.0)
+
+
+def running_normalize(statistics: RunningStatistics, x: jax.Array, features: Features | None = None) -> jax.Array:
     """Returns x (..., size) normalised to mean 0 and deviation 1, clipped to +-10; constant entries become 0."""
-    std = jnp.maximum(jnp.sqrt(statistics.variance), _OBSERVATION_MIN_STD)
-    return jnp.clip((x - statistics.mean) / std, -10.0, 10.0)
+    mean, variance = statistics.mean, statistics.variance
+    if features is not None:
+        mean, variance = (jnp.append(y, own)[features.index] for y, own in ((mean, 0.0), (variance, 1.0)))
+    std = jnp.maximum(jnp.sqrt(variance), _OBSERVATION_MIN_STD)
+    return jnp.clip((x - mean) / std, -10.0, 10.0)
 
 
 class ValueStatistics(NamedTuple):

@@ -203,7 +203,7 @@ def _template(dims: EnvDims, settings: NetworkSettings) -> dict[str, Any]:
 
     def arrays() -> dict[str, Any]:
         params = network.policy_params(network.init(jax.random.PRNGKey(0)))
-        return {"params": params, "normalizer": running_init(dims.observation)}
+        return {"params": params, "normalizer": running_init(dims.observation, settings.features(dims))}
 
     return jax.eval_shape(arrays)
 
@@ -214,14 +214,14 @@ def policy_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> Any
 
     It returns the action and the next recurrent state.
     """
-    network = settings.build(dims)
+    network, features = settings.build(dims), settings.features(dims)
 
     @jax.jit
     def act(
         arrays: PolicyArrays, obs: jax.Array, memory: Memory, key: jax.Array | None, active: jax.Array | None = None
     ) -> tuple[jax.Array, Memory]:
         if normalize:
-            obs = running_normalize(arrays.normalizer, obs)
+            obs = running_normalize(arrays.normalizer, obs, features)
         if active is not None:
             obs = jnp.where(active[..., None], obs, 0.0)
         action, _, memory = network.act(arrays.params, memory, obs, key, active)
@@ -258,17 +258,20 @@ def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "p
         InputError: naming `field`, the policy and what differs, with the values of both.
     """
     check("policy", policy, AnyPolicy)
-    needs = {"task": policy.task, "agents": policy.agents}
-    found: dict[str, Any] = {"task": env.name, "agents": len(teams_of(env)[0])}
+    pairs: dict[str, tuple[Any, Any]] = {
+        "task": (policy.task, env.name),
+        "agents": (policy.agents, len(teams_of(env)[0])),
+    }
     trained: Any = policy
-    if isinstance(own := getattr(policy, "needs", None), Needs) and needs == found:
-        group, groups = own.group, {"policy", *getattr(env, "group_sizes", {})}
-        needs, found = {"group": group}, {"group": ", ".join(sorted(groups))}
-        if group in groups:
-            needs, found = own.by_name(), needs_of(env, trained.config).by_name()
-    for need, value in needs.items():
-        if value != found[need]:
-            raise InputError(f"{field}: {name} needs {need} {value!r}; the environment has {found[need]!r}")
+    if isinstance(own := getattr(policy, "needs", None), Needs) and all(a == b for a, b in pairs.values()):
+        groups = {"policy", *getattr(env, "group_sizes", {})}
+        if own.group in groups:
+            pairs = own.mismatches(needs_of(env, trained.config))
+        else:
+            pairs = {"group": (own.group, ", ".join(sorted(groups)))}
+    for need, (value, found) in pairs.items():
+        if value != found:
+            raise InputError(f"{field}: {name} needs {need} {value!r}; the environment has {found!r}")
 
 
 NAMED: dict[str, Callable[[], TrainedPolicy]] = {}

@@ -6,10 +6,20 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core import devices
-from mqe_jax.core.types import Batch, NetworkMemory, Params, Transition, VectorEnv, observations, reset_memory
+from mqe_jax.core.types import (
+    Batch,
+    Memory,
+    NetworkMemory,
+    Params,
+    Transition,
+    VectorEnv,
+    observations,
+    reset_memory,
+    where_rows,
+)
 from mqe_jax.train.config import PPO
 from mqe_jax.train.networks import Network
-from mqe_jax.train.normalize import RunningStatistics, running_normalize
+from mqe_jax.train.normalize import Features, RunningStatistics, running_normalize
 
 
 class RolloutState(NamedTuple):
@@ -20,6 +30,7 @@ class RolloutState(NamedTuple):
     is_first: jax.Array  # whether the next step is the first of an episode (N,) bool
     episode_steps: jax.Array  # steps in this episode (N,) int32
     episode_return: jax.Array  # sum of rewards in this episode, mean over agents (N,)
+    teacher_memory: Memory = ()  # recurrent state of the teacher
 
 
 class ObservationNormalizer(NamedTuple):
@@ -30,11 +41,17 @@ class ObservationNormalizer(NamedTuple):
 
 
 def normalize_obs(
-    normalizer: ObservationNormalizer, obs: jax.Array, privileged: jax.Array, active: jax.Array, enabled: bool
+    normalizer: ObservationNormalizer,
+    obs: jax.Array,
+    privileged: jax.Array,
+    active: jax.Array,
+    enabled: bool,
+    features: Features | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Returns both observations as network inputs: normalised where `enabled`, 0 of agents that are not `active`."""
     if enabled:
-        obs, privileged = running_normalize(normalizer.obs, obs), running_normalize(normalizer.privileged, privileged)
+        obs = running_normalize(normalizer.obs, obs, features)
+        privileged = running_normalize(normalizer.privileged, privileged)
     return jnp.where(active[..., None], obs, 0.0), privileged
 
 
@@ -68,10 +85,13 @@ def rollout(
     normalize: bool,
     action_scale: float,
     group: str = "policy",
+    features: Features | None = None,
+    teacher: Any = None,
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
-    The environment receives `action_scale` times the sampled action. Metrics are means over steps and environments,
+    The environment receives `action_scale` times the sampled action. A teacher, which sees its own group of
+    observations, says in every step what it would do. Metrics are means over steps and environments,
     but `diverged` and `overflow` are counts; `ended` has the number of `episodes` that ended and means over them.
     """
 
@@ -80,10 +100,15 @@ def rollout(
         memory = reset_memory(state.memory, state.is_first)
         active = active_of(before)
         seen = observations(before).group(group)
-        obs, privileged = normalize_obs(normalizer, seen, before.privileged_obs, active, normalize)
+        obs, privileged = normalize_obs(normalizer, seen, before.privileged_obs, active, normalize, features)
         action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key, active)
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
         _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None], active[None])
+        shown, teacher_memory = (), ()
+        if teacher is not None:
+            teacher_memory = where_rows(state.is_first, teacher.initial_memory(env.num_envs), state.teacher_memory)
+            seen_by_teacher = observations(before).to(teacher)
+            shown, teacher_memory = teacher.act(seen_by_teacher, teacher_memory, jax.random.fold_in(key, 1))
         after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
         transition = Transition(
@@ -100,6 +125,7 @@ def rollout(
             learners=learners_of(before),
             terminated=after.terminated,
             done=done,
+            teacher_action=shown,
         )
         episode_steps = state.episode_steps + 1
         episode_return = state.episode_return + mean_of_team(after.reward, active)
@@ -111,6 +137,7 @@ def rollout(
             is_first=done,
             episode_steps=jnp.where(done, 0, episode_steps),
             episode_return=jnp.where(done, 0.0, episode_return),
+            teacher_memory=teacher_memory,
         )
         last = {name: jnp.where(done, value, 0.0) for name, value in ended.items()}
         return state, (transition, _sums(after.metrics), _sums({**last, "episodes": done}))

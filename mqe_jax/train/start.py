@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import fail, is_record, override, to_mapping
+from mqe_jax.core.settings import fail, is_record, leaves, override, to_mapping
 from mqe_jax.core.types import Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig
@@ -119,8 +119,8 @@ def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> Trai
     check_policy(policy, env, start, "start")
     if shapes != jax.tree.map(jnp.shape, policy.params):
         fail("start", start, "a policy with this run's network")
-    theirs = dict(_leaves(to_mapping(policy.config)))
-    for name, value in _leaves(to_mapping(config)):
+    theirs = dict(leaves(to_mapping(policy.config)))
+    for name, value in leaves(to_mapping(config)):
         acts = name in ("action_scale", "normalization.observations") or name.startswith("network.")
         if acts and name.split(".")[-1] not in MAY_DIFFER and theirs.get(name) != value:
             raise InputError(f"{name}: {value!r} differs from that of the policy in {start}, {theirs.get(name)!r}")
@@ -140,10 +140,10 @@ def learned_state(state: TrainState) -> dict[str, Any]:
 
 def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
     """Raises an InputError naming the first setting in which the run to resume differs."""
-    given = dict(_leaves(before))
-    old = {**dict(_leaves(to_mapping(TrainConfig()))), **given}  # a new setting had its default
+    given = dict(leaves(before))
+    old = {**dict(leaves(to_mapping(TrainConfig()))), **given}  # a new setting had its default
     left_out = {name: None for name in given if name.startswith(("env.", "train_env."))}
-    for name, value in {**left_out, **dict(_leaves(to_mapping(config)))}.items():
+    for name, value in {**left_out, **dict(leaves(to_mapping(config)))}.items():
         if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
             raise InputError(
                 f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
@@ -158,17 +158,8 @@ def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[st
         return
     overrides = dict(parameters)
     control = overrides.pop("control", "command")
-    found = dict(_leaves({"control": task.control, **to_mapping(task.params)}))
-    for name, value in _leaves({"control": control, **to_mapping(override(type(task.params)(), overrides))}):
+    found = dict(leaves({"control": task.control, **to_mapping(task.params)}))
+    for name, value in leaves({"control": control, **to_mapping(override(type(task.params)(), overrides))}):
         if found.get(name) != value:
-            field = "train_env" if parameters != config.env and name in dict(_leaves(config.train_env)) else "env"
+            field = "train_env" if parameters != config.env and name in dict(leaves(config.train_env)) else "env"
             raise InputError(f"{field}.{name}: {value!r} differs from the environments, which have {found.get(name)!r}")
-
-
-def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the dotted names and values of nested settings."""
-    for name, value in mapping.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

@@ -72,7 +72,8 @@ class League:
         if drawn and config.league.members <= drawn:
             fail("league.members", config.league.members, f"more than the blocks that play members, {drawn}")
         params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
-        first = TrainedPolicy(params, running_init(needs.dims.observation), needs, config, {})
+        statistics = running_init(needs.dims.observation, config.network.features(needs.dims))
+        first = TrainedPolicy(params, statistics, needs, config, {})
         load = lambda name: load_as("opponent", name, matches.env) if name in self._roster.fixed else first  # noqa: E731
         self.env = Versus(matches, list(map(load, opponents)), config.draw_reward)
         self._members = config.league.members if drawn else 1
