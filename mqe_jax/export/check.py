@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.types import observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
@@ -52,19 +53,23 @@ def _largest(errors: Mapping[str, float], where: str) -> float:
 
 def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
     """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and idle opponents."""
-    shapes = input_shapes(policy, env)
+    shapes, group = input_shapes(policy, env), policy.needs.group
 
     @jax.jit
     def advance(state: Any, memory: dict[str, Any]) -> tuple[Any, Any, Any]:
-        sensed = {"obs": state.obs, **dict(zip(SENSED, env.read(state.data).proprioception, strict=True))}
+        sensed = {
+            "obs": observations(state).group(group),
+            **dict(zip(SENSED, env.read(state.data).proprioception, strict=True)),
+        }
         inputs = {name: x[: policy.agents] for name, x in sensed.items() if name in shapes} | memory
         outputs = policy_step(policy, env, inputs)
         action = jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"])
-        return inputs, outputs, env.step(state, action)
+        return inputs, outputs, env.with_observations(env.advance(state, action), [group])
 
     @jax.jit
     def start(key: jax.Array) -> tuple[Any, Any]:
-        return env.reset(key), {name: jnp.zeros(s) for name, s in shapes.items() if name not in ("obs", *SENSED)}
+        state = env.with_observations(env.begin(key), [group])
+        return state, {name: jnp.zeros(s) for name, s in shapes.items() if name not in ("obs", *SENSED)}
 
     rows: list[tuple[Any, Any]] = []
     state, memory = start(jax.random.PRNGKey(0))

@@ -1,7 +1,8 @@
 """A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, skill.
 
-Every input and output has a leading batch axis N. Recurrent states are initialised to zero, and each output `next_X` is
-the input `X` of the next step. Of a match, the graph is that of team 0.
+Every input and output has a leading batch axis N. The input `obs` (N, A, O) is the policy's group of observations.
+Recurrent states are initialised to zero, and each output `next_X` is the input `X` of the next step. Of a match, the
+graph is that of team 0.
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|
@@ -26,7 +27,6 @@ import onnx
 
 import mqe_jax
 from mqe_jax import skills
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.core.types import AnyTrained
 from mqe_jax.envs import QuadrupedEnv
@@ -49,15 +49,13 @@ def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
         InputError: for another task than the policy's, or a network with an operation that has no translation.
     """
     check_policy(policy, env)
-    if policy.needs.group != "policy":
-        raise InputError(f"group: {policy.needs.group!r} is not allowed; graphs of policies see the group 'policy'")
     step = functools.partial(policy_step, policy, env)
     return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
 
 
 def input_shapes(policy: Trained, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
-    robots = {"obs": (env.observation_size,)}
+    robots: dict[str, tuple[int, ...]] = {"obs": (policy.needs.dims.observation,)}
     if env.control == "command":
         skill, _ = skill_of(env)
         robots |= SENSED | {name: x.shape for name, x in name_arrays(skill.name, skill.init_memory()).items()}
@@ -108,7 +106,8 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
 
 
 def _properties(policy: Trained, env: QuadrupedEnv) -> dict[str, str]:
-    layout = [[block.name, block.width, block.meaning] for block in env.observation_layout.blocks]
+    seen = {"policy": env.observation_layout, **env.groups}[policy.needs.group]
+    layout = [[block.name, block.width, block.meaning] for block in seen.blocks]
     return {
         "mqe_jax": mqe_jax.__version__,
         "opset": str(OPSET),
@@ -116,6 +115,7 @@ def _properties(policy: Trained, env: QuadrupedEnv) -> dict[str, str]:
         "control": env.control,
         "robot": env.robot.name,
         "period_s": f"{env.dt:g}",
+        "group": policy.needs.group,
         "observation": json.dumps(layout),
         "joints": json.dumps("FL FR RL RR; hip, thigh, calf"),
         "default_joints_rad": json.dumps([round(float(x), 6) for x in env.robot.default_joints]),

@@ -117,6 +117,8 @@ def entries(sources: Sequence[str]) -> list[Entry]:
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
+            if (group := policy.needs.group) != "policy":
+                raise InputError(f"{source}: sees the group {group!r}; on the page there are no sensors")
             short = name if name == "shipped" else _short(Path(name), entry.policies)
             entry.policies[short] = translate(policy, entry.env, source)
     for task, _, entry in found:
