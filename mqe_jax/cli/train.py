@@ -93,7 +93,7 @@ class Train(TaskOptions):
 
 
 def parse_train(arguments: Sequence[str]) -> Train:
-    """Parses the arguments of `mqe train`; the settings' file, algorithm and network decide the flags' defaults.
+    """Parses the arguments of `mqe train`; settings' file, algorithm, network and sensors decide the flags' defaults.
 
     InputError without a task in front, or for a file, an algorithm or a network that is not allowed; SystemExit as of
     `mqe_jax.cli.arguments.parse`.
@@ -103,7 +103,8 @@ def parse_train(arguments: Sequence[str]) -> Train:
         raise InputError(f"task: is missing; it comes first: mqe train TASK {' '.join(arguments)}".rstrip())
     source, others = tyro.cli(Source, args=list(arguments), add_help=False, return_unknown_args=True)
     network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
-    settings = base_config(task, source.config, source.algorithm)
+    given, others = tyro.cli(TaskOptions, args=others, add_help=False, return_unknown_args=True)
+    settings = base_config(task, source.config, source.algorithm, given.overrides())
     if network.name is not None and network.name != settings.network.name:
         settings = override(settings, {"network": {"name": network.name}})
     for flag, name in {"--opponent": "opponents", "--mate": "mates"}.items():

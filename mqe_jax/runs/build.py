@@ -58,7 +58,7 @@ def prepare(
     if len(set(seeds or ())) < len(seeds or ()):
         fail("seeds", seeds, "a list without repetitions")
     if isinstance(task, str | QuadrupedEnv):
-        settings = for_task(settings_of(task, config), task, env)
+        settings = for_task(settings_of(task, config, env), task, env)
     elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
         settings = settings_of("", config)
         theirs = {"env": env, "opponents": settings.opponents, "mates": settings.mates}
@@ -158,7 +158,9 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     _check_teams(both, config)
     others = [load_as("opponent", name, both) for name in Roster(opponents).fixed] if len(both.teams) > 1 else []
     mates = [load_as("mate", name, both) for name in config.mates]
-    groups = {config.group, *groups_of(*others, *mates)}
+    shown = config.imitation.teacher
+    teacher = None if shown is None else load_as("imitation.teacher", shown, both)
+    groups = {config.group, *groups_of(*others, *mates, teacher)}
     demonstrator = config.curriculum.demonstrator
 
     def batch(num_envs: int) -> Any:
@@ -177,7 +179,7 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
         eval_env = eval_env.with_groups(groups)
     if config.train_env:
         _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env, config)
-    league = teacher = None
+    league = None
     if len(both.teams) < 2:
         env = batch(config.num_envs)
         if mates:
@@ -188,8 +190,6 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
         env = league.env
     else:
         env = Mirror(batch(config.num_envs // 2))
-    if config.imitation.teacher is not None:
-        teacher = load_as("imitation.teacher", config.imitation.teacher, both)
     if len(both.teams) > 1 and eval_env is not None:
         fixed = Roster(opponents).fixed or reference_opponents(eval_env.env)[:1]
         if episodes % len(fixed):
@@ -210,10 +210,9 @@ def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None
 
 def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv, config: TrainConfig) -> None:
     """Raises an InputError where a policy that is trained in a task could not act in it as it is evaluated."""
-    evaluated = needs_of(env, config).by_name()
-    for name, value in needs_of(training, config).by_name().items():
-        if value != evaluated[name]:
-            fail(f"train_env.{name}", value, f"that of env, {evaluated[name]!r}, in which the policy is evaluated")
+    differing = needs_of(training, config).mismatches(needs_of(env, config))
+    for name, (value, evaluated) in differing.items():
+        fail(f"train_env.{name}", value, f"that of env, {evaluated!r}, in which the policy is evaluated")
 
 
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
@@ -313,21 +312,27 @@ def run_config(target: str) -> TrainConfig:
     return load_policy(target).config
 
 
-def settings_of(task: str | QuadrupedEnv, config: Config) -> TrainConfig:
-    """Returns the settings that `mqe_jax.learn` is given, without a task's parameters."""
+def settings_of(task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any] | None = None) -> TrainConfig:
+    """Returns the settings that `mqe_jax.learn` is given, but for task parameters, whose sensors select others."""
     if isinstance(config, TrainConfig):
         return config
     changes = dict(config) if isinstance(config, Mapping) else {"config": config}
-    name, algorithm = changes.pop("config", None), changes.pop("algorithm", None)
-    if not isinstance(name, str | Path | None) or not isinstance(algorithm, str | None):
+    source, algorithm = changes.pop("config", None), changes.pop("algorithm", None)
+    if not isinstance(source, str | Path | None) or not isinstance(algorithm, str | None):
         fail("config", config, "a shipped name, a file, a TrainConfig, or a mapping of settings")
-    task = task.name if isinstance(task, QuadrupedEnv) else task
-    return override(base_config(task, None if name is None else str(name), algorithm), changes)
+    name, given = task.name if isinstance(task, QuadrupedEnv) else task, merge(parameters_of(task), env or {})
+    return override(base_config(name, None if source is None else str(source), algorithm, given), changes)
 
 
 def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Returns the settings with a task and its parameters; says so where they are those of another task."""
+    """Returns the settings with a task and its parameters; says so where they are those of another task.
+
+    A task by its id gets the parameters that the teacher needs, where they are not given.
+    """
     name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
     if config.task not in (None, name):
         echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
-    return override(config, {"task": name, "env": merge(parameters_of(task), env or {})})
+    given = merge(config.env, merge(parameters_of(task), env or {}))
+    if config.imitation.teacher is not None and isinstance(task, str):
+        given = merge(parameters_for(name, config.imitation.teacher), given)
+    return override(config, {"task": name, "env": given})

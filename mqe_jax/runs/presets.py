@@ -1,11 +1,12 @@
 """Shipped settings of trainings, by name; it imports no JAX."""
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.core.settings import PathText, check, fail, load_yaml, override
+from mqe_jax.core.settings import FrozenMapping, PathText, check, fail, load_yaml, override
 from mqe_jax.envs.registry import ALIASES, SHIPPED, TASKS
 from mqe_jax.train.config import TrainConfig, load_config
 
@@ -44,18 +45,23 @@ def named_config(name: str, task: str) -> TrainConfig:
     return load_config(path)
 
 
-def base_config(task: str, name: str | None, algorithm: str | None = None) -> TrainConfig:
-    """Returns the settings of a file or a shipped name, with the algorithm's preset.
+def base_config(
+    task: str, name: str | None, algorithm: str | None = None, env: Mapping[str, Any] = FrozenMapping()
+) -> TrainConfig:
+    """Returns the settings of a file or a shipped name, with the presets of the algorithm and of given task parameters.
 
     The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
-    paper/mappo for other tasks. InputError for a file or an algorithm that is not allowed.
+    paper/mappo for other tasks. If the parameters name sensors and the settings no group of observations, a policy that
+    sees the sensors gets the settings of `onboard.yaml`. InputError for a file or an algorithm that is not allowed.
     """
     task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
     if name is None and algorithm is not None:
         name = f"paper/{algorithm}"
     elif name is None:
         name = f"tuned/{task}" if task in _parts("tuned") else "league" if _is_match(task) else "paper/mappo"
-    return override(named_config(name, task), changes)
+    config = override(named_config(name, task), changes)
+    sensing = env.get("senses", "full") not in ("full", (), [])
+    return override(config, _parts("onboard")) if sensing and config.group == "policy" else config
 
 
 def _is_match(task: str) -> bool:

@@ -110,7 +110,8 @@ class Imitation:
     """
 
     teacher: str | None = None
-    """Policy without recurrent state: scripted, a run folder or a policy file; none disables imitation."""
+    """Policy that sees its own group of observations: scripted, the task (its shipped policy), a run folder or a policy
+    file; none disables imitation. Task parameters that are not given are those that it needs."""
     weight: NonNegative = 1.0
     """Initial weight of the loss, annealed linearly to 0."""
     until: Positive = 0.5

@@ -1,0 +1,121 @@
+"""Policies that see sensors: their default settings, their teachers, what they need of an environment, resumed runs."""
+
+import dataclasses
+import functools
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from mqe_jax import make
+from mqe_jax.cli.train import parse_train
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import override
+from mqe_jax.policies import parameters_for, zoo
+from mqe_jax.runs.build import for_task, prepare, settings_of
+from mqe_jax.train.needs import Needs, needs_of
+from mqe_jax.train.policy import check_policy, read_policy
+from mqe_jax.train.runner import train_seeds
+from tests.inputs import refuses
+from tests.training import Stop, assert_same_run, stop_after
+
+SENSES = {"senses": "onboard"}
+TINY: dict[str, Any] = {
+    "config": "demo",
+    "num_envs": 2,
+    "rollout_steps": 4,
+    "total_steps": 3 * 8,
+    "ppo": {"epochs": 1, "minibatches": 1},
+    "network": {"hidden_sizes": (8,), "gru_size": 4, "entity_sizes": (4,), "chunk_length": 2, "openrl_layers": False},
+    "curriculum": {"demonstrator": None, "assistance": 0.0},
+    "checkpoint.every": 1,
+    "loggers": (),
+    "imitation.teacher": "go1gate",
+}
+
+
+def test_sensors_select_the_settings_of_policies_that_see_them() -> None:
+    flags = ["go1gate", "--senses", "onboard", "--imitation.teacher", "go1gate"]
+    train = parse_train(flags)
+    assert train.overrides() == SENSES and train.settings.imitation.teacher == "go1gate"
+    assert (train.settings.group, train.settings.network.name) == ("onboard", "blocks")
+    assert train.settings == settings_of("go1gate", {"imitation.teacher": "go1gate"}, SENSES)
+    network: Any = parse_train(["go1gate", "--set", "senses=onboard", "--network.gru-size", "7"]).settings.network
+    assert network.gru_size == 7
+    plain = parse_train(["go1gate", "--senses", "full"]).settings
+    assert plain == parse_train(["go1gate"]).settings and plain.group == "policy"
+    demo = settings_of("go1gate", {"config": "demo", "group": "policy"}, SENSES)
+    assert demo.group == "policy" and demo.num_envs == 128
+    assert settings_of("go1tug", None, {"senses": ["lidar"]}).group == "onboard"
+
+
+def test_a_task_gets_what_its_teacher_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped: Any = zoo.load("go1gate")
+    needs = override(shipped.needs, {"skill": "agile", "command_ranges": {"vx": (-1.0, 1.5)}})
+    teacher = dataclasses.replace(shipped, needs=needs)
+    monkeypatch.setattr(zoo, "load", lambda name: teacher)
+    config = settings_of("go1gate", {"imitation.teacher": "go1gate"}, SENSES)
+    assert for_task(config, "go1gate", SENSES).env == {
+        **SENSES,
+        "skill": "agile",
+        "command_ranges": needs.command_ranges,
+    }
+    given = for_task(config, "go1gate", {"skill": "walk"})
+    assert given.env["skill"] == "walk"
+    refuses(r"imitation\.teacher: go1gate needs skill 'agile'.* has 'walk'", prepare, "go1gate", given, impl="c")
+
+
+@functools.cache
+def onboard() -> Any:
+    """A training of the gate with sensors and a shipped teacher."""
+    return prepare("go1gate", TINY, SENSES, impl="c")
+
+
+def test_other_sensors_are_named_with_both_values() -> None:
+    (config,), cast = onboard()
+    needs = needs_of(cast.env, config)
+    policy: Any = SimpleNamespace(task="go1gate", agents=2, needs=needs, config=config, act=None, initial_memory=None)
+    check_policy(policy, cast.env)
+    blind = make("go1gate", impl="c", num_envs=1)
+    first, near, *others = needs.senses
+    for senses, message in (
+        ("full", "needs group 'onboard'; the environment has 'policy, proprioception'"),
+        ([first], r"needs senses \('proprioception', 'detections', 'lidar'\); .* has \('proprioception',\)"),
+        ([first, {**near, "range": 4.0}, *others], "needs senses.detections.range 6.0; the environment has 4.0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_policy(policy, make("go1gate", impl="c", num_envs=1, senses=senses))
+    forged = override(needs, {"dims": needs.dims._replace(blocks=needs.dims.blocks[::-1])})
+    assert forged.mismatches(needs) == {} != Needs(task="go1gate", dims=needs.dims).mismatches(needs)
+    assert parameters_for("go1gate", policy) == {}  # no trained policy
+    check_policy(zoo.load("go1gate"), blind)  # of before files described blocks
+
+
+class Pacer:
+    """A teacher that remembers the number of its steps."""
+
+    task, agents, groups = "go1gate", 2, ("policy",)
+
+    def initial_memory(self, num_envs: int) -> jax.Array:
+        return jnp.zeros(num_envs)
+
+    def act(self, obs: Any, memory: jax.Array, key: jax.Array) -> Any:
+        return jnp.tanh(memory[:, None, None] + obs.group("policy")[..., :3]), memory + 1
+
+
+@pytest.mark.usefixtures("shared_programs")
+def test_a_training_with_sensors_resumes_bit_for_bit(tmp_path: Path) -> None:
+    (config,), cast = onboard()
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    train = functools.partial(train_seeds, cast.env, [config], teacher=Pacer())
+    train([whole])
+    with pytest.raises(Stop):
+        train([stopped], on_update=stop_after(1))
+    train([stopped], resume=True)
+    assert_same_run(whole, stopped)
+    policy = read_policy(whole)
+    assert parameters_for("go1gate", policy) == {"senses": policy.needs.senses}
+    check_policy(policy, make("go1gate", impl="c", num_envs=1, **parameters_for("go1gate", policy)))
