@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -19,8 +20,9 @@ from mqe_jax.policies.mixture import Mixture
 from mqe_jax.skills import SKILLS
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
-from mqe_jax.train.normalize import RunningStatistics
-from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.train.normalize import RunningStatistics, running_init
+from mqe_jax.train.policy import TrainedPolicy, save_policy
+from tests.inputs import refuses
 from tests.training import export_error, random_params
 
 onnx = pytest.importorskip("onnx")
@@ -30,23 +32,25 @@ onnxruntime = pytest.importorskip("onnxruntime")
 from mqe_jax.export import translate  # noqa: E402
 from mqe_jax.export.check import errors, record_actions  # noqa: E402
 from mqe_jax.export.policy import input_shapes, shapes, to_onnx  # noqa: E402
-from mqe_jax.export.task import policy_function  # noqa: E402
+from mqe_jax.export.site import entries  # noqa: E402
+from mqe_jax.export.task import TaskFunctions, policy_function, state_arrays  # noqa: E402
 
 GATE = zoo.file_of("go1gate")
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
 
 
-def new_policy(env: Any, control: str = "command", **network: Any) -> TrainedPolicy:
+def new_policy(env: Any, control: str = "command", group: str = "policy", **network: Any) -> TrainedPolicy:
     """A policy with random weights, statistics and action layer, large enough to saturate some actions."""
     if "name" not in network:
         network["critic_input"] = "observations"
-    settings = {"task": env.name, "env": {"control": control}, "action_scale": 0.5, "network": network}
+    settings = {"task": env.name, "env": {"control": control}, "action_scale": 0.5, "network": network, "group": group}
     config = build(TrainConfig, settings)
     needs = needs_of(env, config)
     net = config.network.build(needs.dims)
     params = jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + np.float32(0.1)), net.policy_params(random_params(net)))
-    mean, spread = np.random.default_rng(3).normal(size=(2, env.observation_size)).astype(np.float32)
-    statistics = RunningStatistics(jnp.asarray(mean), jnp.asarray(spread**2), jnp.float32(9.0))
+    fresh = running_init(needs.dims.observation, config.network.features(needs.dims))
+    mean, spread = np.random.default_rng(3).normal(size=(2, *fresh.mean.shape)).astype(np.float32)
+    statistics = RunningStatistics(jnp.asarray(mean), jnp.asarray(spread**2), fresh.samples + 9.0)
     return TrainedPolicy(params, statistics, needs, config, {})
 
 
@@ -124,6 +128,45 @@ def test_a_graph_holds_the_skill_of_the_task(skill: Any, commands: Any, memory: 
     assert export_error(policy, env) < 2e-5
 
 
+def test_a_policy_that_sees_sensors_is_exported_and_senses_on_the_page(tmp_path: Path) -> None:
+    """The graph has readings as inputs; that of the page has the state, for either team of a match."""
+    late, near = {"all": {"delay": 1}}, {"position_noise": 0.0, "yaw_noise": 0.0, "misses": 0.0}
+    odometry = {"name": "proprioception", "drift": 0.0, "yaw_drift": 0.0}
+    senses = [odometry, {"name": "detections", **near, "pipeline": late}, {"name": "lidar", "rays": 8}]
+    env = make("go1bridge", impl="c", num_envs=1, senses=senses)
+    network = {"name": "blocks", "hidden_sizes": [8], "gru_size": 4, "entity_sizes": [4]}
+    policy = new_policy(env, "command", "onboard", **network).acting(True)
+    inputs, outputs = record_actions(policy, env, 2)
+    assert inputs["obs"].shape == (2, 1, env.group_sizes["onboard"]) and inputs["memory"][1:].any()
+    model = to_onnx(policy, env)
+    assert max(errors(model, inputs, outputs).values()) < 1e-4
+    properties = {entry.key: entry.value for entry in model.metadata_props}
+    assert properties["group"] == "onboard" and "lidar" in [name for name, *_ in json.loads(properties["observation"])]
+
+    observe = lambda state: env.with_observations(state, ["onboard"])  # noqa: E731
+    step = jax.jit(lambda state, action: observe(env.advance(state, action)))
+    state = jax.jit(lambda key: observe(env.begin(key)))(jax.random.PRNGKey(0))
+    act, sizes = policy_function(policy, TaskFunctions(env))
+    assert sizes["team"] == ()
+    memory = [{name: jnp.zeros(shape) for name, shape in sizes.items()} for _ in env.teams]
+    expected, graph, page = [policy.initial_memory()] * 2, translate.translate(act, sizes, "test"), jax.jit(act)
+    for _ in range(3):
+        actions = []
+        for team in range(2):
+            action, expected[team] = policy.act(state.groups["onboard"][team : team + 1], expected[team])
+            given = memory[team] | state_arrays(state) | {"team": jnp.float32(team)}
+            found = page(given)
+            np.testing.assert_allclose(found["action"], action, atol=1e-4)
+            batch = {name: np.asarray(given[name])[None] for name in sizes}
+            whole = {name: np.asarray(x)[None] for name, x in found.items()}
+            assert max(errors(graph, batch, whole).values()) < 1e-4
+            memory[team] = {name: found.get(f"next_{name}", x) for name, x in memory[team].items()}
+            actions.append(action)
+        state = step(state, jnp.concatenate(actions))
+    save_policy(tmp_path, new_policy(env, "command", "proprioception", recurrent=False, critic_input="privileged"))
+    refuses("sees the group 'proprioception'; the page has 'policy' and 'onboard'", entries, [str(tmp_path)])
+
+
 def mixture_of(env: Any) -> Mixture:
     """A mixture of policies without and with a recurrent state."""
     one, other = (new_policy(env, "position", hidden_sizes=[16], recurrent=x, gru_size=8) for x in (False, True))
@@ -144,7 +187,7 @@ def test_the_graph_of_a_mixture_has_all_members() -> None:
 def test_the_page_draws_a_member_by_its_noise() -> None:
     env = make("go1plane", impl="c", num_envs=1, control="position")
     policy = mixture_of(env)
-    act, sizes = policy_function(policy, env.observation_size)
+    act, sizes = policy_function(policy, SimpleNamespace(env=env))  # pyright: ignore[reportArgumentType]
     assert sizes["noise"] == (1 + 3 * env.num_agents * env.action_size,)
     inputs = {name: np.zeros((4, *shape), np.float32) for name, shape in sizes.items()}
     inputs["noise"][:, 0] = [-1.0, 0.1, 1.0, 1.0]  # the median of the weights is 0

@@ -286,9 +286,9 @@ class QuadrupedEnv(Task[S, P]):
             if noise:
                 key = jax.random.fold_in(state.key, _NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
-            seen[name] = jnp.where(state.active[:, None], _clip(obs), 0.0)
+            seen[name] = jnp.where(state.active[:, None], finite(obs), 0.0)
         privileged = self.observe_privileged(state, robots)
-        seen = {"obs": seen.pop("policy"), "privileged_obs": _clip(privileged), "groups": seen}
+        seen = {"obs": seen.pop("policy"), "privileged_obs": finite(privileged), "groups": seen}
         return dataclasses.replace(state, **seen)
 
     def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
@@ -389,5 +389,6 @@ class QuadrupedEnv(Task[S, P]):
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
 
 
-def _clip(x: jax.Array) -> jax.Array:
+def finite(x: jax.Array) -> jax.Array:
+    """Returns observations without numbers that are not finite or beyond 1e4."""
     return jnp.clip(jnp.nan_to_num(x), -1e4, 1e4)

@@ -32,6 +32,7 @@ from mqe_jax.physics import robots
 from mqe_jax.policies import load_policy, parameters_for, zoo
 from mqe_jax.policies.mixture import Trained
 from mqe_jax.policies.translated import together, translate
+from mqe_jax.sensors.suite import ONBOARD
 from mqe_jax.skills.agile import AgileSkill
 from mqe_jax.train.policy import Policy
 
@@ -61,7 +62,7 @@ class Entry:
         files = {f"{name}.onnx": graph for name, graph in graphs.items()}
         rows = []
         for name, policy in self.policies.items():
-            graph = _graph(*policy_function(policy, env.observation_size), f"{self.name}_policy", starts)
+            graph = _graph(*policy_function(policy, functions), f"{self.name}_policy", starts)
             files[f"policy-{len(rows)}.onnx"] = graph
             rows.append({"name": name, "file": f"policy-{len(rows)}.onnx", **shapes(graph)})
         for name, graph in files.items():
@@ -117,8 +118,12 @@ def entries(sources: Sequence[str]) -> list[Entry]:
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
-            if (group := policy.needs.group) != "policy":
-                raise InputError(f"{source}: sees the group {group!r}; on the page there are no sensors")
+            if policy.needs.group not in ("policy", ONBOARD):
+                raise InputError(
+                    f"{source}: sees the group {policy.needs.group!r}; the page has 'policy' and {ONBOARD!r}"
+                )
+            if images := [block.name for block in policy.needs.dims.blocks if block.image]:
+                raise InputError(f"{source}: sees {images[0]}; the page has no images")
             short = name if name == "shipped" else _short(Path(name), entry.policies)
             entry.policies[short] = translate(policy, entry.env, source)
     for task, _, entry in found:

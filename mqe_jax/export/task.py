@@ -4,7 +4,7 @@ In an environment step the graphs run in this order; the physics steps are betwe
 
 | graph | of | inputs |
 |---|---|---|
-| `policy` | a team | `obs` (A, O), `noise` (K,), recurrent states |
+| `policy` | a team | `obs` (A, O), or with sensors the state and `team` (); `noise` (K,), recurrent states |
 | `control` | the task | state, `action` (A, D), `drive` (A, D), `driven` (A,), `noise` (K,) |
 | `skill` | a robot | `command` (C,), `gravity` (3,), `joint_position`, `joint_velocity` (12,), recurrent states |
 | `judge` | the task | state after the step, `before_qpos`, `before_qvel`, `before_sensordata` |
@@ -27,11 +27,13 @@ import jax.numpy as jnp
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs.base import finite
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, skill_of
 from mqe_jax.export.translate import Function
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.train.policy import Policy
+from mqe_jax.sensors.suite import ONBOARD
+from mqe_jax.train.policy import Policy, groups_of
 
 PHYSICS = ("qpos", "qvel", "sensordata")
 """Arrays of the physics state that tasks read."""
@@ -66,11 +68,11 @@ class TaskFunctions:
     def control_inputs(self) -> Shapes:
         actions = (self.env.num_agents, self.env.action_size)
         noise = {"noise": (self._noise,)} if self._noise else {}
-        return self._state_inputs | {"action": actions, "drive": actions, "driven": actions[:1]} | noise
+        return self.state_inputs | {"action": actions, "drive": actions, "driven": actions[:1]} | noise
 
     @property
     def judge_inputs(self) -> Shapes:
-        return self._state_inputs | {f"before_{name}": self._state_inputs[name] for name in PHYSICS}
+        return self.state_inputs | {f"before_{name}": self.state_inputs[name] for name in PHYSICS}
 
     def control(self, inputs: Arrays) -> dict[str, jax.Array]:
         """Returns what the skill and the physics get in a step.
@@ -109,7 +111,7 @@ class TaskFunctions:
         state = env.judge(Moment(before, env.read(before.data)), Moment(after, robots))
         obs = env.observation_layout.pack(env.observe(state, robots))
         outputs = {
-            "obs": jnp.clip(jnp.nan_to_num(obs), -1e4, 1e4),
+            "obs": finite(obs),
             "outcome": jnp.stack([state.outcome.by_name()[name] for name in self.outcomes]),
             "terminated": state.terminated,
             "truncated": state.truncated,
@@ -128,7 +130,8 @@ class TaskFunctions:
         return dataclasses.replace(start, data=data, anchors=anchors, task=task, step=step)
 
     @property
-    def _state_inputs(self) -> Shapes:
+    def state_inputs(self) -> Shapes:
+        """Shapes of the arrays of a state by name."""
         return {name: x.shape for name, x in state_arrays(self._start).items()}
 
 
@@ -154,23 +157,52 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     return act, shapes
 
 
-def policy_function(policy: Policy, observation_size: int) -> tuple[Function, Shapes]:
+def policy_function(policy: Policy, functions: TaskFunctions) -> tuple[Function, Shapes]:
     """Returns a policy as a function of one team, and the shapes of its inputs; it samples where `policy` does."""
+    env, sensed = functions.env, groups_of(policy) == {ONBOARD}
     memory = jax.tree.map(lambda x: x[0], policy.initial_memory(1))
     key = jax.random.PRNGKey(0)
-    shapes = {"obs": (policy.agents, observation_size)} | {n: x.shape for n, x in name_arrays("memory", memory).items()}
+    shapes = {"obs": (policy.agents, env.group_sizes[ONBOARD if sensed else "policy"])}
+    shapes |= {name: x.shape for name, x in name_arrays("memory", memory).items()}
 
-    def act(inputs: Arrays) -> dict[str, jax.Array]:
+    def choose(inputs: Arrays) -> dict[str, jax.Array]:
         state = jax.tree.map(lambda x: x[None], fill_arrays("memory", memory, inputs))
         action, state = policy.act(inputs["obs"][None], state, key)
         return {"action": action[0]} | {name: x[0] for name, x in name_arrays("next_memory", state).items()}
 
+    act, shapes = _sensing(choose, shapes, functions) if sensed else (choose, shapes)
+
     def act_with_noise(inputs: Arrays) -> dict[str, jax.Array]:
         with normal_numbers(inputs["noise"]):
-            return act(inputs)
+            return dict(act(inputs))
 
     size = _noise_size(lambda: act({name: jnp.zeros(shape) for name, shape in shapes.items()}))
     return (act_with_noise, shapes | {"noise": (size,)}) if size else (act, shapes)
+
+
+def _sensing(choose: Function, shapes: Shapes, functions: TaskFunctions) -> tuple[Function, Shapes]:
+    """Returns the function of a state that senses and then chooses the actions of the team `team` (), and its inputs.
+
+    `choose` with its inputs is a policy that sees sensors. The recurrent states `sense_NAME` are those of all agents'
+    sensors; the last actions among them are right for the team's own.
+    """
+    env = functions.env
+    first = env.suite.reset()
+    own = {name: x.shape for name, x in name_arrays("sense", first).items() if x.size}
+
+    def act(inputs: Arrays) -> dict[str, jax.Array]:
+        arrays = {name: inputs.get(name, x) for name, x in name_arrays("sense", first).items()}
+        senses = jax.tree.map(lambda x, like: x.astype(like.dtype), fill_arrays("sense", first, arrays), first)
+        state = dataclasses.replace(functions.state(inputs), senses=senses)
+        blocks, senses = env.suite.observe(env.snapshot(state, env.read(state.data)), senses, state.key)
+        every = finite(env.groups[ONBOARD].pack(blocks, env.num_agents))
+        teams = [every[team[0] : team[-1] + 1] for team in env.teams]
+        outputs = choose({**inputs, "obs": jnp.where(inputs["team"] < 0.5, teams[0], teams[-1])})
+        senses = senses._replace(action=jnp.tile(jnp.clip(outputs["action"], -1.0, 1.0), (len(teams), 1)))
+        after = {name: x.astype(jnp.float32) for name, x in name_arrays("next_sense", senses).items() if x.size}
+        return {**outputs, **after}
+
+    return act, functions.state_inputs | {"team": ()} | {n: x for n, x in shapes.items() if n != "obs"} | own
 
 
 @contextlib.contextmanager

@@ -141,7 +141,8 @@ export class Episode {
       const policy = this.policies[team];
       const obs = this.obs.subarray(width * agents[0], width * (agents.at(-1) + 1));
       const size = (this.drive.length / this.driven.length) * agents.length;
-      const action = policy ? (await policy.run({ obs, noise: this.noise(policy) })).action : new Float32Array(size);
+      const seen = policy && { ...this.state, obs, team: [team], noise: this.noise(policy) };
+      const action = policy ? (await policy.run(seen)).action : new Float32Array(size);
       parts.push(...action);
     }
     return parts;
