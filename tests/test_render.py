@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from viewer import Driven, session
 from mqe_jax import cli
 from mqe_jax.envs import TASKS
 from mqe_jax.policies import load_policy
+from mqe_jax.sensors import marks as sensed
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.view.menu import Entry, Menu, find_runs
 from mqe_jax.view.session import HOLD_TIME, Drive
@@ -94,6 +96,33 @@ def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -
     before = env.mj_model.vis.global_.offwidth
     assert list(render.render_frames(env, episode.cut(slice(0, 1)), size=(1000, 80)))
     assert env.mj_model.vis.global_.offwidth == before  # the model's own settings are left alone
+
+
+@pytest.mark.parametrize("backend", ["auto", None])
+def test_what_the_first_robot_senses_is_drawn_and_explained(env: Any, episode: Episode, backend: str | None) -> None:
+    """Lines, points and an area in magenta, and the legend; the other robot's are not."""
+    if backend and render.gl_backend() is None:
+        pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
+    still = episode.cut(slice(0, 1))
+
+    def pink(agent: int, **corners: jax.Array) -> int:
+        every = {name: jnp.zeros((2, *x.shape)).at[agent].set(x) for name, x in corners.items()}
+        shown = {f"{name[:-1]}_opacity": (jnp.arange(2.0) == agent)[:, None] for name in corners if name != "area"}
+        options: Any = {**every, **shown}
+        mark = sensed.marks("lidar", (1.0, 0.0, 1.0), jnp.full(2, 0.6), **options)
+        marked = dataclasses.replace(still, marks=(jax.tree.map(lambda x: np.asarray(x)[None], mark),))
+        (frame,) = render.render_frames(env, marked, size=(320, 180), backend=backend)
+        red, green, blue = np.moveaxis(frame.astype(int), -1, 0)
+        return int(np.count_nonzero((red > green + 40) & (blue > green + 40)))
+
+    corners = {"lines": jnp.array([[[0.5, -1.0], [3.5, 1.0]]]), "points": jnp.array([[2.0, -0.8]])}
+    corners["area"] = jnp.array([[0.5, 0.0], [3.0, -1.0], [3.0, 1.0]])
+    assert all(pink(0, **{name: x}) > 3 for name, x in corners.items())
+    assert pink(1, lines=corners["lines"], points=corners["points"]) == 0
+    mark = sensed.marks("lidar", (1.0, 0.0, 1.0), jnp.full(2, 0.6))
+    blank = np.zeros((360, 640, 3), np.uint8)
+    plain, told = (framing.legend(env, (640, 360), marks)(blank).any(axis=(0, 2)).sum() for marks in ((), (mark,)))
+    assert told > plain + 40
 
 
 BODIES = (

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -26,8 +27,9 @@ from websockets.exceptions import InvalidStatus
 
 from mqe_jax import make
 from mqe_jax.core.errors import InputError
+from mqe_jax.sensors.marks import marks
 from mqe_jax.view.menu import Entry, Menu
-from mqe_jax.view.overlay import _METRES_PER_NEWTON, contact_arrows
+from mqe_jax.view.overlay import _METRES_PER_NEWTON, Overlay, contact_arrows
 from mqe_jax.view.panel import HOLD_RATE, Panel, robot_labels
 from mqe_jax.view.server import authorities, open_server, refusal
 from mqe_jax.view.stage import Stage
@@ -269,6 +271,26 @@ def test_environments_stand_side_by_side_and_every_moving_body_is_drawn(stage: A
     apart = np.diff(away[:, 1])
     assert np.all(apart > 3.1)  # wider than the track with its walls
     np.testing.assert_allclose(away[1, 1], 0.0, atol=1e-6)
+
+
+def test_what_a_robot_senses_is_drawn_in_its_environment(stage: Any) -> None:
+    """Hidden lines are not drawn, and the next drawing replaces the last one."""
+    spots = jnp.arange(2 * 3 * 2 * 2.0).reshape(2, 3, 2, 2)
+    opacity = jnp.array([[1.0, 1.0, 1.0], [0.0, 1.0, 0.5]])
+    area = jnp.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]] * 2)
+    mark = marks("lidar", (1.0, 0.0, 0.0), jnp.full(2, 0.3), lines=spots, line_opacity=opacity, points=spots[:, :, 0])
+    view = marks("in view", (0.0, 1.0, 0.0), jnp.full(2, 0.3), area=area)
+    every = jax.tree.map(lambda x: np.stack([x] * 3), (mark, view))
+    overlay = Overlay(stage.server, stage.env.mj_model, stage.stage.offset)
+    overlay.draw_marks(every, 2, 1)
+    lines, points, shape = overlay._sensed
+    offset = stage.stage.offset[2]
+    np.testing.assert_allclose(lines.points, np.array(mark.lines[1, 1:]) + offset, atol=1e-5)
+    np.testing.assert_allclose(points.points, np.array(mark.points[1]) + offset, atol=1e-5)
+    assert np.all(lines.colors[0, 0] == (255, 0, 0)) and 0 < lines.colors[1, 0, 1] < 255
+    assert sorted({*shape.faces.ravel().tolist()}) == [0, 1, 2, 3] and len(shape.faces) == 2
+    overlay.draw_marks((), 2, 1)
+    assert overlay._sensed == []
 
 
 def test_contact_forces_carry_the_robots() -> None:

@@ -22,7 +22,7 @@ import yaml
 RATES = ("env_steps_per_s", "bare_env_steps_per_s")
 
 
-def work(case: str, steps: int, repeats: int, params: dict[str, Any]) -> None:
+def work(case: str, *, steps: int, repeats: int, cpu_time: bool, params: dict[str, Any]) -> None:
     """Process of one checkout and case: compiles, then answers each line on standard input with one timing."""
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print
@@ -33,6 +33,7 @@ def work(case: str, steps: int, repeats: int, params: dict[str, Any]) -> None:
     import mqe_jax
     from mqe_jax.runs.throughput import programs
 
+    clock = time.process_time if cpu_time else time.perf_counter
     task, impl, count = case.split(":")
     env = mqe_jax.make(task, impl=impl, num_envs=int(count), **params)
     vector: Any = mqe_jax.VectorEnv(env, int(count), final=())
@@ -44,9 +45,9 @@ def work(case: str, steps: int, repeats: int, params: dict[str, Any]) -> None:
     def rate(run: Any, start: Any) -> float:
         seconds = []
         for _ in range(repeats):
-            began = time.perf_counter()
+            began = clock()
             start = jax.block_until_ready(run(start))
-            seconds.append(time.perf_counter() - began)
+            seconds.append(clock() - began)
         return int(count) * steps / median(seconds)
 
     carry = (jax.jit(vector.reset)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1))
@@ -59,13 +60,13 @@ def work(case: str, steps: int, repeats: int, params: dict[str, Any]) -> None:
         print(json.dumps({**figures, "device": device, "jax": jax.__version__}), file=output, flush=True)
 
 
-def start(place: str, case: str, steps: int, repeats: int) -> subprocess.Popen[str]:
+def start(place: str, case: str, **options: Any) -> subprocess.Popen[str]:
     """Starts the process that times one case in one checkout, PATH or PATH,PARAMETER=VALUE,..."""
     folder, *pairs = place.split(",")
     tree, params = Path(folder), {name: yaml.safe_load(value) for name, value in (pair.split("=") for pair in pairs)}
     path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    command = [sys.executable, str(Path(__file__).resolve()), "--work", case, str(steps), str(repeats)]
-    command.append(json.dumps(params))
+    command = [sys.executable, str(Path(__file__).resolve()), "--work", case]
+    command.append(json.dumps({**options, "params": params}))
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=tree, env=os.environ | {"PYTHONPATH": path}, **pipes)
 
@@ -91,19 +92,16 @@ def main() -> int:
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--cpu-time", action="store_true", help="count CPU time: for CPUs that others use too")
     parser.add_argument("--csv", type=Path)
-    parser.add_argument("--work", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--work", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.work:
-        case, steps, repeats, params = arguments.work
-        work(case, int(steps), int(repeats), json.loads(params))
+        work(arguments.work[0], **json.loads(arguments.work[1]))
         return 0
     trees = dict(pair.split("=", 1) for pair in arguments.trees)
-    workers = {
-        (case, name): start(tree, case, arguments.steps, arguments.repeats)
-        for case in arguments.cases
-        for name, tree in trees.items()
-    }
+    options = {name: getattr(arguments, name) for name in ("steps", "repeats", "cpu_time")}
+    workers = {(case, name): start(tree, case, **options) for case in arguments.cases for name, tree in trees.items()}
     for worker in workers.values():
         answer(worker, ask=False)
     rows: list[dict[str, Any]] = []

@@ -34,6 +34,8 @@ class Render(PolicyOptions):
     """Playback speed of a clip; 0.5 is slow motion."""
     at: Annotated[Time | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time of an image in the episode, s. Default: its middle."""
+    sensors: bool = False
+    """Draw what the robots sense, by the sensors of the parameter senses, or of its set onboard."""
 
     def run(self) -> dict[str, Any]:
         """Renders an episode to a file; returns the object for `--json`, with all episodes."""
@@ -41,7 +43,7 @@ class Render(PolicyOptions):
         from mqe_jax.viz.clips import check_output
 
         check_output(self.output, fps=self.fps, speed=self.speed, at=self.at)
-        look = {name: getattr(self, name) for name in ("seed", "seconds", "view", "width", "fps", "speed")}
+        look = {name: getattr(self, name) for name in ("seed", "seconds", "view", "width", "fps", "speed", "sensors")}
         clip = render(**self.playing, episodes=self.best_of, **look)
         renderer = clip.save(self.output, at=self.at)
         echo(f"mqe: wrote {self.output} ({renderer})")

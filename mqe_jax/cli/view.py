@@ -5,7 +5,7 @@ import errno
 import importlib.util
 import socket
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from annotated_types import Ge, Le
 
@@ -24,6 +24,8 @@ class View(PolicyOptions):
 
     num_envs: Annotated[int, Ge(1), Le(16)] = 1
     """Number of environments, side by side: 1 to 16."""
+    sensors: bool = False
+    """Draw what a robot senses, by the sensors of the parameter senses, or of its set onboard."""
     host: str = "127.0.0.1"
     """Address or name to listen on; the default is reachable from this machine only. There is no authentication."""
     port: Port = 8080
@@ -40,14 +42,16 @@ class View(PolicyOptions):
         from mqe_jax.view.session import Session
         from mqe_jax.view.viewer import Viewer
 
+        shown: Any = {"num_envs": self.num_envs, "sensors": self.sensors}
+
         def open_choice(choice: Entry) -> Session:
             """Creates another session, with the task's default parameters; a run has its own ones."""
             names = [None if name == DEFAULT else name for name in (choice.policy, choice.opponent)]
             target = choice.policy if choice.policy in runs else choice.task
             options = dataclasses.replace(self, target=target, policy=names[0], opponent=names[1], set=[])
-            return Session(*players(**options.playing, num_envs=self.num_envs)[:3], self.seed)
+            return Session(*players(**options.playing, **shown)[:3], self.seed)
 
-        env, vector_env, policy, _ = players(**self.playing, num_envs=self.num_envs)
+        env, vector_env, policy, _ = players(**self.playing, **shown)
         runs = find_runs([Path("runs"), Path(self.target).parent])
         own = self.policy or (DEFAULT if self.target in (env.name, *ALIASES) else self.target)
         menu = Menu(open_choice, Entry(env.name, own, self.opponent or DEFAULT), runs)

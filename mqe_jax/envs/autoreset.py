@@ -18,6 +18,7 @@ from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
+from mqe_jax.sensors.suite import ONBOARD
 
 SEEN = ("obs", "privileged_obs", "groups")
 """Fields that are observed once after the reset, and of which a batch may have those at the end of a step too."""
@@ -121,7 +122,8 @@ class VectorEnv(EnvBatch):
         other.groups = tuple(sorted({*names} - {"policy"}))
         for name in other.groups:
             if name not in self.group_sizes:
-                fail("group", name, f"one of {self.name}: {', '.join(self.group_sizes)}")
+                hint = f"; the task parameter senses adds {ONBOARD}" if name == ONBOARD else ""
+                fail("group", name, f"one of {self.name}: {', '.join(self.group_sizes)}{hint}")
         return other
 
     @check_arguments(key=RandomKey)

@@ -91,6 +91,7 @@ class QuadrupedEnv(Task[S, P]):
             max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots,
         )
         self.impl = self.physics.impl
+        self.check_senses()
         self.dt = float(self.compiled.model.opt.timestep) * self.physics.num_substeps
         if self.max_steps < 1:
             fail("episode_length", self.params.episode_length, f"at least one environment step, {self.dt} s")
@@ -237,12 +238,12 @@ class QuadrupedEnv(Task[S, P]):
     def advance(self, state: State[S], action: jax.Array) -> State[S]:
         """Returns the state of `step` with the observations from before it."""
         self.check_state(state)
-        action = self.controller.check_action(action)
+        action = self.controller.check_action(action, self.action_size)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
         still = (state.step < state.frozen_steps) | ~state.active
         own_action = jnp.where(still[:, None], 0.0, action)
-        action = self.unmirror_action(own_action)
+        action = self.unmirror_action(self.moving(own_action))
         key, push_key, _, npc_key = jax.random.split(state.key, 4)
 
         before = Moment(state, self.read(state.data, state.active))

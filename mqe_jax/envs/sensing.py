@@ -8,11 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.core.errors import InputError
 from mqe_jax.envs.state import State
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import CompiledScene
+from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.scene import Entity, SensedScene, Snapshot, entities_of
-from mqe_jax.sensors.suite import Suite
+from mqe_jax.sensors.suite import ONBOARD, Suite
 from mqe_jax.skills.control import Controller
 
 
@@ -23,13 +25,27 @@ class Sensing:
     compiled: CompiledScene
     num_agents: int
     controller: Controller
+    impl: str
     dt: float
     teams: Any
+    groups: Any
+    read: Any
 
     @property
     def action_size(self) -> int:
-        """Length of an agent's action."""
-        return self.controller.action_size
+        """Length of an agent's action: what moves the robot, then what sensors add, such as messages."""
+        return self.controller.action_size + sum(sensor.action_size for sensor in self.params.senses)
+
+    def moving(self, action: jax.Array) -> jax.Array:
+        """Returns the part of actions (..., action_size) that moves the robots."""
+        return action[..., : self.controller.action_size]
+
+    def check_senses(self) -> None:
+        """Raises an InputError for a sensor that the engine lacks."""
+        for sensor in self.params.senses:
+            if sensor.engines and self.impl not in sensor.engines:
+                allowed = " or ".join(sensor.engines)
+                raise InputError(f"senses: {sensor.name!r} needs impl {allowed}; the engine here is {self.impl}")
 
     @property
     def entities(self) -> tuple[Entity, ...]:
@@ -56,3 +72,8 @@ class Sensing:
         pose = self.own_frame(robot_state.base_info[: self.num_agents])[:, [0, 1, 5]]
         action = state.senses.action if state.senses else jnp.zeros((self.num_agents, self.action_size))
         return self.suite.scene.snapshot(state.data, robot_state, state.anchors, pose, action)
+
+    def marks(self, state: State[Any]) -> tuple[Marks, ...]:
+        """Returns what shows the readings in a state that has the group `onboard`."""
+        readings = self.groups[ONBOARD].split(state.groups[ONBOARD])
+        return self.suite.draw(self.snapshot(state, self.read(state.data, state.active)), state.senses, readings)

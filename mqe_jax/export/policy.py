@@ -67,12 +67,13 @@ def policy_step(policy: Trained, env: QuadrupedEnv, inputs: Mapping[str, jax.Arr
     """Returns the outputs of one step of one environment by name, the function that the graph maps over N."""
     action, memory = policy.act(inputs["obs"], fill_arrays("memory", policy.initial_memory(), inputs))
     outputs = {"action": action} | name_arrays("next_memory", memory)
+    moving = env.moving(action)
     if env.control == "torque":
-        return outputs | {"torque": action * env.robot.torque_limit}
+        return outputs | {"torque": moving * env.robot.torque_limit}
     if env.control == "position":
-        return outputs | {"joint_target": env.robot.joint_targets(action, env.params.position_scale)}
+        return outputs | {"joint_target": env.robot.joint_targets(moving, env.params.position_scale)}
     skill, params = skill_of(env)
-    commands = env.controller.skill_commands(action)
+    commands = env.controller.skill_commands(moving)
     sensed = Proprioception(*(inputs[name] for name in SENSED))
     act = jax.vmap(functools.partial(skill.targets, params))
     target, memory = act(fill_arrays(skill.name, skill.init_memory(), inputs), commands, sensed)

@@ -84,8 +84,8 @@ class TaskFunctions:
         """
         env, state = self.env, self.state(inputs)
         robots = env.read(state.data)
-        action = env.unmirror_action(jnp.clip(inputs["action"], -1.0, 1.0))
-        action = jnp.where(inputs["driven"][:, None] > 0.5, inputs["drive"], action)
+        action = env.unmirror_action(env.moving(jnp.clip(inputs["action"], -1.0, 1.0)))
+        action = jnp.where(inputs["driven"][:, None] > 0.5, env.moving(inputs["drive"]), action)
         commands, npcs = env.controller.skill_commands(action), env.npc_commands(state, robots)
         if npcs is not None:
             commands = jnp.concatenate([commands, env.controller.skill.with_choice(env.npc_skill, npcs)])

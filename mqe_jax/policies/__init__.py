@@ -277,7 +277,8 @@ def _constant(shape: tuple[int, ...], first: float, obs: jax.Array, key: jax.Arr
 def _act_scripted(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) -> jax.Array:
     part = env.controller.skill.parts[0]
     own = Commander(part, env.params.commands, part.default_commands(), {})
-    return env.controller.translated(jax.vmap(scripted_policy(env, name))(obs), own)
+    action = env.controller.translated(jax.vmap(scripted_policy(env, name))(obs), own)
+    return jnp.pad(action, ((0, 0), (0, 0), (0, env.action_size - action.shape[-1])))
 
 
 def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], jax.Array]:

@@ -24,6 +24,7 @@ from mqe_jax.selfplay.league.league import League, Roster
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.mates import Mates
 from mqe_jax.selfplay.opponents import Mirror, versus
+from mqe_jax.sensors.suite import ONBOARD, sensors_of
 from mqe_jax.train import learner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Act
@@ -265,8 +266,11 @@ def players(
     impl: str = "auto",
     num_envs: int = 1,
     deterministic: bool = False,
+    sensors: bool = False,
 ) -> Players:
     """Returns what is evaluated, rendered and viewed; arguments and errors as `mqe_jax.evaluate`.
+
+    `sensors` gives the robots those of the set `onboard`, unless they have some.
 
     A run has its own task, parameters and policy. Without a policy, a task has its shipped one if no parameters are
     given, on both sides of a match; else its scripted one, or `forward`; where actions are not commands, `random`. A
@@ -281,12 +285,14 @@ def players(
         if name not in (*TASKS, *zoo.names()) and (os.sep in name or Path(name).exists()):
             config = run_config(name)
             made, params, policy = config.task or "", merge(config.env, params), policy or name
-    shipped = name in zoo.names() and not params and policy is None
+    shipped = name in zoo.names() and not {*params} - {"senses"} and policy is None
     walking = "scripted" if name in PLANNERS else "forward"
     default = walking if params.get("control", "command") == "command" else "random"
     chosen = (name if shipped else default) if policy is None else policy
     if isinstance(made, str):
         params = merge(merge(params, parameters_for(made, chosen, opponent)), env or {})
+    if sensors and not sensors_of(params.get("senses", ())):
+        params["senses"] = ONBOARD
     task_env, batch = make_env(made, impl, params, num_envs)
     own = load_as("policy", chosen, task_env, deterministic=deterministic)
     match = len(task_env.teams) > 1
@@ -299,7 +305,8 @@ def players(
     if match:
         about["opponent"] = str(against)
     everyone = all_agents(task_env, own, other)
-    return Players(task_env, batch.with_groups(groups_of(everyone)), everyone, about)
+    groups = {*groups_of(everyone), *([ONBOARD] if sensors else [])}
+    return Players(task_env, batch.with_groups(groups), everyone, about)
 
 
 def run_config(target: str) -> TrainConfig:

@@ -146,7 +146,9 @@ def tournament(
     return Standings(single.name, names, results, league.rate(results, names.index(references[0])))
 
 
-@check_arguments("width", "fps", "speed", episodes=Candidates, seconds=ClipLength, seed=Seed, view=Camera | None)
+@check_arguments(
+    "width", "fps", "speed", "sensors", episodes=Candidates, seconds=ClipLength, seed=Seed, view=Camera | None
+)
 def render(
     task: str | Path | QuadrupedEnv,
     policy: Player = None,
@@ -162,6 +164,7 @@ def render(
     width: ImageWidth | None = None,
     fps: FrameRate | None = None,
     speed: Speed = 1.0,
+    sensors: bool = False,
 ) -> "Clip":
     """Records an episode as a clip, which shows itself in a notebook and can be saved.
 
@@ -180,6 +183,7 @@ def render(
         width: image width, pixels, at 16:9. Default: 960 for .mp4, 480 for .webp, .gif and notebooks, 1280 for .png.
         fps: frames per second. Default: 25 for .mp4, else 12.5.
         speed: playback speed; 0.5 is slow motion.
+        sensors: whether to draw what the robots sense, by the sensors of `senses`, or of the set `onboard`.
 
     Raises:
         InputError: as `evaluate`.
@@ -188,9 +192,10 @@ def render(
     from mqe_jax.viz.render import gl_backend
 
     threading.Thread(target=gl_backend, daemon=True).start()  # while the episode is computed
-    playing = build.players(task, policy, opponent, env=env, impl=impl, num_envs=episodes, deterministic=deterministic)
+    options: Any = {"env": env, "impl": impl, "num_envs": episodes, "deterministic": deterministic}
+    playing = build.players(task, policy, opponent, **options, sensors=sensors)
     key = jax.random.PRNGKey(seed)
-    recorded = record_episodes(playing.env, playing.policy, key, episodes=episodes, seconds=seconds)
+    recorded = record_episodes(playing.env, playing.policy, key, episodes=episodes, seconds=seconds, sensors=sensors)
     size = None if width is None else (width, round(width * 9 / 32) * 2)
     look = {"view": view, "size": size, "fps": fps, "speed": speed}
     return Clip(playing.env, recorded, {**playing.about, "seed": seed}, look)

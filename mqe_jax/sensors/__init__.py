@@ -6,7 +6,7 @@ A sensor is a settings record derived from `Sensor` in its own file, registered 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import mujoco
@@ -14,6 +14,7 @@ import mujoco
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import FrozenMapping, fail, is_record, record
+from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.sensors.scene import SensedScene, Snapshot
 
@@ -22,10 +23,18 @@ from mqe_jax.sensors.scene import SensedScene, Snapshot
 class Sensor:
     """Base of all sensors: functions of one environment, for all its agents."""
 
+    engines: ClassVar[tuple[str, ...]] = ()
+    """Engines on which it works; all if there are none."""
+
     name: str = ""
     """Name in the registry; of a subclass, a `Literal` with its value as the default."""
     pipeline: Mapping[str, Pipeline] = FrozenMapping()
     """What happens to the readings of its blocks, by their names; of those not named, what `all` has."""
+
+    @property
+    def action_size(self) -> int:
+        """Length of what it adds to an agent's action, after what moves the robot; one sensor of a task may."""
+        return 0
 
     def pipeline_of(self, block: Block) -> Pipeline:
         """Returns what happens to the readings of a block."""
@@ -47,6 +56,12 @@ class Sensor:
     ) -> tuple[dict[str, jax.Array], Any]:
         """Returns the readings of all agents by block (A, width), each in its own frame, and the next memory."""
         raise NotImplementedError(f"sensor {type(self).__name__}: observe() is not defined")
+
+    def draw(
+        self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
+    ) -> tuple[Marks, ...]:
+        """Returns what shows its latest readings by block (A, width), as policies get them but for their scale."""
+        return ()
 
 
 SENSORS: dict[str, type[Sensor]] = {}

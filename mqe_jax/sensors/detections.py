@@ -1,5 +1,6 @@
 """Detections: robots, objects, gates and goals that a camera and a detector on the robot would report."""
 
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import jax
@@ -11,8 +12,15 @@ from mqe_jax.core.limits import Degrees, Distance, Fraction, Length
 from mqe_jax.core.settings import record
 from mqe_jax.physics.objects import Rectangle
 from mqe_jax.sensors import Sensor, register
-from mqe_jax.sensors.planar import cast, turn
-from mqe_jax.sensors.scene import SensedScene, Snapshot
+from mqe_jax.sensors.marks import Marks, marks
+from mqe_jax.sensors.planar import to_circles, to_segments, turn
+from mqe_jax.sensors.scene import SensedScene, Snapshot, reach
+
+_VIEW = (1.0, 0.85, 0.1)
+_SEEN = {"seen now": (0.4, 0.1, 0.95), "seen before": (0.1, 0.1, 0.1)}
+_ABOVE = 0.3  # height of their lines above the trunk, where sheep do not hide them, m
+_EDGES = 65  # points of the edge of what is in view
+_FADE, _PALEST = 2.0, 0.2  # time after which a line to somebody seen has half its opacity, s; its least opacity
 
 
 @register
@@ -55,46 +63,94 @@ class Detections(Sensor):
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        agents = np.arange(scene.num_agents)
-        relative = snapshot.places - snapshot.places[agents, None]  # (A, R + E, 3)
-        yaw, mirror = snapshot.places[agents, 2:], jnp.asarray(scene.mirror, jnp.float32)[:, None]
-        position = turn(relative[..., :2], -yaw) * jnp.stack([jnp.ones_like(mirror), mirror], axis=-1)
-        miss_key, position_key, yaw_key = jax.random.split(key, 3)
-        sighted = self.visible(scene, snapshot)
-        if self.misses:
-            sighted &= ~jax.random.bernoulli(miss_key, self.misses, sighted.shape)
-        if self.position_noise:
-            position += self.position_noise * jax.random.normal(position_key, position.shape)
-        angle = relative[..., 2] * mirror
-        if self.yaw_noise:
-            angle += np.deg2rad(self.yaw_noise) * jax.random.normal(yaw_key, angle.shape)
-        turned = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+        agents, poses = np.arange(scene.num_agents)[:, None], snapshot.places[: scene.num_agents, None]
+        mirror, sighted = scene.mirror[:, None].astype(np.float32), self.visible(scene, snapshot)
         blocks, kept = {}, {}
-        for kind, rows in scene.targets.items():
+        for kind, rows, (off_x, off_y, off_yaw, missed) in self._chances(scene, key):
             entries, known = memory[kind]
-            now, one = sighted[agents[:, None], rows], agents[:, None]
-            seen = [position[one, rows], *([turned[one, rows]] if _turns(scene, rows) else [])]
+            way = snapshot.places[rows] - poses
+            x, y = jnp.moveaxis(turn(way[..., :2], -poses[..., 2]), -1, 0)
+            seen = [jnp.stack([x + off_x, mirror * y + off_y], axis=-1)]
+            if _turns(scene, rows):
+                angle = mirror * way[..., 2] + off_yaw
+                seen.append(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1))
             seen = jnp.concatenate([*seen, jnp.zeros((*rows.shape, 1))], axis=-1)
+            now = sighted[agents, rows] & ~missed
             entries = jnp.where(now[..., None], seen, entries.at[..., -1].add(scene.dt))
             kept[kind] = entries, known | now
             blocks[kind] = by_entity(*kept[kind])
         return blocks, kept
 
+    def _chances(self, scene: SensedScene, key: jax.Array) -> Iterator[tuple[str, np.ndarray, list[Any]]]:
+        """Yields kind and rows of targets with the noise of x, y, m, and of yaw, rad, and who is missed (A, count).
+
+        One draw for each of them, over all kinds: XLA would compute a common one again in each of its uses.
+        """
+        sizes = [rows.shape[1] for rows in scene.targets.values()]
+        shape, keys = (scene.num_agents, sum(sizes)), jax.random.split(key, 4)
+        deviations = self.position_noise, self.position_noise, np.deg2rad(self.yaw_noise)
+        noise = [
+            x * jax.random.normal(k, shape) if x else jnp.zeros(shape) for x, k in zip(deviations, keys, strict=False)
+        ]
+        missed = jax.random.uniform(keys[3], shape) < self.misses if self.misses else jnp.zeros(shape, bool)
+        parts = [jnp.split(each, np.cumsum(sizes)[:-1], axis=1) for each in (*noise, missed)]
+        for (kind, rows), *part in zip(scene.targets.items(), *parts, strict=True):
+            yield kind, rows, part
+
+    def draw(
+        self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
+    ) -> tuple[Marks, ...]:
+        """Shows what is in view, and lines to whom each agent has seen, the paler the longer ago."""
+        origin, yaw = snapshot.places[: scene.num_agents, None, :2], snapshot.places[: scene.num_agents, 2:]
+        half = np.deg2rad(self.field_of_view / 2)
+        direction = turn(jnp.array([1.0, 0.0]), yaw + np.linspace(-half, half, _EDGES, dtype=np.float32))
+        edge = origin + reach(scene, snapshot, direction, self.range)[..., None] * direction
+        rows = np.concatenate([*scene.targets.values()], axis=1)
+        ends = snapshot.places[rows, :2]
+        lines = jnp.stack([jnp.broadcast_to(origin, ends.shape), ends], axis=2)
+        age = jnp.concatenate([memory[kind][0][..., -1] for kind in scene.targets], axis=1)
+        known = jnp.concatenate([memory[kind][1] for kind in scene.targets], axis=1)
+        now, faded = age < scene.dt / 2, jnp.maximum(jnp.exp2(-age / _FADE), _PALEST)
+        found = {"seen now": (known & now) * 1.0, "seen before": jnp.where(known & ~now, faded, 0.0)}
+        return (
+            marks("in view", _VIEW, snapshot.height, area=jnp.concatenate([origin, edge], axis=1)),
+            *(
+                marks(
+                    label,
+                    _SEEN[label],
+                    snapshot.height + _ABOVE,
+                    lines=lines,
+                    line_opacity=opacity,
+                    points=ends,
+                    point_opacity=opacity,
+                    bold=True,
+                )
+                for label, opacity in found.items()
+            ),
+        )
+
     def visible(self, scene: SensedScene, snapshot: Snapshot) -> jax.Array:
         """Returns which of the robots and entities each agent can sight (A, R + E) bool."""
-        agents, places = np.arange(scene.num_agents), np.arange(scene.num_robots + len(scene.entities))
-        origin = snapshot.places[agents, None, :2]
-        way = snapshot.places[:, :2] - origin
-        distance = jnp.linalg.norm(way, axis=-1)
-        direction = way / jnp.maximum(distance, 1e-6)[..., None]
-        ahead = turn(jnp.array([1.0, 0.0]), snapshot.places[agents, 2])
-        inside = jnp.sum(direction * ahead[:, None], axis=-1) >= np.cos(np.deg2rad(self.field_of_view / 2))
-        reach = cast(jnp.broadcast_to(origin, way.shape), direction, snapshot.circles, snapshot.segments)
+
+        def see(pose: jax.Array, radius: jax.Array) -> jax.Array:
+            way = snapshot.places[:, :2] - pose[:2]
+            distance = jnp.linalg.norm(way, axis=-1)
+            direction = way / jnp.maximum(distance, 1e-6)[..., None]
+            ahead = jnp.sum(direction * turn(jnp.array([1.0, 0.0]), pose[2]), axis=-1)
+            inside = ahead >= np.cos(np.deg2rad(self.field_of_view / 2))
+            circles = jnp.concatenate([snapshot.circles[:, :2], radius[:, None]], axis=-1)
+            hidden = jnp.concatenate(
+                [
+                    to_circles(pose[:2], direction, circles) < distance,
+                    to_segments(pose[:2], direction, snapshot.segments) < distance,
+                ]
+            )
+            return inside & (distance <= self.range) & ~jnp.any(hidden & apart, axis=0)
+
         # The line of sight begins and ends within the outlines of both.
-        own = (scene.owners == agents[:, None, None]) | (scene.owners == places[:, None])
-        clear = jnp.all(own | (reach >= distance[..., None]), axis=-1)
+        apart = scene.owners[:, None] != np.arange(len(snapshot.places))
         there = jnp.concatenate([snapshot.robots.active, jnp.ones(len(scene.entities), bool)])
-        return inside & (distance <= self.range) & clear & there
+        return jax.vmap(see)(snapshot.places[: scene.num_agents], scene.others(snapshot)) & there
 
 
 def _turns(scene: SensedScene, rows: np.ndarray) -> bool:

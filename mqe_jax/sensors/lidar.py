@@ -1,5 +1,6 @@
 """A planar lidar at the height of the trunk."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import jax
@@ -10,8 +11,11 @@ from mqe_jax.core.blocks import Block
 from mqe_jax.core.limits import Length, Rays
 from mqe_jax.core.settings import record
 from mqe_jax.sensors import Sensor, register
-from mqe_jax.sensors.planar import cast, turn
-from mqe_jax.sensors.scene import SensedScene, Snapshot
+from mqe_jax.sensors.marks import Marks, marks
+from mqe_jax.sensors.planar import turn
+from mqe_jax.sensors.scene import SensedScene, Snapshot, reach
+
+_COLOR = (0.0, 0.55, 0.8)
 
 
 @register
@@ -32,11 +36,19 @@ class Lidar(Sensor):
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        agents = np.arange(scene.num_agents)
-        x, y, yaw = snapshot.places[agents].T
-        angle = np.arange(self.rays, dtype=np.float32) * (2 * np.pi / self.rays)
-        direction = turn(jnp.array([1.0, 0.0]), yaw[:, None] + scene.mirror[:, None] * angle)
-        origin = jnp.broadcast_to(jnp.stack([x, y], axis=-1)[:, None], direction.shape)
-        distance = cast(origin, direction, snapshot.circles, snapshot.segments)
-        own = scene.owners == agents[:, None]
-        return {"lidar": jnp.min(jnp.where(own[:, None], self.range, distance), axis=-1, initial=self.range)}, memory
+        return {"lidar": reach(scene, snapshot, self._directions(scene, snapshot), self.range)}, memory
+
+    def draw(
+        self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
+    ) -> tuple[Marks, ...]:
+        origin, distance = snapshot.places[: scene.num_agents, None, :2], readings["lidar"]
+        hits = origin + distance[..., None] * self._directions(scene, snapshot)
+        lines = jnp.stack([jnp.broadcast_to(origin, hits.shape), hits], axis=2)
+        shown = {"lines": lines, "line_opacity": 1.0, "points": hits, "point_opacity": distance < 0.99 * self.range}
+        return (marks("lidar", _COLOR, snapshot.height, **shown),)
+
+    def _directions(self, scene: SensedScene, snapshot: Snapshot) -> jax.Array:
+        """Returns the rays' unit vectors (A, rays, 2)."""
+        angle = np.arange(self.rays, dtype=np.float32) * np.float32(2 * np.pi / self.rays)
+        yaw = snapshot.places[: scene.num_agents, 2:]
+        return turn(jnp.array([1.0, 0.0]), yaw + scene.mirror[:, None].astype(np.float32) * angle)

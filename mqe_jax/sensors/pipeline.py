@@ -36,6 +36,11 @@ class Pipeline:
         image = block.image and (self.history * block.image[0], *block.image[1:])
         return dataclasses.replace(block, width=self.history * block.width, entities=entities, image=image)
 
+    def newest(self, block: Block, value: jax.Array) -> jax.Array:
+        """Returns the newest reading (A, width) in what comes out, without the scale."""
+        value = value[:, : block.width]
+        return jnp.where(block.continuous > 0, value / self.scale, value)
+
     def init_memory(self, block: Block, agents: int) -> Any:
         """Returns the readings on their way (D, A, W), those last delivered (H, A, W), and whether there are any."""
         return (
@@ -44,17 +49,23 @@ class Pipeline:
             jnp.zeros((), bool),
         )
 
-    def apply(self, block: Block, reading: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Returns what comes out of a reading (A, W), and the next memory; an episode's first reading comes at once."""
+    def apply(
+        self,
+        block: Block,
+        reading: jax.Array,
+        memory: Any,
+        noise: jax.Array | float = 0.0,
+        lost: jax.Array | bool = False,
+    ) -> tuple[jax.Array, Any]:
+        """Returns what comes out of a reading (A, W), and the next memory; an episode's first reading comes at once.
+
+        `noise` (A, W) is standard normal, and `lost` (A, 1) says whose reading does not arrive.
+        """
         underway, delivered, started = memory
-        noise_key, drop_key = jax.random.split(key)
-        value = reading + self.noise * jax.random.normal(noise_key, reading.shape) if self.noise else reading
+        value = reading + self.noise * noise if self.noise else reading
         value = value if self.clip is None else jnp.clip(value, *self.clip)
         value = jnp.where(block.continuous > 0, self.scale * value, reading)
         line = jnp.concatenate([value[None], jnp.where(started, underway, value)])
-        now = line[-1]
-        if self.dropout:
-            lost = jax.random.bernoulli(drop_key, self.dropout, (len(reading), 1)) & started
-            now = jnp.where(lost, delivered[0], now)
+        now = jnp.where(lost & started, delivered[0], line[-1]) if self.dropout else line[-1]
         delivered = jnp.concatenate([now[None], jnp.where(started, delivered, now)])[: self.history]
         return jnp.moveaxis(delivered, 0, 1).reshape(len(reading), -1), (line[:-1], delivered, jnp.ones((), bool))

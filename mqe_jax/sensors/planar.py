@@ -20,11 +20,6 @@ def turn(vector: ArrayLike, angle: jax.Array) -> jax.Array:
     return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
-def cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Returns the cross products (...) of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
 def sides(pose: jax.Array, size: np.ndarray) -> jax.Array:
     """Returns the ends of the sides (4 n, 2, 2), m, of rectangles of a size (n, 2) at poses x, y, yaw (n, 3)."""
     corners = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]], np.float32) * size[:, None]
@@ -32,25 +27,34 @@ def sides(pose: jax.Array, size: np.ndarray) -> jax.Array:
     return jnp.stack([corners, jnp.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
 
 
-def cast(origin: jax.Array, direction: jax.Array, circles: jax.Array, segments: jax.Array) -> jax.Array:
-    """Returns the distances along rays to shapes (..., C + S), m, infinite where a ray misses.
+def to_circles(origin: jax.Array, direction: jax.Array, circles: jax.Array) -> jax.Array:
+    """Returns the distances along the rays of one robot to circles (C, N), m, infinite where a ray misses.
 
     Args:
-        origin: start of each ray (..., 2), m.
-        direction: unit vectors (..., 2).
-        circles: x, y, radius (C, 3), m.
+        origin: start of the rays (2,), m.
+        direction: unit vectors (N, 2).
+        circles: x, y, radius (C, 3), m; a circle without a radius is missed.
+    """
+    (dx, dy), (x, y) = direction.T, (circles[:, :2] - origin).T[..., None]
+    along, aside = dx * x + dy * y, dx * y - dy * x
+    room = jnp.square(circles[:, 2:]) - jnp.square(aside)
+    half = jnp.sqrt(jnp.maximum(room, 0.0))
+    near = jnp.where(along > half, along - half, along + half)  # the far side from within
+    return jnp.where((room > 0) & (near > 0), near, jnp.inf)
+
+
+def to_segments(origin: jax.Array, direction: jax.Array, segments: jax.Array) -> jax.Array:
+    """Returns the distances along the rays of one robot to segments (S, N), m, infinite where a ray misses.
+
+    Args:
+        origin: start of the rays (2,), m.
+        direction: unit vectors (N, 2).
         segments: both ends (S, 2, 2), m.
     """
-    origin, direction = origin[..., None, :], direction[..., None, :]
-    center = circles[:, :2] - origin
-    along, aside = jnp.sum(direction * center, axis=-1), cross(direction, center)
-    half = jnp.sqrt(jnp.maximum(jnp.square(circles[:, 2]) - jnp.square(aside), 0.0))
-    near = jnp.where(along > half, along - half, along + half)  # the far side from within
-    circle = jnp.where((jnp.abs(aside) < circles[:, 2]) & (near > 0), near, jnp.inf)
-
     start, side = segments[:, 0] - origin, segments[:, 1] - segments[:, 0]
-    slope = cross(direction, side)
-    divisor = jnp.where(slope == 0, 1.0, slope)
-    far, part = cross(start, side) / divisor, cross(start, direction) / divisor
-    hit = (slope != 0) & (far > 0) & (part >= -_EDGE) & (part <= 1 + _EDGE)
-    return jnp.concatenate([circle, jnp.where(hit, far, jnp.inf)], axis=-1)
+    (dx, dy), (sx, sy), (tx, ty) = direction.T, start.T[..., None], side.T[..., None]
+    slope = dx * ty - dy * tx
+    scale = 1.0 / jnp.where(slope == 0, 1.0, slope)
+    far, part = scale * (sx * ty - sy * tx), scale * (sx * dy - sy * dx)
+    hit = (slope != 0) & (far > 0) & (jnp.abs(part - 0.5) <= 0.5 + _EDGE)
+    return jnp.where(hit, far, jnp.inf)

@@ -1,5 +1,6 @@
 """Proprioception: what inertial unit, joint encoders and odometry measure, and the last action."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import jax
@@ -11,8 +12,13 @@ from mqe_jax.core.limits import Degrees, Distance
 from mqe_jax.core.settings import record
 from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
 from mqe_jax.sensors import Sensor, register
+from mqe_jax.sensors.marks import Marks, marks
 from mqe_jax.sensors.planar import turn
 from mqe_jax.sensors.scene import SensedScene, Snapshot
+
+_COLOR = (0.95, 0.1, 0.5)
+_ABOVE = 0.15  # height of the arrow above the trunk, m
+_ARROW = np.array([[[0, 0], [0.45, 0]], [[0.45, 0], [0.33, 0.08]], [[0.45, 0], [0.33, -0.08]]], np.float32)  # m
 
 
 @register
@@ -50,12 +56,12 @@ class Proprioception(Sensor):
         side = np.where(np.arange(3) == 1, mirror, 1.0)  # of y; rotations change the signs of the other two
         joints = lambda x: jnp.where(mirror < 0, x[:, MIRRORED_JOINTS] * MIRRORED_SIGNS, x)  # noqa: E731
         estimate, last, started = memory
-        way_key, yaw_key = jax.random.split(key)
+        chance = jax.random.normal(key, (scene.num_agents, 3))  # of position and yaw
         moved = turn(snapshot.pose[:, :2] - last[:, :2], -last[:, 2])
         way = jnp.linalg.norm(moved, axis=-1, keepdims=True)
-        moved += self.drift * jnp.sqrt(way) * jax.random.normal(way_key, moved.shape)
+        moved += self.drift * jnp.sqrt(way) * chance[:, :2]
         turned = snapshot.pose[:, 2] - last[:, 2]
-        noise = np.deg2rad(self.yaw_drift) * np.sqrt(scene.dt) * jax.random.normal(yaw_key, turned.shape)
+        noise = np.deg2rad(self.yaw_drift) * np.sqrt(scene.dt) * chance[:, 2]
         position = estimate[:, :2] + turn(moved, estimate[:, 2])
         guess = jnp.concatenate([position, (estimate[:, 2] + turned + noise)[:, None]], axis=-1)
         estimate = jnp.where(started, guess, snapshot.pose)
@@ -69,3 +75,18 @@ class Proprioception(Sensor):
             "odometry": jnp.concatenate([estimate[:, :2], jnp.cos(yaw), jnp.sin(yaw)], axis=-1),
         }
         return blocks, (estimate, snapshot.pose, jnp.ones((), bool))
+
+    def draw(
+        self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
+    ) -> tuple[Marks, ...]:
+        """Shows the estimated pose as an arrow, with a line to the true one."""
+        places, mirror = snapshot.places[: scene.num_agents], jnp.asarray(scene.mirror, jnp.float32)[:, None]
+        x, y, cosine, sine = readings["odometry"].T
+        off = turn(jnp.stack([x, y], axis=-1) - snapshot.pose[:, :2], -snapshot.pose[:, 2])
+        off = jnp.concatenate([off[:, :1], mirror * off[:, 1:]], axis=-1)
+        at = places[:, :2] + turn(off, places[:, 2])
+        yaw = places[:, 2:] + mirror * (jnp.arctan2(sine, cosine) - snapshot.pose[:, 2])[:, None]
+        arrow = at[:, None, None] + turn(_ARROW, yaw[..., None])
+        link = jnp.stack([places[:, :2], at], axis=1)[:, None]
+        lines = jnp.concatenate([arrow, link], axis=1)
+        return (marks("odometry", _COLOR, snapshot.height + _ABOVE, lines=lines, points=at[:, None], bold=True),)

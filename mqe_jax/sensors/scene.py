@@ -15,7 +15,7 @@ from mqe_jax.physics.objects import Circle, Rectangle
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.rotation import quaternion_to_euler
 from mqe_jax.physics.scene import CompiledScene
-from mqe_jax.sensors.planar import sides
+from mqe_jax.sensors.planar import sides, to_circles, to_segments
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -55,6 +55,11 @@ class Snapshot(NamedTuple):
     segments: jax.Array
     """Ends of the sides of walls and entities (S, 2, 2), m."""
 
+    @property
+    def height(self) -> jax.Array:
+        """Heights of the agents' trunks (A,), m."""
+        return self.robots.position_w[: len(self.pose), 2]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SensedScene:
@@ -90,6 +95,18 @@ class SensedScene:
         )
 
     @functools.cached_property
+    def mates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Each agent's teammates, padded by itself to the size of the largest team (A, count), and which are some."""
+        count = max(map(len, self.teams)) - 1
+        rows = [
+            [*(mate for mate in team if mate != agent), *[agent] * count][:count]
+            for team in self.teams
+            for agent in team
+        ]
+        mates = np.array(rows, int).reshape(self.num_agents, count)
+        return mates, mates != np.arange(self.num_agents)[:, None]
+
+    @functools.cached_property
     def targets(self) -> dict[str, np.ndarray]:
         """What each agent may detect by kind, as rows of `Snapshot.places` (A, count)."""
         robots = np.arange(self.num_robots)
@@ -117,6 +134,11 @@ class SensedScene:
         walls = len(self.compiled.layout.barriers) + 4 * len(self.compiled.layout.walls)
         rectangles = [row for row, outline in self.outlines.items() if isinstance(outline, Rectangle)]
         return np.array([*range(self.num_robots), *circles, *[-1] * walls, *np.repeat(rectangles, 4)], int)
+
+    def others(self, snapshot: Snapshot) -> jax.Array:
+        """Returns the radii of the circles for the rays of each agent (A, C), m: 0 of its own one."""
+        rows = np.arange(self.num_agents)[:, None]
+        return jnp.where(self.owners[: len(snapshot.circles)] == rows, 0.0, snapshot.circles[:, 2])
 
     def snapshot(
         self, data: mjx.Data, robots: RobotState, anchors: jax.Array, pose: jax.Array, action: jax.Array
@@ -160,6 +182,18 @@ class SensedScene:
             center = center.at[moving].add(anchors[self.compiled.mocap_anchor])
         boxes = sides(jnp.pad(center, ((0, 0), (0, 1))), np.reshape([wall.size[:2] for wall in walls], (-1, 2)))
         return jnp.concatenate([jnp.asarray(ends, jnp.float32), boxes])
+
+
+def reach(scene: SensedScene, snapshot: Snapshot, direction: jax.Array, limit: float) -> jax.Array:
+    """Returns how far each agent's rays (A, N, 2) get from its trunk's centre (A, N), m, at most `limit`."""
+
+    def read(origin: jax.Array, direction: jax.Array, radius: jax.Array) -> jax.Array:
+        circles = jnp.concatenate([snapshot.circles[:, :2], radius[:, None]], axis=-1)
+        found = to_circles(origin, direction, circles), to_segments(origin, direction, snapshot.segments)
+        circle, segment = (jnp.min(each, axis=0, initial=limit) for each in found)
+        return jnp.minimum(circle, segment)
+
+    return jax.vmap(read)(snapshot.places[: scene.num_agents, :2], direction, scene.others(snapshot))
 
 
 def _planar(position: jax.Array, quaternion: jax.Array) -> jax.Array:

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pydantic
 
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import nearest
 from mqe_jax.core.settings import build, fail
-from mqe_jax.sensors import SENSORS, Sensor
+from mqe_jax.sensors import SENSORS, Sensor, depth, messages  # noqa: F401
 from mqe_jax.sensors.detections import Detections
 from mqe_jax.sensors.lidar import Lidar
+from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.sensors.proprioception import Proprioception
 from mqe_jax.sensors.scene import SensedScene, Snapshot
@@ -46,7 +49,7 @@ def sensors_of(value: Any) -> tuple[Sensor, ...]:
     """Returns sensors from the name of a set, or from a sequence of sensors, of their names and of mappings.
 
     Raises:
-        InputError: for an unknown name, or two sensors of one name.
+        InputError: for an unknown name, two sensors of one name, or two that add to actions.
     """
     if isinstance(value, str):
         if value not in SETS:
@@ -57,6 +60,8 @@ def sensors_of(value: Any) -> tuple[Sensor, ...]:
     sensors = tuple(map(_sensor, value))
     if len({sensor.name for sensor in sensors}) < len(sensors):
         fail("senses", [sensor.name for sensor in sensors], "sensors of different names")
+    if len(added := [sensor.name for sensor in sensors if sensor.action_size]) > 1:
+        fail("senses", added, "sensors of which at most one adds to actions")
     return sensors
 
 
@@ -128,10 +133,29 @@ class Suite:
             own_key = jax.random.fold_in(key, number)
             blocks, memory[sensor.name] = sensor.observe(self.scene, snapshot, state.memory[sensor.name], own_key)
             readings |= blocks
+        piped = {x.name: (sensor.pipeline_of(x), x) for sensor, x in self._measured if x.name in state.queues}
+        noise, lost = self._chances(piped, jax.random.fold_in(key, len(self.sensors)))
         queues = {}
-        for number, (sensor, block) in enumerate(self._measured):
-            if block.name in state.queues:
-                own_key = jax.random.fold_in(key, len(self.sensors) + number)
-                pipeline, queue = sensor.pipeline_of(block), state.queues[block.name]
-                readings[block.name], queues[block.name] = pipeline.apply(block, readings[block.name], queue, own_key)
+        for name, (pipeline, block) in piped.items():
+            chances = noise.get(name, 0.0), lost.get(name, False)
+            readings[name], queues[name] = pipeline.apply(block, readings[name], state.queues[name], *chances)
         return readings, SensorState(state.action, memory, queues)
+
+    def _chances(
+        self, piped: Mapping[str, tuple[Pipeline, Block]], key: jax.Array
+    ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+        """Returns the noise and the losses of blocks with pipelines that have some; one draw each, which saves time."""
+        agents, (noise_key, loss_key) = self.scene.num_agents, jax.random.split(key)
+        noisy = {name: block.width for name, (pipeline, block) in piped.items() if pipeline.noise}
+        drawn = jax.random.normal(noise_key, (agents, sum(noisy.values())))
+        parts = jnp.split(drawn, np.cumsum([*noisy.values()])[:-1], axis=1) if noisy else []
+        rates = {name: pipeline.dropout for name, (pipeline, _) in piped.items() if pipeline.dropout}
+        losses = jax.random.uniform(loss_key, (len(rates), agents, 1)) if rates else ()
+        lost = {name: loss < rate for (name, rate), loss in zip(rates.items(), losses, strict=True)}
+        return dict(zip(noisy, parts, strict=True)), lost
+
+    def draw(self, snapshot: Snapshot, state: SensorState, readings: Mapping[str, jax.Array]) -> tuple[Marks, ...]:
+        """Returns what shows the sensors' readings, by block as `observe` returns them, in the state after it."""
+        newest = {x.name: sensor.pipeline_of(x).newest(x, readings[x.name]) for sensor, x in self._measured}
+        drawn = (sensor.draw(self.scene, snapshot, newest, state.memory[sensor.name]) for sensor in self.sensors)
+        return tuple(itertools.chain.from_iterable(drawn))

@@ -134,13 +134,13 @@ class Controller(Commander):
             rest[: self.num_agents] = 0.0
         return rest
 
-    def check_action(self, action: jax.Array) -> jax.Array:
-        """Returns actions (A, action_size) as an array; InputError for others, or known ones that are not finite."""
+    def check_action(self, action: jax.Array, size: int) -> jax.Array:
+        """Returns actions (A, size) as an array; InputError for others, or known ones that are not finite."""
         try:
             action = jnp.asarray(action)
         except (TypeError, ValueError, OverflowError):
             fail("action", action, "an array of numbers")
-        shape = (self.num_agents, self.action_size)
+        shape = (self.num_agents, size)
         if action.shape != shape:
             raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
         if not jnp.issubdtype(action.dtype, jnp.floating):

@@ -1,6 +1,6 @@
 """HTML of the panel. viser's Markdown renders HTML that is in a text, so every text of the panel is escaped here."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,15 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     head_row = f"<thead><tr>{cells('th', head)}</tr></thead>"
     return f'<div style="{_BOX}"><table style="border-collapse:collapse">{head_row}<tbody>{body}</tbody></table></div>'
+
+
+def legend(colors: Mapping[str, tuple[float, float, float]]) -> str:
+    """Returns labels, each after a dot of its colour, 0 to 1."""
+    dots = (
+        f'<span style="color:rgb({",".join(str(int(255 * part)) for part in color)})">&#9679;</span> {to_html(label)}'
+        for label, color in colors.items()
+    )
+    return f'<div style="{_BOX}">{" &nbsp; ".join(dots)}</div>'
 
 
 def bars(names: Sequence[str], values: Sequence[float]) -> str:

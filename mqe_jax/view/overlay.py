@@ -1,26 +1,32 @@
-"""What the scene can show over the robots: contact points with their forces, and collision shapes."""
+"""What the scene can show over the robots: contact points with forces, collision shapes, and what a robot senses."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 from mjviser.conversions import merge_geoms
 
+from mqe_jax.sensors.marks import Marks
 from mqe_jax.viz.geometry import COLLISION_GROUP, pose
 from mqe_jax.viz.recording import Episode
 
 _METRES_PER_NEWTON, _LONGEST = 0.004, 1.0  # of an arrow, m
 _FORCE, _SHAPE = (224, 60, 40), (224, 138, 44)
+_BACKGROUND = np.array([0.7, 0.7, 0.65])  # towards which lines and points fade, as viser draws them opaque
+_AREA = 0.3  # opacity of an area
 
 
 class Overlay:
-    """Contacts of one environment and collision shapes of all, drawn below the movable root frame of a `Stage`."""
+    """Contacts and a robot's marks of one environment, and collision shapes of all, below the movable root frame of a
+    `Stage`."""
 
     def __init__(self, server: Any, model: mujoco.MjModel, offset: np.ndarray) -> None:
         """Draws nothing yet; `offset` (N, 3) is the place of each environment, m."""
         self._server, self._model, self._data, self._offset = server, model, mujoco.MjData(model), offset
         self.contacts = False  # whether they are drawn
         self._arrows: Any = None
+        self._sensed: list[Any] = []
         self._shapes: list[tuple[int, Any]] = []
 
     def show_shapes(self, shown: bool) -> None:
@@ -54,6 +60,36 @@ class Overlay:
                     head_radius=0.03,
                     head_length=0.05,
                 )
+
+    def draw_marks(self, marks: Sequence[Marks], index: int, agent: int) -> None:
+        """Draws the marks of an agent of environment `index`, in place of the last ones."""
+        for handle in self._sensed:
+            handle.remove()
+        self._sensed = []
+        scene, offset = self._server.scene, self._offset[index]
+        for mark in marks:
+            name, color = f"/world/sensed/{mark.label}", np.array(mark.color)
+            for kind, opacity in (("lines", mark.line_opacity), ("points", mark.point_opacity)):
+                shown = opacity[index, agent] > 0
+                if not shown.any():
+                    continue
+                ends = (getattr(mark, kind)[index, agent][shown] + offset).astype(np.float32)
+                part = opacity[index, agent][shown, None]
+                colors = (255 * (part * color + (1 - part) * _BACKGROUND)).astype(np.uint8)
+                if kind == "lines":
+                    both, width = np.repeat(colors[:, None], 2, axis=1), 4.0 if mark.bold else 1.5
+                    self._sensed.append(
+                        scene.add_line_segments(f"{name}/lines", ends, both, thickness=width, thickness_units="screen")
+                    )
+                else:
+                    self._sensed.append(
+                        scene.add_point_cloud(f"{name}/points", ends, colors, point_size=0.05, precision="float32")
+                    )
+            if corners := mark.area.shape[2]:
+                faces = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
+                area = (mark.area[index, agent] + offset).astype(np.float32)
+                look: Any = {"color": tuple(int(255 * part) for part in color), "opacity": _AREA, "side": "double"}
+                self._sensed.append(scene.add_mesh_simple(f"{name}/area", area, faces, **look))
 
     def _bodies(self) -> dict[int, list[int]]:
         found: dict[int, list[int]] = {}

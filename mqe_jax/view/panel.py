@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.physics.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS
-from mqe_jax.view.markup import bars, observation_table, paragraph, table
+from mqe_jax.view.markup import bars, legend, observation_table, paragraph, table
 from mqe_jax.view.menu import DEFAULT, Entry, Menu
 from mqe_jax.view.session import DRIVEN, Session
 from mqe_jax.viz.geometry import robot_bases, robot_color
@@ -56,6 +56,7 @@ class Panel:
         self.camera = ACTION if session.num_envs == 1 else FREE  # or the label of the followed body
         self.env, self.back = 0, 0  # the selected environment, and the steps by which the shown one lies back
         self.contacts = self.shapes = False  # what is shown of them
+        self.sensors = session.senses  # whether it is shown what a robot senses
         self._state = self._gui.add_html("")
         if menu is not None:
             self._add_menu(menu)
@@ -207,6 +208,10 @@ class Panel:
             env = gui.add_dropdown("Environment", numbers, initial_value="1", visible=session.num_envs > 1)
             contacts = gui.add_checkbox("Contacts", False, hint="Contact points and forces in this environment")
             shapes = gui.add_checkbox("Collision shapes", False)
+            hint = "Of the driven robot (default: robot 1) in this environment"
+            sensors = gui.add_checkbox("Sensors", self.sensors, hint=hint, visible=self.sensors)
+            if self.sensors:
+                gui.add_html(legend({mark.label: mark.color for mark in session.moment().marks}))
 
         def follow(_: Any) -> None:
             self.camera = str(camera.value)
@@ -217,11 +222,13 @@ class Panel:
 
         def overlay(_: Any) -> None:
             self.contacts, self.shapes = bool(contacts.value), bool(shapes.value)
+            self.sensors = bool(sensors.value)
 
         camera.on_update(follow)
         env.on_update(choose)
         contacts.on_update(overlay)
         shapes.on_update(overlay)
+        sensors.on_update(overlay)
 
     def _add_drive(self) -> None:
         gui, drive = self._gui, self._session.drive

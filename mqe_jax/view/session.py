@@ -12,6 +12,8 @@ import numpy as np
 
 from mqe_jax.core.types import RESULTS, VectorEnv, observations, where_rows
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.sensors.marks import Marks
+from mqe_jax.sensors.suite import ONBOARD
 from mqe_jax.train.policy import Policy
 from mqe_jax.viz.recording import Episode
 
@@ -28,6 +30,7 @@ class Scene(NamedTuple):
     qvel: np.ndarray  # velocities (N, nv)
     ctrl: np.ndarray  # actuator targets (N, nu)
     obs: np.ndarray  # observations of the agents (N, A, O)
+    marks: tuple[Marks, ...] = ()  # what they sense; arrays (N, A, ...)
 
 
 @dataclass
@@ -80,7 +83,11 @@ class Session:
         self._key = jax.random.PRNGKey(seed)
         self._reset = jax.jit(vector_env.reset)
         self._step = jax.jit(self._advance)
+        self.senses = ONBOARD in getattr(vector_env, "groups", ())
+        """Whether there are sensors' readings to draw."""
+        self._marks = jax.jit(jax.vmap(env.marks)) if self.senses else lambda _: ()
         self.drivable = getattr(env, "control", "") == "command" and set(DRIVEN) <= set(env.params.commands)
+        self._moving = env.controller.action_size if self.drivable else env.action_size
         if self.drivable:
             self._columns = np.array([env.params.commands.index(name) for name in DRIVEN])
             self.drive.low, self.drive.high = env.controller.changes[self._columns].T
@@ -108,7 +115,7 @@ class Session:
         """Advances all environments by one step, with automatic reset."""
         self._key, key = jax.random.split(self._key)
         mask = np.zeros((self.num_envs, self.env.num_agents), bool)
-        driven = np.zeros(self.env.action_size, np.float32)  # change of the commands
+        driven = np.zeros(self._moving, np.float32)  # change of the commands
         if self.drivable and self.drive.robot is not None:
             mask[self.drive.env, self.drive.robot] = True
             driven[self._columns] = self.drive.now()
@@ -128,7 +135,7 @@ class Session:
         data = self.state.data
         poses = map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat))
         arrays = map(np.asarray, (data.qvel, data.ctrl, self.state.obs))
-        return Scene(Episode(*poses, dt=self.env.dt), *arrays)
+        return Scene(Episode(*poses, dt=self.env.dt), *arrays, marks=jax.device_get(self._marks(self.state)))
 
     def at(self, back: int) -> int:
         """Returns the index into the history of the step `back` steps ago, at most its oldest."""
@@ -148,10 +155,11 @@ class Session:
         if self.drivable:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.
             driven = env.controller.action_of(driven)
-            own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, env.action_size)))
-            action = jnp.where(mask[..., None], own, action)
+            own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, len(driven))))
+            moving = jnp.where(mask[..., None], own, action[..., : len(driven)])
+            action = action.at[..., : len(driven)].set(moving)
             applied = jax.vmap(lambda a: env.controller.skill_commands(env.unmirror_action(jnp.clip(a, -1.0, 1.0))))
-            commands = applied(action)[..., env.controller.skill.index(DRIVEN)]
+            commands = applied(moving)[..., env.controller.skill.index(DRIVEN)]
         state = self._vector_env.step(state, action)
         done = state.terminated | state.truncated
         memory = where_rows(done, self._first_memory, memory)

@@ -130,6 +130,7 @@ class Viewer:
             self._overlay.show_shapes(self._shapes)
         self._overlay.contacts = panel.contacts
         self._overlay.draw(moment.frame, panel.env, moment.qvel[panel.env], moment.ctrl[panel.env])
+        self._overlay.draw_marks(moment.marks if panel.sensors else (), panel.env, self.session.drive.robot or 0)
 
     def _step_if_due(self, now: float, due: float) -> bool:
         """Handles reset and single-step requests, advances if the next step is due; returns whether it was due."""

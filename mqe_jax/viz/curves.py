@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
 from mqe_jax.core.settings import check_arguments
+from mqe_jax.sensors.marks import Marks
 from mqe_jax.viz.geometry import box_corners, extent, posed, robot_bases, robot_color, scenery_geoms
 from mqe_jax.viz.recording import Episode
 
@@ -81,7 +82,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
 
 
 def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots."""
+    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots, and what the first one senses."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon
@@ -105,7 +106,8 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
         colour = robot_color(model, body)
         patch = axes.add_patch(Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4))
         robots.append((body, patch))
-    for data in posed(model, episode, range(len(episode))):
+    for index, data in enumerate(posed(model, episode, range(len(episode)))):
+        marks = [artist for mark in episode.marks for artist in _sensed(axes, mark, index)]
         for geom, patch in scenery:
             points = box_corners(model, data, geom)[:, :2]
             patch.set_xy(points[ConvexHull(points).vertices])
@@ -116,3 +118,18 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
             patch.set_xy(body_shape @ turn + data.xpos[body][:2])
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        for artist in marks:
+            artist.remove()
+
+
+def _sensed(axes: Any, mark: Marks, index: int) -> list[Any]:
+    """Draws the first agent's marks in a frame."""
+    from matplotlib.collections import LineCollection
+
+    colors = ([(*mark.color, alpha) for alpha in each[index][0]] for each in (mark.line_opacity, mark.point_opacity))
+    (line, point), spots = colors, mark.points[index][0]
+    lines = LineCollection(
+        [*np.asarray(mark.lines[index][0, ..., :2])], colors=line, lw=2 if mark.bold else 0.8, zorder=3
+    )
+    area = axes.fill(*mark.area[index][0].T[:2], color=mark.color, alpha=0.3, lw=0, zorder=1)
+    return [axes.add_collection(lines), axes.scatter(*spots.T[:2], s=6, c=point, zorder=3), *area]

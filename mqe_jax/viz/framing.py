@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GOAL_SITE, HIDDEN_GROUP
+from mqe_jax.sensors.marks import Marks
 from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose_boxes, posed, robot_bases, robot_color
 from mqe_jax.viz.recording import Episode
 
@@ -82,12 +83,12 @@ def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
     return [*rows, ("scripted", scripted)] if scripted else rows
 
 
-def legend(env: QuadrupedEnv, size: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
+def legend(env: QuadrupedEnv, size: tuple[int, int], marks: Sequence[Marks] = ()) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3) uint8.
 
-    One robot alone needs none.
+    One robot alone needs none; with `marks` it says what they are.
     """
-    labels = entries(env)
+    labels = entries(env) + [(mark.label, [tuple(round(255 * part) for part in mark.color)]) for mark in marks]
     if sum(len(dots) for _, dots in labels) < 2:
         return lambda frame: frame
     unit = max(size[1] / 360, 0.6)

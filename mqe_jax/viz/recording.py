@@ -15,8 +15,12 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.sensors.marks import Marks
+from mqe_jax.sensors.suite import ONBOARD
 from mqe_jax.train.evaluate import Act, acting
 from mqe_jax.train.policy import Policy, groups_of
+
+_DRAWN = 2048  # numbers that the marks of an agent take, about
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +41,8 @@ class Episode:
     """Mean over steps of the sum of the reward terms."""
     settled: float = 0.0
     """Time from which `success` has its last value, s."""
+    marks: tuple[Marks, ...] = ()
+    """What the agents sense, if it is recorded; arrays (T, A, ...)."""
 
     def __post_init__(self) -> None:
         shapes = [getattr(x, "shape", ()) for x in (self.qpos, self.mocap_pos, self.mocap_quat)]
@@ -52,24 +58,33 @@ class Episode:
     def cut(self, frames: slice) -> "Episode":
         """Returns the episode with a part of its frames, such as every n-th; `settled` stays that of the whole."""
         poses = {name: getattr(self, name)[frames] for name in ("qpos", "mocap_pos", "mocap_quat")}
-        return dataclasses.replace(self, **poses, dt=self.dt * (frames.step or 1))
+        marks = jax.tree.map(lambda x: x[frames], self.marks)
+        return dataclasses.replace(self, **poses, marks=marks, dt=self.dt * (frames.step or 1))
 
 
 @single
-@check_arguments(env=AnySingle, policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
+@check_arguments("sensors", env=AnySingle, policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
 def record_episodes(
-    env: QuadrupedEnv, policy: Policy | Act, key: jax.Array, *, episodes: int = 1, seconds: float = 20.0
+    env: QuadrupedEnv,
+    policy: Policy | Act,
+    key: jax.Array,
+    *,
+    episodes: int = 1,
+    seconds: float = 20.0,
+    sensors: bool = False,
 ) -> list[Episode]:
     """Records one episode in each of several environments, until it ends or for `seconds`.
 
     `policy` is that of all agents, or a function like its `act` without recurrent state; batched over episodes.
+    `sensors` also records what shows the readings of the task's sensors.
     """
-    numbers = episodes * round(seconds / env.dt) * (env.mj_model.nq + 7 * env.mj_model.nmocap)
+    groups = tuple({*groups_of(policy), *([ONBOARD] if sensors else [])} - {"policy"})
+    size = env.mj_model.nq + 7 * env.mj_model.nmocap + (_DRAWN * env.num_agents if sensors else 0)
+    numbers = episodes * round(seconds / env.dt) * size
     if 4 * numbers > CLIP_BYTES:
         fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
     length = 50
     act, memory = acting(policy, env, episodes)
-    groups = tuple(groups_of(policy) - {"policy"})
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
@@ -83,7 +98,8 @@ def record_episodes(
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))
         success = state.outcome.success
         success = jnp.zeros_like(reward) if success is None else success[:, 0]
-        return (state, memory), (*now(state), done, reward, success)
+        marks = jax.vmap(env.marks)(seen) if sensors else ()
+        return (state, memory), (*now(state), done, reward, success, marks)
 
     @jax.jit
     def begin(key: jax.Array) -> Any:
@@ -104,7 +120,10 @@ def record_episodes(
         rows.append(jax.device_get(out))
         if np.concatenate([row[3] for row in rows]).any(0).all():
             break
-    *frames, done, reward, success = (np.concatenate(column)[:steps] for column in zip(*rows, strict=True))
+    *columns, drawn = zip(*rows, strict=True)
+    *frames, done, reward, success = (np.concatenate(column)[:steps] for column in columns)
+    # After the last step nobody senses: the marks before it remain.
+    drawn = jax.tree.map(lambda *parts: np.concatenate([*parts, parts[-1][-1:]]), *drawn)
     frames = [np.concatenate(pair) for pair in zip(first, frames, strict=True)]
     recorded = []
     for i in range(episodes):
@@ -114,7 +133,8 @@ def record_episodes(
         settled = (int(others[-1]) + 2 if len(others) else 0) * float(env.dt)
         poses = (x[: last + 2, i] for x in frames)
         rest = {"success": won, "reward": float(reward[: last + 1, i].mean()), "settled": settled}
-        recorded.append(Episode(*poses, dt=float(env.dt), **rest))
+        marks = jax.tree.map(lambda x, i=i, last=last: x[: last + 2, i], drawn)
+        recorded.append(Episode(*poses, dt=float(env.dt), marks=marks, **rest))
     return recorded
 
 

@@ -24,6 +24,7 @@ from mqe_jax.physics.appearance.grounds import GROUND_MATERIAL
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import check_output, write_clip
 from mqe_jax.viz.curves import draw_top
+from mqe_jax.viz.drawing import add_marks
 from mqe_jax.viz.framing import Camera, legend
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, rendering_model
 from mqe_jax.viz.recording import Episode
@@ -121,6 +122,7 @@ def _draw_gl(
                 model.light_pos[0] = np.array(camera.lookat) - 2 * model.stat.extent * model.light_dir[0]
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, view, option)
+            add_marks(renderer.scene, episode.marks, index, size[1], camera.distance)
             yield renderer.render()
 
 
@@ -202,5 +204,5 @@ def render_episode(
             text = f"{len(episode)} frames of {size[0]} x {size[1]} pixels are too many for {suffix}"
             raise InputError(f"output: {text}; give a smaller width, fewer frames per second, or .mp4")
         views = cameras(rendering_model(env.mj_model, episode), episode, "follow" if view is None else view, aspect)
-    write_clip(path, map(legend(env, size), render_frames(env, episode, views, size, backend)), fps)
+    write_clip(path, map(legend(env, size, episode.marks), render_frames(env, episode, views, size, backend)), fps)
     return backend or "matplotlib"
