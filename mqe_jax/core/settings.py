@@ -374,7 +374,8 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     places = [brief(str(part)) for part in first["loc"]]
     value, context = first["input"], first.get("ctx", {})
     if isinstance(raised := context.get("error"), InputError):
-        return InputError(".".join([*places, str(raised)]))
+        named = places and re.match(rf"{re.escape(places[-1])}[:.]", str(raised))
+        return InputError(".".join([*(places[:-1] if named else places), str(raised)]))
     if first["type"] == "unexpected_keyword_argument":
         for part in places[:-1]:
             kind = _record_in(hints_of(kind)[part])
