@@ -230,8 +230,8 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
 
 def test_the_demo_resumes_only_what_has_begun(capfd: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
     monkeypatch.setattr(demo, "DEMO_TASK", "fake")
-    small = "task: fake\nnum_envs: 4\nrollout_steps: 8\ntotal_steps: 64\ncheckpoint: {every: 1}\n"
-    Path("small.yaml").write_text(small)
+    small = "task: fake, num_envs: 4, rollout_steps: 8, total_steps: 64, checkpoint: {every: 1}"
+    Path("small.yaml").write_text(f"{{{small}, network: {{recurrent: false}}}}")
     for _ in range(2):
         assert cli.main(["demo", "--run-dir", "run", "--config", "small.yaml", "--episodes", "4"]) == 0
         assert "no checkpoint" not in capfd.readouterr().err

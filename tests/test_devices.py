@@ -109,12 +109,19 @@ def test_one_group_is_one_permutation() -> None:
     np.testing.assert_array_equal(index, jax.random.permutation(KEY, 12).reshape(2, 6))
 
 
-@pytest.mark.parametrize("network", ["actor_critic", pytest.param("mat", marks=pytest.mark.soak)])
-def test_two_shares_are_one_batch(network: str) -> None:
-    own = {"width": 8} if network == "mat" else {"hidden_sizes": (8,), "chunk_length": 4}
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"hidden_sizes": (8,), "recurrent": False},
+        pytest.param({"hidden_sizes": (8,), "chunk_length": 4}, marks=pytest.mark.soak),
+        pytest.param({"name": "mat", "width": 8}, marks=pytest.mark.soak),
+    ],
+    ids=["forward", "recurrent", "mat"],
+)
+def test_two_shares_are_one_batch(network: dict[str, Any]) -> None:
     ppo = {"epochs": 2, "minibatches": 2, "groups": 2}
     sizes = {"num_envs": 8, "rollout_steps": 8, "total_steps": 640, "ppo": ppo}
-    config = settings(**sizes, optimizer__target_kl=0.01, network={"name": network, **own})
+    config = settings(**sizes, optimizer__target_kl=0.01, network={"name": "actor_critic", **network})
     whole = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 8), config)
     share = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4), config, processes=2)
 

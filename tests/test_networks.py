@@ -119,11 +119,11 @@ def test_parallel_log_probabilities_equal_sequential_ones(agents: int, settings:
 
 
 def test_an_agent_that_takes_no_part_is_left_out_of_the_sequence() -> None:
-    network, params, obs = made(4, blocks=2, heads=2)
+    network, params, obs = made(4, heads=2)
     there = np.array([0, 2, 3])
     active = jnp.zeros((4, 4), bool).at[:, there].set(True)
     action, density, _ = network.act(network.policy_params(params), (), obs, None, active)
-    fewer = made(3, blocks=2, heads=2)[0]
+    fewer = made(3, heads=2)[0]
     alone, its_density, _ = fewer.act(fewer.policy_params(params), (), obs[:, there], None)
     np.testing.assert_allclose(action[:, there], alone, atol=1e-5)
     np.testing.assert_allclose(density[:, there], its_density, atol=1e-5)

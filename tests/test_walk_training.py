@@ -119,9 +119,9 @@ def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> Non
 
 def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
     file = tmp_path / "start.safetensors"
-    start = jax.jit(walk_policy.init_params)(jax.random.PRNGKey(3))
+    start = walk_policy.init_params(jax.random.PRNGKey(3))
     walk_policy.save_params(start, file)
-    params = jax.jit(WalkNetwork(weights=str(file)).build(DIMS).init)(jax.random.PRNGKey(0))
+    params = WalkNetwork(weights=str(file)).build(DIMS).init(jax.random.PRNGKey(0))
     jax.tree.map(np.testing.assert_array_equal, params["policy"], start)
     refuses(r"network.name: 'walk' is not allowed", WalkNetwork().build, DIMS._replace(agents=2))
 
@@ -168,7 +168,7 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
 
 
 def test_descending_the_loss_makes_a_policy_symmetric() -> None:
-    params = jax.jit(walk_policy.init_params)(jax.random.PRNGKey(0))
+    params = walk_policy.init_params(jax.random.PRNGKey(0))
     flat = jax.random.normal(jax.random.PRNGKey(1), (8, 2100))
 
     @jax.jit
@@ -176,13 +176,14 @@ def test_descending_the_loss_makes_a_policy_symmetric() -> None:
         return WALK_FORM.symmetry_loss(params, flat, walk_policy.infer(params, flat)[0])
 
     before = float(loss(params))
+    descend = jax.jit(lambda params: jax.tree.map(lambda p, g: p - 0.5 * g, params, jax.grad(loss)(params)))
     for _ in range(30):
-        params = jax.tree.map(lambda p, g: p - 0.5 * g, params, jax.grad(loss)(params))
+        params = descend(params)
     assert before > 1e-6 and float(loss(params)) < 0.5 * before
 
 
 AGILE = agile.AgileSkill(GO1)
-PARAMS = jax.jit(agile.NETWORKS.init)(jax.random.PRNGKey(0))
+PARAMS = agile.NETWORKS.init(jax.random.PRNGKey(0))
 STILL = override(AGILE_TASK, {"randomize": False})
 
 
@@ -248,7 +249,7 @@ def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
 def test_the_trained_network_acts_as_the_skill() -> None:
     env = WalkEnv(GO1, STILL, skill="agile", impl="c", num_envs=1)
     network = AgileNetwork().build(EnvDims(1, env.observation_size, env.privileged_observation_size, 12, 1))
-    params = jax.jit(network.init)(jax.random.PRNGKey(1))
+    params = network.init(jax.random.PRNGKey(1))
     state, seen, memory = (
         jax.jit(env.reset)(jax.random.PRNGKey(2)),
         network.initial_memory(1).actor,
