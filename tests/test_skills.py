@@ -18,6 +18,7 @@ from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.policies import load_as, load_policy
 from mqe_jax.policies.translated import Translated
+from mqe_jax.policies.zoo import population
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import agile
@@ -29,6 +30,7 @@ from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import WalkPolicy
 from tests.inputs import refuses
 
+WALKING = population.FOLDER / "1-go1football-1vs1-late.safetensors"  # a policy of the skill `walk`
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
 NAMES = ("vx", "vy", "yaw_rate")
 
@@ -171,9 +173,9 @@ def test_policies_of_other_needs_are_refused(
     if "skill" in others:
         others["skill_weights"] = weights
     env = make("go1football-1vs1", impl="c", num_envs=1, **others)
-    policy = load_policy("go1football-1vs1")
+    policy = load_policy(WALKING)
     policy = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **own))
-    for source in (policy, *([] if own else ["go1football-1vs1"])):
+    for source in (policy, *([] if own else ["population/1/late", str(WALKING)])):
         refuses(rf"{field}: .* needs {said}", load_as, field, source, env)
 
 
@@ -194,7 +196,7 @@ TASK = "go1football-1vs1"
 @pytest.fixture(scope="module")
 def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Files of the shipped policy, and of one with the same network for the agile skill and its ranges."""
-    policy, folder = load_policy(TASK), tmp_path_factory.mktemp("policies")
+    policy, folder = load_policy(WALKING), tmp_path_factory.mktemp("policies")
     needs = dataclasses.replace(policy.needs, skill="agile", gait=None, command_ranges=WIDE)
     agile = dataclasses.replace(policy, needs=needs)
     return {
