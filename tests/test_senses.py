@@ -54,15 +54,16 @@ def drawn(env: Any, state: State, odometry: tuple[float, float]) -> tuple[dict[s
     ahead, left = odometry
     off = jnp.stack([cosine * ahead - sine * left, sine * ahead + cosine * left], axis=-1)
 
-    def draw(state: State) -> Any:
-        snapshot = env.snapshot(state, env.read(state.data))
-        blocks, senses = env.suite.observe(snapshot, env.suite.reset(), state.key)
-        distances = blocks["lidar"][:, :32] / 2
-        blocks |= {"odometry": blocks["odometry"].at[:, :2].add(off)}
-        return env.suite.draw(snapshot, senses, blocks), distances
+    def sense(state: State) -> Any:
+        return env.suite.observe(env.snapshot(state, env.read(state.data)), env.suite.reset(), state.key)
 
-    marks, distances = jax.device_get(jax.jit(draw)(state))
-    return {mark.label: mark for mark in marks}, distances
+    def draw(state: State, senses: Any, blocks: Any) -> Any:
+        blocks |= {"odometry": blocks["odometry"].at[:, :2].add(off)}
+        return env.suite.draw(env.snapshot(state, env.read(state.data)), senses, blocks)
+
+    blocks, senses = jax.jit(sense)(state)
+    marks = jax.device_get(jax.jit(draw)(state, senses, blocks))
+    return {mark.label: mark for mark in marks}, np.asarray(blocks["lidar"])[:, :32] / 2
 
 
 def sighted(env: Any, state: State) -> list[np.ndarray]:
@@ -141,6 +142,13 @@ def test_messages_get_lost_and_do_not_reach_far() -> None:
     assert not np.any(hear(far)) and np.mean(hear(near)) == pytest.approx(0.7, abs=0.06)
 
 
+def test_teams_of_different_sizes_are_padded() -> None:
+    scene = dataclasses.replace(made("go1gate").suite.scene, teams=((0, 1, 2), (3,)))
+    mates, there = scene.mates
+    np.testing.assert_array_equal(mates, [[1, 2], [0, 2], [0, 1], [3, 3]])
+    np.testing.assert_array_equal(there, [[True] * 2] * 3 + [[False] * 2])
+
+
 def test_scripted_robots_are_silent() -> None:
     env = make("go1gate", impl="c", senses=["messages"])
     policy = load_policy("scripted", env)
@@ -167,19 +175,25 @@ def test_a_group_without_its_sensors_is_named() -> None:
 
 
 @pytest.mark.gpu
-def test_depth_agrees_with_mujocos_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for pixels at edges; the second batch is of another size."""
+@pytest.mark.parametrize("task", ["go1gate", "go1revolvingdoor"])
+def test_depth_agrees_with_mujocos_renderer(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for pixels at edges; the second batch is of another size. At the door the second team's image is mirrored.
+
+    The points that are drawn are where rays from the camera end.
+    """
     if (backend := render.gl_backend()) is None:
         pytest.skip("no GL library")
     monkeypatch.setattr("mujoco.rendering.classic.gl_context.GLContext", render._gl_context(backend))
-    env = make("go1gate", impl="warp", control="position", num_envs=4, senses=["depth"])
-    states, sensor = scattered("go1gate", 4), Depth()
+    env = make(task, impl="warp", control="position", num_envs=4, senses=["depth"])
+    states, sensor = scattered(task, 4), Depth()
     given = (states.data.qpos, states.data.qvel, states.data.mocap_pos, states.data.ctrl)
     moved = dataclasses.replace(states, data=jax.vmap(env.physics.init)(*given))
     read = readings(env, moved, sensor).reshape(4, 2, sensor.height, sensor.width)
     few = readings(env, jax.tree.map(lambda x: x[:3], moved), sensor)
     np.testing.assert_array_equal(few.reshape(3, *read.shape[1:]), read[:3])
-    model, option, apart = env.compiled.model, mujoco.MjvOption(), []
+    draw = lambda state, x: sensor.draw(env.suite.scene, env.snapshot(state, env.read(state.data)), {"depth": x}, ())  # noqa: E731
+    (drawn,) = jax.device_get(jax.jit(jax.vmap(draw))(moved, read.reshape(4, 2, -1)))
+    model, option, apart, beside = env.compiled.model, mujoco.MjvOption(), [], []
     option.geomgroup[:], option.sitegroup[:], data = 1, 0, mujoco.MjData(model)
     with mujoco.Renderer(model, sensor.height, sensor.width) as renderer:
         renderer.enable_depth_rendering()
@@ -188,5 +202,12 @@ def test_depth_agrees_with_mujocos_renderer(monkeypatch: pytest.MonkeyPatch) -> 
             mujoco.mj_forward(model, data)
             for agent in range(2):
                 renderer.update_scene(data, f"robot{agent}/depth", option)
-                apart.append(np.abs(np.minimum(renderer.render() / sensor.range, 1) - read[number, agent]))
+                seen = np.minimum(renderer.render() / sensor.range, 1)[:, :: int(env.suite.scene.mirror[agent])]
+                apart.append(np.abs(seen - read[number, agent]))
+                place = data.cam(f"robot{agent}/depth").xpos
+                for point in drawn.points[number, agent][drawn.point_opacity[number, agent] > 0][::7]:
+                    way, length = point - place, np.linalg.norm(point - place)
+                    struck = mujoco.mj_ray(model, data, place, way / length, None, True, -1, np.zeros(1, np.int32))
+                    beside.append(abs(struck - length))
     assert np.std(read) > 0.1 and np.median(apart) < 1e-3 and np.mean(np.array(apart) > 0.02) < 0.05
+    assert len(beside) > 40 and np.median(beside) < 1e-3 and np.mean(np.array(beside) > 0.02) < 0.2

@@ -1,6 +1,6 @@
 """What the scene can show over the robots: contact points with forces, collision shapes, and what a robot senses."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import mujoco
@@ -63,33 +63,28 @@ class Overlay:
 
     def draw_marks(self, marks: Sequence[Marks], index: int, agent: int) -> None:
         """Draws the marks of an agent of environment `index`, in place of the last ones."""
-        for handle in self._sensed:
-            handle.remove()
-        self._sensed = []
-        scene, offset = self._server.scene, self._offset[index]
-        for mark in marks:
-            name, color = f"/world/sensed/{mark.label}", np.array(mark.color)
-            for kind, opacity in (("lines", mark.line_opacity), ("points", mark.point_opacity)):
-                shown = opacity[index, agent] > 0
-                if not shown.any():
-                    continue
-                ends = (getattr(mark, kind)[index, agent][shown] + offset).astype(np.float32)
-                part = opacity[index, agent][shown, None]
-                colors = (255 * (part * color + (1 - part) * _BACKGROUND)).astype(np.uint8)
-                if kind == "lines":
-                    both, width = np.repeat(colors[:, None], 2, axis=1), 4.0 if mark.bold else 1.5
-                    self._sensed.append(
-                        scene.add_line_segments(f"{name}/lines", ends, both, thickness=width, thickness_units="screen")
-                    )
-                else:
-                    self._sensed.append(
-                        scene.add_point_cloud(f"{name}/points", ends, colors, point_size=0.05, precision="float32")
-                    )
-            if corners := mark.area.shape[2]:
-                faces = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
-                area = (mark.area[index, agent] + offset).astype(np.float32)
-                look: Any = {"color": tuple(int(255 * part) for part in color), "opacity": _AREA, "side": "double"}
-                self._sensed.append(scene.add_mesh_simple(f"{name}/area", area, faces, **look))
+        with self._server.atomic():
+            for handle in self._sensed:
+                handle.remove()
+            self._sensed = [handle for mark in marks for handle in self._add_marks(mark, index, agent)]
+
+    def _add_marks(self, mark: Marks, index: int, agent: int) -> Iterator[Any]:
+        """Yields the handles of what it draws: lines, points, an area."""
+        scene, name, offset = self._server.scene, f"/world/sensed/{mark.label}", self._offset[index]
+        ends, colors = _shown(mark, mark.lines[index, agent], mark.line_opacity[index, agent])
+        if len(ends):
+            thick: Any = {"thickness": 4.0 if mark.bold else 1.5, "thickness_units": "screen"}
+            colors = np.repeat(colors[:, None], 2, axis=1)
+            yield scene.add_line_segments(f"{name}/lines", (ends + offset).astype(np.float32), colors, **thick)
+        spots, colors = _shown(mark, mark.points[index, agent], mark.point_opacity[index, agent])
+        if len(spots):
+            look: Any = {"point_size": 0.05, "precision": "float32"}
+            yield scene.add_point_cloud(f"{name}/points", (spots + offset).astype(np.float32), colors, **look)
+        if corners := mark.area.shape[2]:
+            faces = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
+            look = {"color": tuple(int(255 * part) for part in mark.color), "opacity": _AREA, "side": "double"}
+            area = (mark.area[index, agent] + offset).astype(np.float32)
+            yield scene.add_mesh_simple(f"{name}/area", area, faces, **look)
 
     def _bodies(self) -> dict[int, list[int]]:
         found: dict[int, list[int]] = {}
@@ -111,6 +106,12 @@ class Overlay:
             lod="off",
             wireframe=True,
         )
+
+
+def _shown(mark: Marks, places: Any, opacity: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the places of lines or points that are not hidden, and their colours (n, 3), 0 to 255."""
+    part = opacity[opacity > 0, None]
+    return places[opacity > 0], (255 * (part * np.array(mark.color) + (1 - part) * _BACKGROUND)).astype(np.uint8)
 
 
 def contact_arrows(
