@@ -18,7 +18,7 @@ from mqe_jax.core import devices
 from mqe_jax.core.settings import build
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.policies import all_agents, load_policy
+from mqe_jax.policies import all_agents, load_policy, parameters_for
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.selfplay.league.sides import BothSides
@@ -155,12 +155,13 @@ def copied(value: Any) -> Any:
     return pickle.loads(pickle.dumps(value))
 
 
-def walking(task: str) -> QuadrupedEnv:
-    return make(task, impl="c", num_envs=2)
+def played(task: str) -> QuadrupedEnv:
+    """The task with what its shipped policy needs."""
+    return make(task, impl="c", num_envs=2, **parameters_for(task, task))
 
 
 def matches() -> VectorEnv:
-    return VectorEnv(walking("go1wrestling"), 2)
+    return VectorEnv(played("go1wrestling"), 2)
 
 
 def league() -> Any:
@@ -171,7 +172,7 @@ def league() -> Any:
 BATCHES: dict[str, Callable[[], Any]] = {
     "vector": lambda: VectorEnv(made("go1plane"), 2),
     "deadline": lambda: Deadline(VectorEnv(made("go1plane"), 2)),
-    "demonstrated": lambda: Demonstrated(walking("go1gate"), 2, load_policy("scripted", walking("go1gate"))),
+    "demonstrated": lambda: Demonstrated(played("go1gate"), 2, load_policy("scripted", played("go1gate"))),
     "versus": lambda: versus(matches(), ["go1wrestling", "scripted"]),
     "mirror": lambda: Mirror(matches()),
     "both sides": lambda: BothSides(matches()),
@@ -193,7 +194,7 @@ def test_batches(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["scripted", "random", "idle", "forward", "go1wrestling", "both"])
 def test_policies(name: str) -> None:
-    env = walking("go1wrestling")
+    env = played("go1wrestling")
     policy = load_policy("scripted" if name == "both" else name, env)
     policy = all_agents(env, policy, load_policy("go1wrestling", env)) if name == "both" else policy
     obs = jax.random.normal(KEY, (2, policy.agents, env.observation_size))
