@@ -18,7 +18,7 @@ from mqe_jax.core import threefry  # noqa: F401
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
-from mqe_jax.policies import all_agents, load_policy
+from mqe_jax.policies import all_agents, load_policy, parameters_for
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig
@@ -72,7 +72,7 @@ def test_the_loops_of_jax_step_every_task(task: str) -> None:
 )
 def test_policies_act_in_single_precision(task: str, name: str) -> None:
     with strict_x64():
-        env = make(task, impl="c", num_envs=2)
+        env = make(task, impl="c", num_envs=2, **parameters_for(task, name))
         policy = load_policy(name, env)
         policy = all_agents(env, policy, policy if len(env.teams) > 1 else None)
         obs = jax.ShapeDtypeStruct((2, env.num_agents, env.observation_size), jnp.float32)

@@ -278,7 +278,8 @@ def _act_scripted(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) 
     part = env.controller.skill.parts[0]
     own = Commander(part, env.params.commands, part.default_commands(), {})
     action = env.controller.translated(jax.vmap(scripted_policy(env, name))(obs), own)
-    return jnp.pad(action, ((0, 0), (0, 0), (0, env.action_size - action.shape[-1])))
+    silent = jnp.zeros((*action.shape[:-1], env.action_size - action.shape[-1]))
+    return jnp.concatenate([action, silent], axis=-1) if silent.shape[-1] else action
 
 
 def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], jax.Array]:

@@ -160,9 +160,11 @@ class Versus(OneTeam):
         first, opponent = self.opponents[block], state.opponents[block]
         if not isinstance(first, TrainedPolicy):
             raise InputError(f"block: the opponent of block {block} is fixed; only trained policies can be exchanged")
-        if policy.architecture != first.architecture:
-            other = f"{policy.architecture}, not {first.architecture}"
-            raise InputError(f"policy: of another architecture than block {block}: {other}")
+        given, known = policy.architecture, first.architecture
+        for name in dict.fromkeys((*given, *known)):
+            if given.get(name) != known.get(name):
+                other = f"{name} {given.get(name)!r}, not {known.get(name)!r}"
+                raise InputError(f"policy: of another architecture than block {block}: {other}")
         changed = exchange(opponent, _arrays(policy), at_once=at_once)
         return dataclasses.replace(state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :]))
 

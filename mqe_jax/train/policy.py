@@ -154,10 +154,11 @@ class TrainedPolicy:
         return PolicyArrays(self.params, self.normalizer, jnp.float32(self.config.action_scale))
 
     @property
-    def architecture(self) -> Any:
-        """Everything but the arrays; policies of equal architecture can be exchanged within compiled code."""
-        settings = self.config.network, self.config.normalization.observations
-        return (self.needs.by_name(), *settings, self.deterministic)
+    def architecture(self) -> dict[str, Any]:
+        """Everything but the arrays by name; policies with equal ones can be exchanged within compiled code."""
+        settings = {"normalization.observations": self.config.normalization.observations}
+        network = {f"network.{name}": value for name, value in vars(self.config.network).items()}
+        return {**self.needs.by_name(), **network, **settings, "deterministic": self.deterministic}
 
     def acting(self, deterministic: bool) -> Self:
         """Returns the policy that acts with its mean actions, or samples them."""
