@@ -262,10 +262,10 @@ def check(outputs: list[dict[str, Any]], name: str) -> None:
         assert any("image/png" in data for data in outputs)
 
 
-# The tour does what the quickstart and the README do, for half a minute.
+# The others do what the quickstart, the README and the example task do, at length.
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=pytest.mark.soak if path.stem == "tour" else ()) for path in NOTEBOOKS],
+    [pytest.param(path, marks=() if path.stem == "quickstart" else pytest.mark.soak) for path in NOTEBOOKS],
     ids=lambda path: path.stem,
 )
 def test_notebooks_run_at_small_size(path: Path, tmp_path: Path, monkeypatch: Any, request: Any) -> None:
