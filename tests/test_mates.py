@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 
 from mqe_jax.core.settings import build, override
+from mqe_jax.core.types import Transition
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.runs import build as setup
 from mqe_jax.selfplay.mates import Mates
+from mqe_jax.train import learner as learning
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.rollout import learners_of
 from tests import fake_env
 from tests.inputs import refuses
+from tests.test_plain_update import SETTINGS, config_of, drawn, learner_of
+from tests.training import assert_same
 
 KEY = jax.random.PRNGKey(0)
 
@@ -72,3 +76,51 @@ def test_mates_that_do_not_fit_are_refused() -> None:
         with pytest.raises(setup.InputError, match=error):
             setup.environments("c", changed, 1)
     refuses(r"mates: \('idle',\) .* left out for a batch", setup.prepare, batch, {"mates": ["idle"]})
+
+
+@pytest.mark.parametrize("name", [*SETTINGS, "mat"])
+def test_an_agent_that_takes_no_part_or_does_not_learn_counts_nowhere_in_an_update(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it sees, does and gets, statistics, parameters and metrics stay the same; an active one changes them.
+
+    What an agent that does not learn does changes nothing either; its reward is part of a joint one.
+    """
+    config = config_of("joint" if name == "mat" else name)
+    if name == "mat":
+        settings = {"ratio": "agent", "value": "agent"}
+        config = override(config, {"ppo": settings, "network": {"name": "mat", "width": 4}, "imitation.teacher": None})
+    if config.ppo.ratio == "agent" and name != "mat":
+        config = override(config, {"imitation.teacher": "scripted", "normalization.observations": True})
+    random = np.random.default_rng(5)
+    (env, state), data = drawn(random, config, 1)
+    part = data.active.at[:, 0, 1].set(False)
+    data, other = data._replace(active=part, learners=part), {}
+    for field in ("obs", "final_obs", "action", "log_prob", "reward"):
+        x = getattr(data, field)
+        other[field] = x.at[:, 0, 1].set(jnp.asarray(random.normal(size=x[:, 0, 1].shape), jnp.float32))
+    now: list[Transition] = []
+    monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, now[0], {"ended": {"episodes": 0.0}}))
+
+    @jax.jit
+    def update(state: Any, data: Transition) -> Any:
+        now[:] = [data]
+        after, metrics = learner_of(env, config).update(state)
+        return dataclasses.replace(after, rollout=None), metrics
+
+    everyone = jnp.ones_like(data.active)
+    with_mate = data._replace(active=everyone)  # agent 1 takes part, but another policy acts for it
+    acted = with_mate._replace(action=other["action"], log_prob=other["log_prob"])
+    more = data._replace(**other), acted, acted._replace(reward=other["reward"]), with_mate._replace(**other)
+    plain, everything, mate, alone, acts, paid, lives = (
+        update(state, x) for x in (data, with_mate._replace(learners=everyone), with_mate, *more)
+    )
+    assert_same(plain, alone)
+    assert_same(mate, acts)
+    if config.ppo.value != "joint":
+        assert_same(mate, paid)
+    if getattr(config.network, "critic_input", "observations") != "observations":
+        assert_same(mate, lives)
+    value = lambda result: float(result[1]["loss/value"])  # noqa: E731
+    assert value(everything) not in (value(plain), value(mate))
+    assert (value(acts) != value(paid)) == (config.ppo.value == "joint")  # the team's mean includes the mate's reward

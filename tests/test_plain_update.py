@@ -19,7 +19,7 @@ from mqe_jax.train.normalize import RunningStatistics, ValueStatistics, value_in
 from mqe_jax.train.optim import AdamState
 from mqe_jax.train.rollout import ObservationNormalizer
 from tests import training as probes
-from tests.training import Probe, assert_same
+from tests.training import Probe
 
 T, N, A, F, D = 6, 4, 2, 3, 2
 """Steps, environments, agents, features and action size."""
@@ -360,51 +360,3 @@ def test_the_learning_rate_follows_the_kl_divergence_within_its_bounds() -> None
     for kl, before, after in (*rows, (1.0, 1.2e-5, 1e-5), (0.0, 9e-3, 1e-2)):
         rate = stages._adapt(jnp.float32(before), jnp.float32(kl), 0.01)
         assert float(rate) == pytest.approx(after), (kl, before)
-
-
-@pytest.mark.parametrize("name", [*SETTINGS, "mat"])
-def test_an_agent_that_takes_no_part_or_does_not_learn_counts_nowhere_in_an_update(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whatever it sees, does and gets, statistics, parameters and metrics stay the same; an active one changes them.
-
-    What an agent that does not learn does changes nothing either; its reward is part of a joint one.
-    """
-    config = config_of("joint" if name == "mat" else name)
-    if name == "mat":
-        settings = {"ratio": "agent", "value": "agent"}
-        config = override(config, {"ppo": settings, "network": {"name": "mat", "width": 4}, "imitation.teacher": None})
-    if config.ppo.ratio == "agent" and name != "mat":
-        config = override(config, {"imitation.teacher": "scripted", "normalization.observations": True})
-    random = np.random.default_rng(5)
-    (env, state), data = drawn(random, config, 1)
-    part = data.active.at[:, 0, 1].set(False)
-    data, other = data._replace(active=part, learners=part), {}
-    for field in ("obs", "final_obs", "action", "log_prob", "reward"):
-        x = getattr(data, field)
-        other[field] = x.at[:, 0, 1].set(jnp.asarray(random.normal(size=x[:, 0, 1].shape), jnp.float32))
-    now: list[Transition] = []
-    monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, now[0], {"ended": {"episodes": 0.0}}))
-
-    @jax.jit
-    def update(state: Any, data: Transition) -> Any:
-        now[:] = [data]
-        after, metrics = learner_of(env, config).update(state)
-        return dataclasses.replace(after, rollout=None), metrics
-
-    everyone = jnp.ones_like(data.active)
-    with_mate = data._replace(active=everyone)  # agent 1 takes part, but another policy acts for it
-    acted = with_mate._replace(action=other["action"], log_prob=other["log_prob"])
-    more = data._replace(**other), acted, acted._replace(reward=other["reward"]), with_mate._replace(**other)
-    plain, everything, mate, alone, acts, paid, lives = (
-        update(state, x) for x in (data, with_mate._replace(learners=everyone), with_mate, *more)
-    )
-    assert_same(plain, alone)
-    assert_same(mate, acts)
-    if config.ppo.value != "joint":
-        assert_same(mate, paid)
-    if getattr(config.network, "critic_input", "observations") != "observations":
-        assert_same(mate, lives)
-    value = lambda result: float(result[1]["loss/value"])  # noqa: E731
-    assert value(everything) not in (value(plain), value(mate))
-    assert (value(acts) != value(paid)) == (config.ppo.value == "joint")  # the team's mean includes the mate's reward
