@@ -63,7 +63,12 @@ class Stages:
         """Returns the PPO loss () of a minibatch and its parts, means over the agents that learn."""
         network, config, ppo, learners = self.network, self.config, self.config.ppo, batch.learners
         seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
-        new = network.evaluate(params, *seen, batch.action, batch.active)
+        evaluate = lambda action: network.evaluate(params, *seen, action, batch.active)  # noqa: E731
+        if config.imitation.teacher is None:
+            new = taught = evaluate(batch.action)
+        else:  # what depends on no action is computed once
+            both = jax.vmap(evaluate)(jnp.stack([batch.action, batch.teacher_action]))
+            new, taught = jax.tree.map(lambda x: x[0], both), jax.tree.map(lambda x: x[1], both)
         old, now_taken = (jnp.where(learners[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
         log_ratio = RATIOS[ppo.ratio](now_taken, old)
         surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
@@ -82,7 +87,6 @@ class Stages:
         metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
         actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
         if config.imitation.teacher is not None:
-            taught = network.evaluate(params, *seen, batch.teacher_action, batch.active)
             metrics["loss/imitation"] = -_mean(jnp.sum(taught.log_prob, axis=-1), learners)
             actor_loss += now.imitation * metrics["loss/imitation"]
         return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
