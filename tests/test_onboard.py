@@ -8,19 +8,23 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mqe_jax import make
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
+from mqe_jax.core.types import Batch
 from mqe_jax.policies import parameters_for, zoo
 from mqe_jax.runs.build import for_task, prepare, settings_of
 from mqe_jax.train.needs import Needs, needs_of
 from mqe_jax.train.policy import check_policy, read_policy
 from mqe_jax.train.runner import train_seeds
+from mqe_jax.train.stages import Stages
+from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Stop, assert_same_run, stop_after
+from tests.training import FAST, Probe, ProbeState, Stop, assert_same_run, settings, stop_after, updated
 
 SENSES = {"senses": "onboard"}
 TINY: dict[str, Any] = {
@@ -92,6 +96,63 @@ def test_other_sensors_are_named_with_both_values() -> None:
     assert forged.mismatches(needs) == {} != Needs(task="go1gate", dims=needs.dims).mismatches(needs)
     assert parameters_for("go1gate", policy) == {}  # no trained policy
     check_policy(zoo.load("go1gate"), blind)  # of before files described blocks
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SeeingState(ProbeState):
+    """A state with a further group of observations."""
+
+    groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+
+
+class Seeing(Probe):
+    """Environments whose group `signs` shows the sign alone."""
+
+    def _seeing(self, state: Any) -> Any:
+        signs = jnp.broadcast_to(state.hidden[:, None, None], (self.num_envs, self.num_agents, 1))
+        return SeeingState(**{**vars(state), "groups": {"signs": signs}})
+
+    def reset(self, key: jax.Array) -> Any:
+        return self._seeing(super().reset(key))
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        return self._seeing(super().step(state, action))
+
+
+class Counter:
+    """A teacher that sees the sign alone, and remembers the number of steps of an episode."""
+
+    task, agents, groups = "probe", 2, ("signs",)
+
+    def initial_memory(self, num_envs: int) -> jax.Array:
+        return jnp.zeros(num_envs)
+
+    def act(self, obs: Any, memory: Any, key: Any) -> Any:
+        return obs.group("signs") * memory[:, None, None] / 8, memory + 1
+
+
+def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
+    """Its memory passes from rollout to rollout, and starts anew with each episode."""
+    show = lambda hidden, step: jnp.stack([hidden, step.astype(jnp.float32)], axis=-1)  # noqa: E731
+    env = Seeing(show, probes.pay_one, num_envs=32, features=2, max_episode_steps=3, odd_episode_steps=5)
+    shown: list[Any] = []
+
+    class Watched(Stages):
+        def update(self, carry: Any, batch: Batch, now: Any, key: jax.Array) -> Any:
+            jax.debug.callback(lambda *x: shown.append(x), batch.obs, batch.teacher_action, ordered=True)
+            return super().update(carry, batch, now, key)
+
+    config = settings(
+        FAST, imitation={"teacher": "scripted", "until": 1.0}, action_scale=0.5, network__log_std_min=-1.0
+    )
+    metrics = updated(env, config, 12, stages=Watched, teacher=Counter())[1]
+    for obs, action in shown:
+        np.testing.assert_allclose(action, obs[..., 2:3] * obs[..., 3:] / 8 / 0.5, atol=1e-6)
+    losses = [float(row["loss/imitation"]) for row in metrics]
+    assert losses[-1] < losses[0] - 0.1 and losses[-1] < 0.1  # of its deviation alone -0.08
+    blind = Probe(probes.show_hidden, probes.pay_one, num_envs=32)
+    refuses("group: 'signs' is missing in the state", updated, blind, config, 0, teacher=Counter())
 
 
 class Pacer:

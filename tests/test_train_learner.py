@@ -1,7 +1,6 @@
 """Training: the learner and evaluations on probes with known solutions; loggers and checkpoints."""
 
 import csv
-import dataclasses
 import functools
 import importlib.util
 import math
@@ -27,7 +26,7 @@ from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.stages import Stages
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import FAST, Probe, ProbeState, assert_same, settings, updated
+from tests.training import FAST, Probe, assert_same, settings, updated
 
 small = functools.partial(settings, FAST)
 
@@ -123,63 +122,8 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
     assert all(sorted(order) == list(range(8)) for order in drawn)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class SeeingState(ProbeState):
-    """A state with a further group of observations."""
-
-    groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
-
-
-class Seeing(Probe):
-    """Environments whose group `signs` shows the sign alone."""
-
-    def _seeing(self, state: Any) -> Any:
-        signs = jnp.broadcast_to(state.hidden[:, None, None], (self.num_envs, self.num_agents, 1))
-        return SeeingState(**{**vars(state), "groups": {"signs": signs}})
-
-    def reset(self, key: jax.Array) -> Any:
-        return self._seeing(super().reset(key))
-
-    def step(self, state: Any, action: jax.Array) -> Any:
-        return self._seeing(super().step(state, action))
-
-
-class Counter:
-    """A teacher that sees the sign alone, and remembers the number of steps of an episode."""
-
-    task, agents, groups = "probe", 2, ("signs",)
-
-    def initial_memory(self, num_envs: int) -> jax.Array:
-        return jnp.zeros(num_envs)
-
-    def act(self, obs: Any, memory: Any, key: Any) -> Any:
-        return obs.group("signs") * memory[:, None, None] / 8, memory + 1
-
-
-def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
-    """Its memory passes from rollout to rollout, and starts anew with each episode."""
-    show = lambda hidden, step: jnp.stack([hidden, step.astype(jnp.float32)], axis=-1)  # noqa: E731
-    env = Seeing(show, probes.pay_one, num_envs=32, features=2, max_episode_steps=3, odd_episode_steps=5)
-    shown: list[Any] = []
-
-    class Watched(Stages):
-        def update(self, carry: Any, batch: Batch, now: Any, key: jax.Array) -> Any:
-            jax.debug.callback(lambda *x: shown.append(x), batch.obs, batch.teacher_action, ordered=True)
-            return super().update(carry, batch, now, key)
-
-    config = small(imitation={"teacher": "scripted", "until": 1.0}, action_scale=0.5, network__log_std_min=-1.0)
-    metrics = updated(env, config, 12, stages=Watched, teacher=Counter())[1]
-    for obs, action in shown:
-        np.testing.assert_allclose(action, obs[..., 2:3] * obs[..., 3:] / 8 / 0.5, atol=1e-6)
-    losses = [float(row["loss/imitation"]) for row in metrics]
-    assert losses[-1] < losses[0] - 0.1 and losses[-1] < 0.1  # of its deviation alone -0.08
-
-
 def test_settings_must_fit_the_environment() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
-    with pytest.raises(InputError, match="group: 'signs' is missing in the state"):
-        updated(env, small(num_envs=4, imitation__teacher="scripted"), 0, teacher=Counter())
     for values, message in (
         ({}, "num_envs: 32 is not allowed; it must be equal to the environment's num_envs, 4"),
         ({"num_envs": 4, "ppo__minibatches": 7}, "ppo.minibatches: 7 is not allowed; it must be a divisor"),
