@@ -15,16 +15,17 @@ from mqe_jax import make
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
-from mqe_jax.core.types import Batch
-from mqe_jax.policies import parameters_for, zoo
+from mqe_jax.core.types import Batch, Observations
+from mqe_jax.policies import load_as, parameters_for, zoo
 from mqe_jax.runs.build import for_task, prepare, settings_of
 from mqe_jax.train.needs import Needs, needs_of
-from mqe_jax.train.policy import check_policy, read_policy
+from mqe_jax.train.normalize import running_init
+from mqe_jax.train.policy import TrainedPolicy, check_policy, read_policy
 from mqe_jax.train.runner import train_seeds
 from mqe_jax.train.stages import Stages
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import FAST, Probe, ProbeState, Stop, assert_same_run, settings, stop_after, updated
+from tests.training import FAST, Probe, ProbeState, Stop, assert_same_run, random_params, settings, stop_after, updated
 
 SENSES = {"senses": "onboard"}
 TINY: dict[str, Any] = {
@@ -78,6 +79,39 @@ def onboard() -> Any:
     return prepare("go1gate", TINY, SENSES, impl="c")
 
 
+def test_policies_without_sensors_send_no_messages() -> None:
+    """The shipped policy is a teacher and an opponent of one that sends messages."""
+    senses = {"senses": ["proprioception", {"name": "messages", "numbers": 2}]}
+    _, cast = prepare("go1gate", TINY, senses, impl="c")
+    obs = Observations(jnp.ones((3, 2, 16)))
+    act = lambda policy: policy.act(obs, policy.initial_memory(3), jax.random.PRNGKey(0))[0]  # noqa: E731
+    action = act(cast.teacher)
+    assert action.shape == (3, 2, 5) == (3, 2, cast.env.action_size) and not action[..., 3:].any()
+    shipped = zoo.load("go1gate")
+    np.testing.assert_array_equal(
+        action[..., :3], shipped.act(obs, shipped.initial_memory(3), jax.random.PRNGKey(0))[0]
+    )
+
+
+def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
+    (config,), cast = onboard()
+    needs, random = needs_of(cast.env, config), np.random.default_rng(0)
+    network, features = config.network.build(needs.dims), config.network.features(needs.dims)
+    statistics = running_init(needs.dims.observation, features)
+    policy = TrainedPolicy(network.policy_params(random_params(network)), statistics, needs, config, {}, True)
+    env = make("go1gate", impl="c", num_envs=1, skill=("walk", "agile"), **SENSES)
+    layout, met = env.groups["onboard"], load_as("opponent", policy, env)
+    assert layout.size == needs.dims.observation + 1
+    memory, own, last = met.initial_memory(3), policy.initial_memory(3), jnp.zeros((3, 2, 3))
+    for _ in range(2):
+        here, key = jnp.asarray(random.normal(size=(3, 2, layout.size)), jnp.float32), jax.random.PRNGKey(0)
+        action, memory = met.act(Observations(jnp.zeros((3, 2, 16)), None, {"onboard": here}), memory, key)
+        seen = jnp.concatenate([*(layout.split(here) | {"action": last}).values()], axis=-1)
+        last, own = policy.act(seen, own)
+        assert action.shape == (3, 2, 4) and np.abs(last).max() > 0.01
+        np.testing.assert_allclose(action, met.here.translated(last, met.own), atol=1e-6)  # pyright: ignore
+
+
 def test_other_sensors_are_named_with_both_values() -> None:
     (config,), cast = onboard()
     needs = needs_of(cast.env, config)
@@ -107,7 +141,10 @@ class SeeingState(ProbeState):
 
 
 class Seeing(Probe):
-    """Environments whose group `signs` shows the sign alone."""
+    """Environments whose group `signs` shows the sign alone; the second entry of an action moves nothing."""
+
+    def moving(self, action: jax.Array) -> jax.Array:
+        return action[..., :1]
 
     def _seeing(self, state: Any) -> Any:
         signs = jnp.broadcast_to(state.hidden[:, None, None], (self.num_envs, self.num_agents, 1))
@@ -129,13 +166,13 @@ class Counter:
         return jnp.zeros(num_envs)
 
     def act(self, obs: Any, memory: Any, key: Any) -> Any:
-        return obs.group("signs") * memory[:, None, None] / 8, memory + 1
+        return jnp.tile(obs.group("signs") * memory[:, None, None] / 8, 2), memory + 1
 
 
 def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
     """Its memory passes from rollout to rollout, and starts anew with each episode."""
     show = lambda hidden, step: jnp.stack([hidden, step.astype(jnp.float32)], axis=-1)  # noqa: E731
-    env = Seeing(show, probes.pay_one, num_envs=32, features=2, max_episode_steps=3, odd_episode_steps=5)
+    env = Seeing(show, probes.pay_one, num_envs=32, action_size=2, features=2, max_episode_steps=3, odd_episode_steps=5)
     shown: list[Any] = []
 
     class Watched(Stages):

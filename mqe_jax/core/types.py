@@ -327,4 +327,4 @@ class Batch(NamedTuple):
     old_value: jax.Array  # normalised values at collection (L, C, V)
     active: jax.Array  # which agents took part (L, C, A) bool
     learners: jax.Array  # active agents from whose samples the policy learns (L, C, A) bool
-    teacher_action: Any = ()  # actions of the teacher, unscaled (L, C, A, D); empty without one
+    teacher_action: Any = ()  # the first D' entries of the teacher's actions, unscaled (L, C, A, D'); empty without one

@@ -1,4 +1,4 @@
-"""Trained policies in tasks whose actions choose between skills: each acts with its own skill and command ranges."""
+"""Trained policies in tasks with wider actions: each acts with its own skill, and some send no messages."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.types import Memory
+from mqe_jax.core.types import Memory, Observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import SKILLS
@@ -25,6 +26,36 @@ class Translated(Composed):
     policy: Trained
     own: Commander = dataclasses.field(repr=False)
     here: Commander = dataclasses.field(repr=False)
+    sensed: slice | None = None
+    """Where the policy's observations have the last action, as it means here; None if they lack it."""
+
+    _parts = property(lambda self: (self.policy,))
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns the initial recurrent state of the policy; if it sees its last action, with that."""
+        memory = self.policy.initial_memory(num_envs)
+        shape = (num_envs, self.agents, self.policy.needs.dims.action)
+        return memory if self.sensed is None else (memory, jnp.zeros(shape))
+
+    def act(self, obs: Any, memory: Memory, key: jax.Array | None) -> tuple[jax.Array, Memory]:
+        """Returns the actions; see `Policy`."""
+        if self.sensed is None:
+            action, memory = self.policy.act(obs, memory, key)
+            return self.here.translated(action, self.own), memory
+        seen, (memory, last), group = Observations.at(obs), memory, self.policy.needs.group
+        here = seen.group(group) if isinstance(obs, Observations) else obs
+        own = jnp.concatenate([here[..., : self.sensed.start], last, here[..., self.sensed.stop :]], axis=-1)
+        seen = dataclasses.replace(seen, groups={**seen.groups, group: own})
+        action, memory = self.policy.act(seen, memory, key)
+        return self.here.translated(action, self.own), (memory, action)
+
+
+@dataclasses.dataclass(frozen=True)
+class Silent(Composed):
+    """A policy without sensors, as a policy of a task whose robots send messages of `numbers` numbers: zeros."""
+
+    policy: Policy
+    numbers: int
 
     _parts = property(lambda self: (self.policy,))
 
@@ -35,16 +66,19 @@ class Translated(Composed):
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions; see `Policy`."""
         action, memory = self.policy.act(obs, memory, key)
-        return self.here.translated(action, self.own), memory
+        return jnp.pad(action, ((0, 0), (0, 0), (0, self.numbers))), memory
 
 
 def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
-    """Returns a trained policy as it acts in a task: itself, or of several skills with its own one.
+    """Returns a trained policy as it acts in a task: itself, or of several skills with its own one, or silent.
 
     Raises:
         InputError: if the policy does not fit the task.
     """
     needs = policy.needs
+    if (numbers := env.action_size - env.controller.action_size) and not needs.senses:
+        view = _changed(env, params=dataclasses.replace(env.params, senses=()))
+        return Silent(translate(policy, view, name), numbers)
     if needs.control == "command" == env.control and len(env.controller.skill.parts) > 1:
         gait = needs.gait and env.params.gait  # a skill may have no gaits
         params = dataclasses.replace(env.params, skill=needs.skill, gait=gait, command_ranges=needs.command_ranges)
@@ -52,12 +86,23 @@ def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
         if here.admits(own):
             if beyond := own.skill.untrained_commands(params.action_ranges()):
                 raise InputError(f"policy: {name} commands beyond what its skill is trained for: {', '.join(beyond)}")
-            view = copy.copy(env)  # as the policy was trained
-            view.params, view.controller = params, dataclasses.replace(env.controller, commands=own.commands)
-            check_policy(policy, view, name)
-            return Translated(policy, own, here)
+            controller = dataclasses.replace(env.controller, commands=own.commands)
+            check_policy(policy, _changed(env, params=params, controller=controller), name)  # as it was trained
+            layout = {"policy": env.observation_layout, **env.groups}[needs.group]
+            sensed = layout.slice("action") if needs.senses and "action" in layout.names else None
+            if sensed is not None and sensed.stop - sensed.start != env.controller.action_size:
+                raise InputError(f"policy: {name} remembers actions or sends messages; it meets its own skill only")
+            return Translated(policy, own, here, sensed)
     check_policy(policy, env, name)
     return policy
+
+
+def _changed(env: QuadrupedEnv, **attributes: Any) -> QuadrupedEnv:
+    """Returns a task with other attributes, to which a policy is compared."""
+    other = copy.copy(env)
+    vars(other).update(attributes)
+    vars(other).pop("suite", None)  # which depends on them
+    return other
 
 
 def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -92,6 +92,7 @@ def make_learner(
     network, features = config.network.build(dims), config.network.features(dims)
     check_divisible(config, network, processes)
     algorithm = stages(network, config)
+    moving = getattr(getattr(env, "env", env), "moving", lambda action: action)  # messages are not imitated
 
     @single
     @check_arguments(key=RandomKey)
@@ -145,7 +146,7 @@ def make_learner(
         )
         batch, value_normalizer, batch_metrics = _prepare(algorithm, now, state, transitions, features)
         if teacher is not None:
-            shown = transitions.teacher_action / config.action_scale
+            shown = moving(transitions.teacher_action) / config.action_scale
             batch = batch._replace(teacher_action=chunks(shown, network.chunk_length))
         carry = state.params, begun_anew(state.optimizer, now.actor_begins), state.learning_rate
         carry, loss_metrics = algorithm.update(carry, batch, now, epoch_key)
