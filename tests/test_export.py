@@ -33,7 +33,7 @@ from mqe_jax.export import translate  # noqa: E402
 from mqe_jax.export.check import errors, record_actions  # noqa: E402
 from mqe_jax.export.policy import input_shapes, shapes, to_onnx  # noqa: E402
 from mqe_jax.export.site import entries  # noqa: E402
-from mqe_jax.export.task import TaskFunctions, policy_function, state_arrays  # noqa: E402
+from mqe_jax.export.task import TaskFunctions, normal_numbers, policy_function, state_arrays  # noqa: E402
 
 GATE = zoo.file_of("go1gate")
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
@@ -163,6 +163,9 @@ def test_a_policy_that_sees_sensors_is_exported_and_senses_on_the_page(tmp_path:
             memory[team] = {name: found.get(f"next_{name}", x) for name, x in memory[team].items()}
             actions.append(action)
         state = step(state, jnp.concatenate(actions))
+    with normal_numbers(jnp.array([-0.1, 0.1, -1.3, -1.2])):
+        lost = [jax.random.bernoulli(state.key, p, (2,)) for p in (0.5, 0.1)]
+    np.testing.assert_array_equal(lost, [[True, False], [True, False]])  # quantiles 0 and -1.28
     save_policy(tmp_path, new_policy(env, "command", "proprioception", recurrent=False, critic_input="privileged"))
     refuses("sees the group 'proprioception'; the page has 'policy' and 'onboard'", entries, [str(tmp_path)])
 

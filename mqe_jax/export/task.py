@@ -209,7 +209,8 @@ def _sensing(choose: Function, shapes: Shapes, functions: TaskFunctions) -> tupl
 def normal_numbers(noise: jax.Array | None, used: Callable[[int], None] = lambda size: None) -> Iterator[None]:
     """Within it, `jax.random.normal` returns the numbers of `noise` (K,) in order, or zeros without them.
 
-    A graph has no random keys, so its noise is an input. Nothing is compiled within, as JAX would keep it.
+    `uniform` and `bernoulli` are made of such numbers. A graph has no random keys, so its noise is an input. Nothing is
+    compiled within, as JAX would keep it.
     """
     position = 0
 
@@ -219,7 +220,16 @@ def normal_numbers(noise: jax.Array | None, used: Callable[[int], None] = lambda
         used(position)
         return jnp.zeros(shape, dtype) if noise is None else noise[first:position].reshape(shape)
 
-    with jax.disable_jit(), mock.patch.object(jax.random, "normal", normal):
+    def uniform(
+        key: jax.Array, shape: tuple[int, ...] = (), dtype: Any = jnp.float32, minval: Any = 0.0, maxval: Any = 1.0
+    ) -> jax.Array:
+        return minval + (maxval - minval) * 0.5 * (1.0 + jax.lax.erf(normal(key, shape, dtype) / math.sqrt(2.0)))
+
+    def bernoulli(key: jax.Array, p: Any, shape: tuple[int, ...]) -> jax.Array:
+        return uniform(key, shape) < p
+
+    draws = {"normal": normal, "uniform": uniform, "bernoulli": bernoulli}
+    with jax.disable_jit(), mock.patch.multiple(jax.random, **draws):
         yield
 
 
