@@ -66,7 +66,7 @@ class Silent(Composed):
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions; see `Policy`."""
         action, memory = self.policy.act(obs, memory, key)
-        return jnp.pad(action, ((0, 0), (0, 0), (0, self.numbers))), memory
+        return jnp.concatenate([action, jnp.zeros((*action.shape[:-1], self.numbers))], axis=-1), memory
 
 
 def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:

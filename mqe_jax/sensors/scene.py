@@ -180,7 +180,8 @@ class SensedScene:
         moving = np.flatnonzero([wall.anchor is not None for wall in walls])
         if len(moving):
             center = center.at[moving].add(anchors[self.compiled.mocap_anchor])
-        boxes = sides(jnp.pad(center, ((0, 0), (0, 1))), np.reshape([wall.size[:2] for wall in walls], (-1, 2)))
+        level = jnp.concatenate([center, jnp.zeros((len(walls), 1))], axis=-1)  # jnp.pad has no translation to a graph
+        boxes = sides(level, np.reshape([wall.size[:2] for wall in walls], (-1, 2)))
         return jnp.concatenate([jnp.asarray(ends, jnp.float32), boxes])
 
 
