@@ -7,6 +7,7 @@ Frame: the environment's, x along the track from its start, y across it with 0 o
 """
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -17,6 +18,14 @@ from mqe_jax.physics.appearance.shapes import WALL_COLOR, WALL_GROUP, Ground, St
 from mqe_jax.physics.collision import GROUND_BIT, WALL_BIT
 
 _THICKNESS = 0.04  # of the side walls, m
+LANE = 0.75  # m, distance between robots that start side by side, at least
+ROW = 1.0  # m, distance between those that start one behind the other
+
+
+def rows_of(robots: int, width: float) -> tuple[int, float]:
+    """Returns how many robots start side by side on a width, and how far the last row is behind the first; m."""
+    rows = math.ceil(robots / max(int(width / LANE), 1))
+    return math.ceil(robots / rows), ROW * (rows - 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,23 +94,27 @@ class TerrainBlock:
 
 @dataclasses.dataclass(frozen=True)
 class SpawnArea(TerrainBlock):
-    """Spawn poses side by side across the track, with a wall behind them."""
+    """Spawn poses side by side across the track, in rows, with a wall behind them."""
 
     length: float = 2.0
     spawn_x: float | None = None
-    """X of the spawn poses from the block's start, m; half its length if None."""
+    """X of the spawn poses from the block's start, m; half its length if None. Of several rows, the first."""
     spacing: float | None = None
-    """Distance between neighbouring spawn poses, m; the track's width / number of robots if None."""
+    """Distance between neighbouring spawn poses, m; the track's width / robots in a row if None."""
+    columns: int | None = None
+    """Number of robots in a row; all of them if None. Further rows are behind the first one."""
     back_wall: bool = True
     """Whether there is a wall behind the robots."""
 
     def layout(self, start: float, track: "Track", number: int) -> Layout:
         x = start + (self.length / 2 if self.spawn_x is None else self.spawn_x)
-        spacing = track.width / track.num_robots if self.spacing is None else self.spacing
-        middle = (track.num_robots - 1) / 2
-        spawn = tuple((x, (robot - middle) * spacing, 0.0) for robot in range(track.num_robots))
+        columns, spawn = self.columns or track.num_robots, []
+        spacing = track.width / columns if self.spacing is None else self.spacing
+        for row, first in enumerate(range(0, track.num_robots, columns)):
+            count = min(columns, track.num_robots - first)
+            spawn += [(x - row * ROW, (i - (count - 1) / 2) * spacing, 0.0) for i in range(count)]
         back = (Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),) if self.back_wall else ()
-        return Layout(barriers=back, spawn=spawn)
+        return Layout(barriers=back, spawn=tuple(spawn))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +171,8 @@ class Track:
     """Blocks in order along x."""
     width: float = 3.0
     """Distance between the side walls, m."""
+    start: float = 0.0
+    """X at which the first block begins, m."""
     num_robots: int = 2
     """Number of spawn poses of a `SpawnArea`."""
     wall_height: float = 0.5
@@ -181,7 +196,7 @@ class Track:
     def layout(self) -> Layout:
         """Returns the layout of all blocks; anchors are numbered over the whole track."""
         walls, barriers, anchors, spawn = [], [], [], []
-        start = 0.0
+        start = self.start
         for number, block in enumerate(self.blocks):
             part = block.layout(start, self, number)
             for wall in part.walls:
@@ -192,9 +207,9 @@ class Track:
             spawn += part.spawn
             start += block.length
         if self.walled:
-            middle, half = start / 2, self.width / 2
-            barriers.append(Barrier("side_right", (middle, -half), (0.0, 1.0), start))
-            barriers.append(Barrier("side_left", (middle, half), (0.0, -1.0), start))
+            middle, half = (self.start + start) / 2, self.width / 2
+            barriers.append(Barrier("side_right", (middle, -half), (0.0, 1.0), start - self.start))
+            barriers.append(Barrier("side_left", (middle, half), (0.0, -1.0), start - self.start))
         return Layout(tuple(walls), tuple(barriers), tuple(anchors), tuple(spawn))
 
 

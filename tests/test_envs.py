@@ -180,7 +180,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("go1seesaw", {"plank_start": -0.3}, r"plank_start: -0.3 .*within \+-plank.limit"),
     ("go1revolvingdoor", {"gap": 1.5}, r"door.size: .*narrower than the gap, 1.5"),
     ("go1bridge", {"platform_x": (3.0, 4.0)}, r"platform_x: .*more than a platform's length"),
-    ("go1gate", {"num_agents": 3}, r"num_agents: 3; go1gate requires 2"),
+    ("go1tug", {"num_agents": 3}, r"num_agents: 3 is not allowed; it must be 2, the size of go1tug"),
     ("go1plane", {"gait": "gallop"}, r"gait: unknown name 'gallop'"),
     ("go1plane", {"skill_weights": "/nowhere"}, r"walk policy: no file /nowhere"),
     ("go1plane", {"skill": ("walk", "agil")}, r"skill: unknown name 'agil' .did you mean 'agile'"),
@@ -292,7 +292,7 @@ def test_a_block_of_entities_says_who_is_there() -> None:
     assert layout.entities(packed, "sheep")[0].shape == (2, 2, 1) and layout.entities(packed, "sheep")[1].all()
     with pytest.raises(KeyError, match="'own' has no entities"):
         layout.entities(packed, "own")
-    assert [b.entities.kind for b in made("go1sheep-hard").observation_layout.blocks if b.entities] == ["sheep"]
+    assert [b.entities.kind for b in made("go1sheep-hard").observation_layout.blocks if b.entities] == ["robot", "sheep"]
 
 
 def test_a_block_of_an_image_has_its_shape() -> None:

@@ -57,7 +57,7 @@ class QuadrupedEnv(Task[S, P]):
         self.weights = weights_of(self.params)
         offset, expected = self.params.randomization.motor_offset, self.Params().num_agents
         if self.params.num_agents != expected and not self.variable_num_agents:
-            raise InputError(f"num_agents: {self.params.num_agents}; {self.name} requires {expected} robots")
+            fail("num_agents", self.params.num_agents, f"{expected}, the size of {self.name}")
         self.control = check_mode(control)
         if offset and control == "torque":
             fail("randomization.motor_offset", offset, "0 with control torque, which has no joint targets")
@@ -76,7 +76,7 @@ class QuadrupedEnv(Task[S, P]):
             joint_mechanics=self.params.joint_mechanics,
             solver_iterations=self.params.solver_iterations,
             torque_robots=torque_robots,
-            max_contacts=self.params.contacts_per_robot * scene.num_robots,
+            max_contacts=self.params.contacts_per_robot * scene.num_robots + self.extra_contacts,
             foot_sensors=self.params.privileged_contact_forces,
             edits=tuple(sensor.edit_spec for sensor in self.params.senses),
         )
@@ -88,7 +88,7 @@ class QuadrupedEnv(Task[S, P]):
             impl=impl,
             num_envs=num_envs,
             contacts_per_env=self._scene.max_contacts,
-            max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots,
+            max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots + 4 * self.extra_contacts,
         )
         self.impl = self.physics.impl
         self.check_senses()
@@ -241,7 +241,7 @@ class QuadrupedEnv(Task[S, P]):
         action = self.controller.check_action(action, self.action_size)
         bad_action = ~jnp.all(jnp.isfinite(action))
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
-        still = (state.step < state.frozen_steps) | ~state.active
+        still = (state.step < state.frozen_steps) | ~self.acting(state)
         own_action = jnp.where(still[:, None], 0.0, action)
         action = self.unmirror_action(self.moving(own_action))
         key, push_key, _, npc_key = jax.random.split(state.key, 4)
@@ -299,7 +299,7 @@ class QuadrupedEnv(Task[S, P]):
         collision = jnp.any(robot_state.count(robot_state.trunk_force[: self.num_agents] > self.params.collision_force))
         state = dataclasses.replace(state, task=alike("step_task", self.step_task(before, after), state.task))
         reward, logged = self.score(before, Moment(state, robot_state), collision)
-        fall, crash = jnp.any(self.fallen(robot_state)), collision & self.params.end_on_collision
+        fall, crash = jnp.any(self.fallen(robot_state)) & self.falls_end, collision & self.params.end_on_collision
         failed = diverged | fall | crash
         decided = check_shape("ending", self.ending(state, robot_state), (), dtype=bool)
         terminated, late = failed | decided, state.step >= self.max_steps

@@ -82,7 +82,7 @@ class Go1RevolvingDoor(Duel[None, DoorParams]):
         colors, half = (0, 2), params.track_width / 2
         marks = (*grounds.pads(self.spawn_poses(), colors), *grounds.finish(params.line_x, (-half, half)))
         length = params.door.position[0] + 3.0
-        ground = grounds.track(length, params.track_width, 2, marks, grounds.COURT)
+        ground = grounds.track((0.0, length), params.track_width, 2, marks, grounds.COURT)
         track = Track(blocks=blocks, width=params.track_width, wall_height=0.85, ground=ground)
         return Scene(track, num_robots=2, objects={"door": params.door}, colors=colors)
 

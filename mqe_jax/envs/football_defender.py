@@ -11,7 +11,7 @@ import numpy as np
 from mqe_jax.core.limits import Fraction
 from mqe_jax.core.settings import record
 from mqe_jax.envs.football import BALL_BLOCKS, FAR, GOALS, Football, FootballParams, Play
-from mqe_jax.envs.observation import PAIR, ObservationLayout, for_all, pair
+from mqe_jax.envs.observation import ObservationLayout, for_all, observe_team, team_blocks
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import defend
 from mqe_jax.physics.robots.index import RobotState
@@ -72,10 +72,12 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     title = "Football (2 vs 1)"
     aim = "Score in the goal behind the defender."
     Params = DefenderParams
-    kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 0.0, np.pi))
     ball_spot = (5.0, -2.1)
-    colors = (0, 1, 2)
     npc_varied = ("vx", "vy", "yaw_rate")
+
+    @property
+    def kick_off(self) -> tuple[tuple[float, float, float], ...]:
+        return (4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 0.0, np.pi)
 
     def npc_commands(self, state: State[DefenderState], robot_state: RobotState) -> jax.Array:
         """Walk commands of the defender (1, C)."""
@@ -113,11 +115,11 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout((*PAIR, *BALL_BLOCKS))
+        return ObservationLayout((*team_blocks(2), *BALL_BLOCKS))
 
     def observe(self, state: State[DefenderState], robot_state: RobotState) -> dict[str, jax.Array]:
         return {
-            **pair(robot_state.base_info[:2]),
+            **observe_team(robot_state.base_info[:2]),
             "ball": for_all(self.ball(state.data), 2),
             "ball_velocity": for_all(self.ball_velocity(state.data), 2),
         }

@@ -1,4 +1,7 @@
-"""go1gate, the paper's Narrow Gate: two robots pass, one after the other, through a gap wide enough for one."""
+"""go1gate, the paper's Narrow Gate: robots, by default two, pass one by one through a gap wide enough for one."""
+
+import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +11,13 @@ from mqe_jax.core.limits import Coordinate, Distance, Length, TimeLimit
 from mqe_jax.core.settings import record
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, for_all, pair
+from mqe_jax.envs.observation import GATE, ObservationLayout, for_all, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
-from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
+from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track, rows_of
 
 
 @record
@@ -53,7 +56,8 @@ class GateParams(TaskParams):
     target_x: Coordinate = 5.5
     """X of the robots' targets, m."""
     target_y: Coordinate = 0.75
-    """|y| of the targets, m; the robots' paths cross: the first robot's target is on the left."""
+    """|y| of the targets, m; the robots' paths cross: the first robot's target is on the left. Those of more than two
+    robots are in rows, mirrored from the robots' places at the start; the first row's are the last."""
     rewards: GateRewards = GateRewards()
     """Weights of the reward terms."""
 
@@ -66,41 +70,56 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
     """Narrow Gate.
 
     - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is sampled at reset.
-    - Observation: one-hot 2, own base info 6, teammate's base info 6, gate centre 2.
+    - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2.
     - Reward: see `GateRewards`; shared.
-    - End: a fall, a collision, or 10 s. Success: both are through without a collision.
+    - End: a fall, a collision, or 10 s. Success: all robots are through without a collision.
+    - Sizes: any `num_agents`; the track is longer by 1 m at both ends for every further row of robots.
 
     Source: paper, section III and table of rewards.
     """
 
     name = "go1gate"
     title = "Narrow Gate"
-    aim = "Get both robots through the gap, which is wide enough for one. Touch nothing."
+    aim = "Get all robots through the gap, which is wide enough for one. Touch nothing."
     Params = GateParams
+    variable_num_agents = True
 
     def scene(self) -> Scene:
-        params = self.params
+        params, agents = self.params, self.num_agents
+        columns, behind = rows_of(agents, params.track_width)
         gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
-        blocks = (SpawnArea(2.0), gate, Plane(1.0), EndWall())
-        targets = [(params.target_x, side * params.target_y, 0.0) for side in (1, -1)]
-        ground = grounds.track(6.0, params.track_width, 4, grounds.pads(targets, (0, 1)))
-        return Scene(Track(blocks=blocks, width=params.track_width, ground=ground), num_robots=2)
+        spawn = SpawnArea(2.0 + behind, spawn_x=1.0 + behind, columns=columns)
+        track = Track(
+            blocks=(spawn, gate, Plane(1.0 + behind), EndWall()),
+            width=params.track_width,
+            start=0.0 - behind,
+            num_robots=agents,
+        )
+        pads = grounds.pads([(x, y, 0.0) for x, y in self.targets(track.layout().spawn)], range(agents))
+        ground = grounds.track((track.start, 6.0 + behind), params.track_width, 4, pads)
+        return Scene(dataclasses.replace(track, ground=ground), num_robots=agents)
+
+    def targets(self, spawn: Sequence[tuple[float, float, float]]) -> np.ndarray:
+        """Returns the robots' targets (A, 2), m, from their spawn poses."""
+        params = self.params
+        x, y = np.array(spawn)[:, :2].T
+        apart = params.target_y / (params.track_width / 4)  # |y| of two robots at the start is a quarter of the width
+        return np.stack([params.target_x + x - x.min(), -apart * y], axis=-1)
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout((*PAIR, GATE))
+        return ObservationLayout((*team_blocks(self.num_agents), GATE))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        return {**pair(robot_state.base_info), "gate": for_all(state.anchors, 2)}
+        return {**observe_team(robot_state.base_info), "gate": for_all(state.anchors, self.num_agents)}
 
     def target_distance(self, robot_state: RobotState) -> jax.Array:
-        """Returns each robot's horizontal distance to its target (2,), m."""
-        params = self.params
-        target = np.array([[params.target_x, params.target_y], [params.target_x, -params.target_y]], np.float32)
+        """Returns each robot's horizontal distance to its target (A,), m."""
+        target = self.targets(self.compiled.layout.spawn).astype(np.float32)
         return jnp.linalg.norm(robot_state.position_w[:, :2] - target, axis=-1)
 
     def through(self, state: State, robot_state: RobotState) -> jax.Array:
-        """Returns which robots are past the gate (2,) bool."""
+        """Returns which robots are past the gate (A,) bool."""
         return robot_state.position_w[:, 0] > state.anchors[0, 0] + self.params.past_gate
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
@@ -113,6 +132,6 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
         }
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
-        """Success: both robots are through; `one`: at least one is, however the episode ended."""
+        """Success: all robots are through; `one`: at least one is, however the episode ended."""
         through = self.through(state, robot_state)
         return {"success": jnp.all(through | ~robot_state.active) & ~failed, "one": jnp.any(robot_state.count(through))}

@@ -91,8 +91,6 @@ def one_hot(agents: int, meaning: str = "agent's id") -> Block:
     return Block("one_hot", agents, meaning, categorical=True)
 
 
-# The first blocks of two cooperating robots; `pair` fills them.
-PAIR = (one_hot(2), Block("base", 6, BASE_INFO), Block("teammate", 6, BASE_INFO))
 GATE = Block("gate", 2, "centre of the gap, m")
 
 
@@ -106,9 +104,16 @@ PROPRIOCEPTION = ObservationLayout(
 """What an agent's own sensors measure."""
 
 
-def pair(info: jax.Array) -> dict[str, jax.Array]:
-    """Returns the blocks of `PAIR` from the base information (2, 6) of both robots."""
-    return {"one_hot": jnp.eye(2), "base": info, "teammate": others(info)}
+def team_blocks(agents: int) -> tuple[Block, ...]:
+    """Returns the first blocks of cooperating robots; `observe_team` fills them."""
+    mates = (entities("teammate", "robot", agents - 1, 6, f"of each, {BASE_INFO}"),) if agents > 1 else ()
+    return one_hot(agents), Block("base", 6, BASE_INFO), *mates
+
+
+def observe_team(info: jax.Array) -> dict[str, jax.Array]:
+    """Returns the blocks of `team_blocks` from the base information (A, 6) of its robots."""
+    mates = {"teammate": others(info)} if len(info) > 1 else {}
+    return {"one_hot": jnp.eye(len(info)), "base": info, **mates}
 
 
 def others(values: jax.Array) -> jax.Array:

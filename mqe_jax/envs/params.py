@@ -10,15 +10,16 @@ from mqe_jax.core.limits import (
     Buffer,
     Coordinate,
     Distance,
-    Few,
     Fraction,
     Iterations,
     Length,
     NonNegative,
     Positive,
     PositiveFriction,
+    Robots,
     Time,
     TimeLimit,
+    bounds,
 )
 from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, record
 from mqe_jax.envs.randomization import Randomization
@@ -32,8 +33,8 @@ from mqe_jax.skills.control import Commander
 class TaskParams:
     """Parameters common to all tasks; a task adds its own."""
 
-    num_agents: Few = 2
-    """Number of controlled robots."""
+    num_agents: Robots = 2
+    """Number of controlled robots; in a match those of both teams."""
     robot: str = "go1"
     """Name of the robot, such as go1 or go2 (`mqe_jax.physics.robots`)."""
     episode_length: TimeLimit = 10.0
@@ -150,6 +151,13 @@ def check_above(spawn_height: float, top: float, robot: str) -> None:
     least = top + robots.get(robot).stand_height
     if spawn_height < least:
         fail("spawn_height", spawn_height, f"at least {least:.2f}, because the supporting surface is at {top}")
+
+
+def check_teams(num_agents: int, most: int, room: str) -> None:
+    """Raises an InputError unless `num_agents` are two equal teams of at most `most` robots, for which `room` is."""
+    most = min(2 * most, int(bounds(Robots)[1]))
+    if num_agents % 2 or num_agents > most:
+        fail("num_agents", num_agents, f"even, for two equal teams, and at most {most} with {room}")
 
 
 def check_gap(name: str, width: float, track_width: float) -> None:

@@ -1,4 +1,4 @@
-"""go1pushbox, the paper's Push Box: two robots push a box, too heavy for one of them, through a gate."""
+"""go1pushbox, the paper's Push Box: robots, by default two, push a box through a gate, too heavy for one of them."""
 
 import dataclasses
 
@@ -9,17 +9,18 @@ import numpy as np
 from mqe_jax.core.limits import Buffer, Coordinate, Distance, Iterations, Length, NonNegative, TimeLimit
 from mqe_jax.core.settings import fail, record
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import GATE, PAIR, Block, ObservationLayout, for_all, pair
+from mqe_jax.envs.observation import GATE, Block, ObservationLayout, for_all, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.objects import Box
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
-from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
+from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track, rows_of
 
 _SPAWN_LENGTH, _GATE_LENGTH, _GATE_DEPTH = 2.0, 5.0, 0.1  # m, along x
 _BEHIND = 0.3  # of a robot's centre behind the box's rear face, m
+_ABREAST, _LENGTH = 3, 0.8  # robots that push side by side, at most; distance between their rows, m
 
 
 @record
@@ -50,7 +51,7 @@ class PushBoxParams(TaskParams):
     past_gate: Coordinate = 0.0
     """Distance of the box's centre behind the gate's at which it counts as through, m."""
     box: Box = Box()
-    """The box."""
+    """The box as two robots push it; the mass grows with `num_agents` / 2."""
     box_x: Coordinate = 2.5
     """X of the box's centre at reset, m."""
     box_noise: Distance = 0.5
@@ -83,10 +84,11 @@ class PushBoxState:
 class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     """Push Box.
 
-    - Scene: a track 5 m wide with a box of 1 m and 6 kg in front of a gate of 1.5 m.
-    - Observation: one-hot 2, own base info 6, teammate's base info 6, gate centre 2, box x, y, box quaternion 4.
+    - Scene: a track 5 m wide with a box of 1 m and 3 kg per robot in front of a gate of 1.5 m.
+    - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2, box x, y, box quaternion 4.
     - Reward: see `PushBoxRewards`; shared.
     - End: a fall, or 15 s. Success: the box is past the gate.
+    - Sizes: any `num_agents`; robots that do not fit beside each other start in rows.
 
     Source: paper, section III and table of rewards.
     """
@@ -95,15 +97,23 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     title = "Push Box"
     aim = "Push the box through the gate."
     Params = PushBoxParams
+    variable_num_agents = True
 
     def scene(self) -> Scene:
-        params = self.params
+        params, agents = self.params, self.num_agents
+        columns, behind = rows_of(agents, params.track_width)
+        spawn = SpawnArea(_SPAWN_LENGTH + behind, spawn_x=_SPAWN_LENGTH / 2 + behind, columns=columns)
         gate = Gate(_GATE_LENGTH, width=params.gate_width, depth=_GATE_DEPTH, random=params.gate_random)
-        blocks = (SpawnArea(_SPAWN_LENGTH), gate, EndWall())
-        length, goal_x = _SPAWN_LENGTH + _GATE_LENGTH, _SPAWN_LENGTH + _GATE_LENGTH / 2
-        ground = grounds.warehouse(length, params.track_width, goal_x)
-        track = Track(blocks=blocks, width=params.track_width, ground=ground)
-        return Scene(track, num_robots=2, objects={"box": params.box})
+        ends, goal_x = (0.0 - behind, _SPAWN_LENGTH + _GATE_LENGTH), _SPAWN_LENGTH + _GATE_LENGTH / 2
+        track = Track(
+            blocks=(spawn, gate, EndWall()),
+            width=params.track_width,
+            start=ends[0],
+            num_robots=agents,
+            ground=grounds.warehouse(ends, params.track_width, goal_x),
+        )
+        box = dataclasses.replace(params.box, mass=params.box.mass * agents / 2)
+        return Scene(track, num_robots=agents, objects={"box": box})
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
@@ -127,21 +137,26 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
         """Returns the robots' summed distances to their places behind the box, and that of box and gate in y (), m."""
         box = self.object_pose(now.state.data, "box")[:2]
         length, width, _ = self.params.box.size
-        places = box + jnp.array([[-0.5 * length - _BEHIND, -0.25 * width], [-0.5 * length - _BEHIND, 0.25 * width]])
-        behind = jnp.sum(now.robots.count(jnp.linalg.norm(now.robots.position_w[:2, :2] - places, axis=-1)))
+        place = np.arange(self.num_agents)
+        row, first = place // _ABREAST, place // _ABREAST * _ABREAST
+        share = (place - first + 0.5) / np.minimum(_ABREAST, self.num_agents - first) - 0.5  # of the box's width
+        x, y = -0.5 * length - _BEHIND - _LENGTH * row, share * width
+        places = box + jnp.array(np.stack([x, y], axis=-1), jnp.float32)
+        behind = jnp.sum(now.robots.count(jnp.linalg.norm(now.robots.position_w[:, :2] - places, axis=-1)))
         return behind, jnp.abs(box[1] - now.state.anchors[0, 1])
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout((*PAIR, GATE, Block("box", 2, "centre x, y, m"), Block("box_quaternion", 4, "wxyz")))
+        box = Block("box", 2, "centre x, y, m"), Block("box_quaternion", 4, "wxyz")
+        return ObservationLayout((*team_blocks(self.num_agents), GATE, *box))
 
     def observe(self, state: State[PushBoxState], robot_state: RobotState) -> dict[str, jax.Array]:
-        pose = self.object_pose(state.data, "box")
+        pose, agents = self.object_pose(state.data, "box"), self.num_agents
         return {
-            **pair(robot_state.base_info),
-            "gate": for_all(state.anchors, 2),
-            "box": for_all(pose[:2], 2),
-            "box_quaternion": for_all(pose[3:], 2),
+            **observe_team(robot_state.base_info),
+            "gate": for_all(state.anchors, agents),
+            "box": for_all(pose[:2], agents),
+            "box_quaternion": for_all(pose[3:], agents),
         }
 
     def rewards(

@@ -7,7 +7,7 @@ from mqe_jax.core.limits import Coordinate, Length, TimeLimit
 from mqe_jax.core.settings import fail, record
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import PAIR, ObservationLayout, pair
+from mqe_jax.envs.observation import ObservationLayout, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
@@ -101,10 +101,10 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout(PAIR)
+        return ObservationLayout(team_blocks(2))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        return pair(robot_state.base_info)
+        return observe_team(robot_state.base_info)
 
     def on_platform(self, robot_state: RobotState) -> jax.Array:
         """Returns which active robots are on the platform (2,) bool."""

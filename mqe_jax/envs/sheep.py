@@ -1,26 +1,31 @@
-"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: two robots herd sheep through a gate."""
+"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: robots, by default two, herd sheep through a gate."""
 
+import math
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.limits import Buffer, Coordinate, Distance, Few, Friction, Length, NonNegative, TimeLimit
-from mqe_jax.core.settings import record
+from mqe_jax.core.limits import Buffer, Coordinate, Distance, Few, FlockSize, Friction, Length, NonNegative, TimeLimit
+from mqe_jax.core.settings import fail, record
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import GATE, PAIR, ObservationLayout, entities, for_all, pair
+from mqe_jax.envs.observation import GATE, ObservationLayout, entities, for_all, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import flock
+from mqe_jax.physics import objects
 from mqe_jax.physics.appearance import grounds
-from mqe_jax.physics.objects import Sheep
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
-from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
+from mqe_jax.terrain import LANE, EndWall, Gate, Plane, SpawnArea, Track, rows_of
 
 if TYPE_CHECKING:
     from mujoco import mjx
+
+_ROOM = 0.5  # m, from the flock at the start to the walls; as much again to the robots
+_CLEAR = 0.05  # m, between the sheep of a flock that could not be closer
+_CONTACTS = 2  # of each sheep beyond those of the task's own flock
 
 
 @record
@@ -54,7 +59,7 @@ class SheepEasyParams(TaskParams):
     spawn_x: Coordinate = 1.25
     """Spawn x of the robots, m."""
     spawn_spacing: Distance = 1.95
-    """Distance between the robots, m."""
+    """Distance between the robots, m, at most."""
     gate_width: Length = 0.8
     """Width of the gate's gap, m."""
     gate_random: tuple[Distance, Distance] = (0.0, 0.5)
@@ -63,10 +68,12 @@ class SheepEasyParams(TaskParams):
     """Distance behind the gate's centre at which a sheep counts as through, m."""
     flock: tuple[Few, Few] = (1, 1)
     """Number of sheep along x and along y."""
+    num_sheep: FlockSize | None = None
+    """Number of sheep, in about as many rows as columns; that of `flock` if none."""
     flock_center: tuple[Coordinate, Coordinate] = (3.0, 0.0)
     """Centre of the flock at reset, m."""
     flock_spacing: Distance = 1.5
-    """Distance between neighbouring sheep at reset, m."""
+    """Distance between neighbouring sheep at reset, m; a flock of `num_sheep` is closer where it needs to be."""
     flock_noise: Distance = 0.3
     """Half-width of the uniform noise on each sheep's position, m."""
     restlessness: NonNegative = 0.08
@@ -80,6 +87,43 @@ class SheepEasyParams(TaskParams):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_gap("gate_width", self.gate_width, self.track_width)
+        most = math.prod(self._most)
+        if self.num_sheep is not None and self.num_sheep > most:
+            fail("num_sheep", self.num_sheep, f"at most {most}, for which there is room before the gate")
+
+    @property
+    def _room(self) -> np.ndarray:
+        """Extents x, y (2,) of the ground on which the flock may stand at the start, about its centre, m."""
+        (x, y), gate = self.flock_center, sum(self.lengths[:2]) + _ROOM - self.gate_random[0]
+        along = min(x - self.spawn_x - 2 * _ROOM, gate - x - _ROOM)
+        return 2 * np.maximum([along, self.track_width / 2 - abs(y) - _ROOM], 0.0)
+
+    @property
+    def _most(self) -> tuple[int, int]:
+        """The most sheep that there is room for along x and along y."""
+        rows, columns = (self._room / (2 * objects.Sheep().radius + _CLEAR)).astype(int) + 1
+        return int(rows), int(columns)
+
+    @property
+    def flock_size(self) -> int:
+        """Number of sheep S."""
+        return math.prod(self.flock) if self.num_sheep is None else self.num_sheep
+
+    def flock_grid(self) -> tuple[np.ndarray, float]:
+        """Returns the sheep's mean positions at the start (S, 2), and half the width of the noise on them, m."""
+        (rows, columns), spacing, noise = self.flock, self.flock_spacing, self.flock_noise
+        if self.num_sheep is not None:
+            most_rows, most_columns = self._most
+            columns = max(
+                min(math.ceil(math.sqrt(self.flock_size)), most_columns), math.ceil(self.flock_size / most_rows)
+            )
+            rows = math.ceil(self.flock_size / columns)
+            spacing = min(spacing, *(self._room / np.maximum([rows - 1, columns - 1], 1)).tolist())
+            noise = min(noise, max(spacing / 2 - objects.Sheep().radius, 0.0))
+        number = np.arange(self.flock_size)
+        count = np.minimum(columns, self.flock_size - number // columns * columns)  # of the sheep's row
+        grid = np.stack([number // columns - (rows - 1) / 2, number % columns - (count - 1) / 2], axis=-1)
+        return self.flock_center + spacing * grid, noise
 
 
 @record
@@ -104,9 +148,10 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     """Sheep Dog: sheep flee from nearby robots and must be herded through a gate.
 
     - Scene: a track with a gate whose centre is sampled at reset; one sheep (hard: nine) in front of it.
-    - Observation: one-hot 2, own base info 6, teammate's base info 6, gate centre 2, each sheep's x, y.
+    - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2, each sheep's x, y.
     - Reward: see `SheepRewards`; shared.
     - End: a fall, a collision, or 15 s. Success: the share of the sheep that are past the gate at the time limit.
+    - Sizes: any `num_agents` and `num_sheep`; robots that do not fit beside each other start in rows.
 
     Source: paper, section III and table of rewards.
     """
@@ -115,33 +160,43 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     title = "Sheep Dog (Easy)"
     aim = "Drive the sheep through the gate."
     Params = SheepEasyParams
+    variable_num_agents = True
 
     @property
     def num_sheep(self) -> int:
         """Number of sheep S."""
-        rows, columns = self.params.flock
-        return rows * columns
+        return self.params.flock_size
+
+    @property
+    def extra_contacts(self) -> int:
+        """Of the sheep beyond the task's own flock."""
+        return _CONTACTS * max(self.num_sheep - self.Params().flock_size, 0)
 
     def scene(self) -> Scene:
-        params = self.params
+        params, agents = self.params, self.num_agents
         before, middle, behind = params.lengths
-        spawn = SpawnArea(before, spawn_x=params.spawn_x, spacing=params.spawn_spacing)
+        columns, rows = rows_of(agents, params.track_width)
+        spacing = min(params.spawn_spacing, (params.track_width - LANE) / max(columns - 1, 1))
+        spawn = SpawnArea(before + rows, spawn_x=params.spawn_x + rows, spacing=spacing, columns=columns)
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
-        blocks = (spawn, Plane(middle), gate, Plane(behind), EndWall())
-        ground = grounds.meadow(before + middle + behind + 1.0, params.track_width, before + middle + 0.5)
-        track = Track(blocks=blocks, width=params.track_width, style="fence", ground=ground)
-        flock = {f"sheep{number}": Sheep() for number in range(self.num_sheep)}
-        return Scene(track, num_robots=2, objects=flock)
+        ends, goal = (0.0 - rows, before + middle + behind + 1.0), before + middle + 0.5
+        track = Track(
+            blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()),
+            width=params.track_width,
+            start=ends[0],
+            num_robots=agents,
+            style="fence",
+            ground=grounds.meadow(ends, params.track_width, goal),
+        )
+        flock = {f"sheep{number}": objects.Sheep() for number in range(self.num_sheep)}
+        return Scene(track, num_robots=agents, objects=flock)
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Samples the sheep's initial positions."""
-        params = self.params
-        rows, columns = params.flock
-        x, y = np.meshgrid(np.arange(rows) - (rows - 1) / 2, np.arange(columns) - (columns - 1) / 2, indexing="ij")
-        start = params.flock_center + params.flock_spacing * np.stack([x, y], axis=-1).reshape(-1, 2)
-        noise = jax.random.uniform(key, start.shape, minval=-params.flock_noise, maxval=params.flock_noise)
+        start, spread = self.params.flock_grid()
+        noise = jax.random.uniform(key, start.shape, minval=-spread, maxval=spread)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
 
     def step_npcs(self, data: "mjx.Data", robot_state: RobotState, key: jax.Array) -> "mjx.Data":
@@ -168,11 +223,12 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout((*PAIR, GATE, entities("sheep", "sheep", self.num_sheep, 2, "x, y of each, m")))
+        sheep = entities("sheep", "sheep", self.num_sheep, 2, "x, y of each, m")
+        return ObservationLayout((*team_blocks(self.num_agents), GATE, sheep))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        sheep = for_all(self.sheep(state.data), 2)
-        return {**pair(robot_state.base_info), "gate": for_all(state.anchors, 2), "sheep": sheep}
+        sheep, gate = (for_all(x, self.num_agents) for x in (self.sheep(state.data), state.anchors))
+        return {**observe_team(robot_state.base_info), "gate": gate, "sheep": sheep}
 
     def through(self, state: State) -> jax.Array:
         """Returns which sheep are past the gate (S,) bool."""

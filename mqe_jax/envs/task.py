@@ -83,6 +83,11 @@ class Task(Sensing, Generic[S, P]):
         """Agents of each team; a single team in cooperative tasks."""
         return (tuple(range(self.num_agents)),)
 
+    @property
+    def extra_contacts(self) -> int:
+        """Contacts for which an environment's buffers have room beyond those of its robots."""
+        return 0
+
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the track's blocks."""
         return self.compiled.layout.spawn
@@ -108,6 +113,10 @@ class Task(Sensing, Generic[S, P]):
     def npc_commands(self, state: State[S], robot_state: RobotState) -> jax.Array | None:
         """Returns commands (R - A, C) of `npc_skill` for the NPC robots, or None if there are none."""
         return None
+
+    def acting(self, state: State[S]) -> jax.Array:
+        """Returns which agents act (A,) bool; the actions of the others are zero."""
+        return state.active
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
         """Maps actions (A, action_size) from each agent's own (possibly mirrored) frame to the robots' frame."""
@@ -186,6 +195,11 @@ class Task(Sensing, Generic[S, P]):
     def ending(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns whether the task's own rules end the episode () bool."""
         return jnp.zeros((), bool)
+
+    @property
+    def falls_end(self) -> bool:
+        """Whether a fallen robot ends the episode."""
+        return True
 
     def outcome(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Returns `success` () and further results by name () of an episode that ends here.

@@ -10,6 +10,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError, one_line
 from mqe_jax.physics import robots
+from mqe_jax.physics.appearance import UNNUMBERED
 from mqe_jax.physics.appearance.grounds import add_light
 from mqe_jax.physics.collision import MAX_ROBOTS
 from mqe_jax.physics.objects import Object
@@ -135,6 +136,7 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
             torque_control=number < scene.torque_robots,
             joint_mechanics=scene.joint_mechanics,
             color=scene.colors[number] if scene.colors else number,
+            numbered=scene.num_robots > UNNUMBERED,
         )
         spec.attach(body, prefix=prefix(number), frame=spec.worldbody.add_frame())
     for name, item in scene.objects.items():
@@ -143,7 +145,7 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
     for edit in scene.edits:
         edit(spec)
     if visual:
-        add_light(spec, (scene.track.length / 2, 0, 8))
+        add_light(spec, (scene.track.start + scene.track.length / 2, 0, 8))
     return spec, layout
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mqe_jax.physics.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS
+from mqe_jax.physics.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS, UNNUMBERED
 from mqe_jax.view.markup import bars, legend, observation_table, paragraph, table
 from mqe_jax.view.menu import DEFAULT, Entry, Menu
 from mqe_jax.view.session import DRIVEN, Session
@@ -281,7 +281,9 @@ class Panel:
 
 
 def robot_labels(model: mujoco.MjModel) -> list[str]:
-    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, by the nearest of the agents' colours."""
+    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, without colours where they bear numbers."""
     shown = np.array([robot_color(model, trunk) for trunk in robot_bases(model)])
-    apart = np.linalg.norm(shown[:, None] - np.array(ROBOT_COLORS), axis=-1)
+    if len(shown) > UNNUMBERED:
+        return [f"robot {i + 1}" for i in range(len(shown))]
+    apart = np.linalg.norm(shown[:, None] - np.array(ROBOT_COLORS[: len(ROBOT_COLOR_NAMES)]), axis=-1)
     return [f"robot {i + 1} ({ROBOT_COLOR_NAMES[nearest]})" for i, nearest in enumerate(apart.argmin(axis=1))]

@@ -17,7 +17,8 @@ the same, fixed; scene: fixed, whole scene; side: tracks the first robot from it
 _MARGIN = np.array([0.4, 0.4, 0.25])  # around a robot's trunk, m
 _SMOOTHING = 0.6  # duration over which a following camera is averaged, s
 _SAMPLES = 24  # frames of an episode by which directions are compared
-_DISTANCES = (2.0, 16.0)  # of a following camera, m
+_DISTANCES = (2.0, 16.0)  # of a camera that follows up to `_FEW` robots, m; further away from more
+_FEW = 8
 _ELEVATIONS = (-30.0, -38.0, -48.0, -60.0)
 _DIRECTIONS = [(azimuth, elevation) for azimuth in (90.0, 60.0, 30.0, 0.0, -30.0, 120.0) for elevation in _ELEVATIONS]
 _BEHIND = 2.0  # m of distance that a camera may add to see the robots beside each other
@@ -90,11 +91,12 @@ def _following(
     model: mujoco.MjModel, points: list[np.ndarray], goals: np.ndarray, direction: Camera, aspect: float, width: int
 ) -> list[Camera]:
     """Returns a camera for each frame that contains the targets of all frames at most `width` away, and the goal."""
-    views = []
+    views, (near, far) = [], _DISTANCES
+    far *= max(1.0, float(np.sqrt(len(robot_bases(model)) / _FEW)))
     for index in range(len(points)):
         around = points[max(0, index - width) : index + width + 1]
         corners = np.stack([np.min(around, axis=0), np.max(around, axis=0)]).reshape(-1, 3)
-        views.append(fit(model, np.concatenate([corners, goals]), direction, aspect, _DISTANCES))
+        views.append(fit(model, np.concatenate([corners, goals]), direction, aspect, (near, far)))
     return views
 
 

@@ -74,11 +74,14 @@ _INK, _PAPER = (28, 32, 40), (246, 246, 242)
 
 
 def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
-    """Returns labels and the colours, 0 to 255, of their robots: teams in the order of `env.teams`, then others."""
+    """Returns labels and the different colours, 0 to 255, of their robots: teams as in `env.teams`, then others."""
     bases = robot_bases(env.mj_model)
     colors = [tuple(round(255 * part) for part in robot_color(env.mj_model, body)[:3]) for body in bases]
     names = ("team",) if len(env.teams) == 1 else ("team 0", "team 1")
-    rows = [(name, [colors[agent] for agent in team]) for name, team in zip(names, env.teams, strict=True)]
+    rows = [
+        (name, list(dict.fromkeys(colors[agent] for agent in team)))
+        for name, team in zip(names, env.teams, strict=True)
+    ]
     scripted = colors[sum(map(len, env.teams)) :]
     return [*rows, ("scripted", scripted)] if scripted else rows
 

@@ -9,6 +9,8 @@ from mqe_jax.physics.appearance import DARK_WOOD, GLASS, INK, STEEL, WHITE, WOOD
 from mqe_jax.physics.appearance.shapes import Kind, add_box, add_rod, add_visual
 
 _PROUD = 0.004  # distance by which details stand out from the collision shape, m
+# Inked segments of each digit: three across from the top, the left upper and lower, the right upper and lower.
+_DIGITS = "1011111 0000011 1110110 1110011 0101011 1111001 1111101 1000011 1111111 1111011".split()
 
 
 def crate(body: Any, half: np.ndarray) -> None:
@@ -114,3 +116,21 @@ def sheep(body: Any, radius: float, height: float) -> None:
         for x in (-0.5 * radius, 0.5 * radius):
             y = side * 0.35 * radius
             add_rod(body, face, 0.11 * radius, (x, y, 0.0), (x, y, 0.45 * height))
+
+
+def back_number(trunk: Any, number: int, top: float) -> None:
+    """Adds a robot's number to its trunk, on a white cloth whose height above the trunk's origin is `top`, m.
+
+    It reads from behind the robot.
+    """
+    digits, half, thick = str(number), (0.09, 0.042), 0.014  # of a digit, along x and y; of a segment
+    pitch = 2 * half[1] + 3 * thick
+    add_box(trunk, WHITE, (0.13, 0.02 + pitch * len(digits) / 2, 0.003), (0, 0, top))
+    lower, upper = -half[0] / 2, half[0] / 2
+    for place, digit in enumerate(digits):
+        middle = ((len(digits) - 1) / 2 - place) * pitch
+        across = [(x, 0.0, (thick, half[1] + thick)) for x in (half[0], 0.0, -half[0])]
+        along = [(x, side * half[1], (upper + thick, thick)) for side in (1, -1) for x in (upper, lower)]
+        for inked, (x, y, (length, width)) in zip(_DIGITS[int(digit)], across + along, strict=True):
+            if inked == "1":
+                add_box(trunk, INK, (length, width, 0.003), (x, middle + y, top + 0.002))

@@ -52,11 +52,11 @@ def finish(x: float, y: Point, squares: int = 14, z: float = 0.0) -> tuple[Shape
     return rectangle((x, x + 2 * side), y, WHITE, 3, z), *dark
 
 
-def track(length: float, width: float, lanes: int, shapes: Sequence[Shape] = (), color: Color = CLAY) -> Ground:
-    """Returns a running track with white lines between its lanes."""
+def track(x: Point, width: float, lanes: int, shapes: Sequence[Shape] = (), color: Color = CLAY) -> Ground:
+    """Returns a running track between two x, m, with white lines between its lanes."""
     edges = np.linspace(-width / 2, width / 2, lanes + 1)[1:-1].tolist()
-    lines = [line((0.0, y), (length, y), width=0.04, level=2) for y in edges]
-    return Ground(shapes=(rectangle((0.0, length), (-width / 2, width / 2), color), *lines, *shapes))
+    lines = [line((x[0], y), (x[1], y), width=0.04, level=2) for y in edges]
+    return Ground(shapes=(rectangle(x, (-width / 2, width / 2), color), *lines, *shapes))
 
 
 def hall(x: Point, y: Point, color: Color, shapes: Sequence[Shape] = ()) -> Ground:
@@ -71,32 +71,33 @@ def halves(x: Point, y: Point) -> Ground:
     return Ground(_HALL, (rectangle(x, (y[0], 0.0), blue), rectangle(x, (0.0, y[1]), red), middle))
 
 
-def warehouse(length: float, width: float, goal_x: float) -> Ground:
-    """Returns a concrete floor with yellow lines, and a painted zone beyond the gate at `goal_x`."""
+def warehouse(x: Point, width: float, goal_x: float) -> Ground:
+    """Returns a concrete floor between two x, m, with yellow lines, and a painted zone beyond the gate at `goal_x`."""
     half = width / 2 - 0.25
-    zone = rectangle((goal_x, length), (-width / 2, width / 2), (0.55, 0.72, 0.58, 1.0), 2)
-    start = outline((0.25, goal_x - 0.4), (-half, half), YELLOW, 0.07)
-    return hall((0.0, length), (-width / 2, width / 2), (0.70, 0.69, 0.66, 1.0), (zone, *start))
+    zone = rectangle((goal_x, x[1]), (-width / 2, width / 2), (0.55, 0.72, 0.58, 1.0), 2)
+    start = outline((x[0] + 0.25, goal_x - 0.4), (-half, half), YELLOW, 0.07)
+    return hall(x, (-width / 2, width / 2), (0.70, 0.69, 0.66, 1.0), (zone, *start))
 
 
-def meadow(length: float, width: float, goal_x: float) -> Ground:
-    """Returns grass with tufts and flowers, and a pen beyond the gate at `goal_x`."""
+def meadow(x_range: Point, width: float, goal_x: float) -> Ground:
+    """Returns grass between two x, m, with tufts and flowers, and a pen beyond the gate at `goal_x`."""
+    begin, end = x_range
     random = np.random.default_rng(4)
     pen: Color = (0.72, 0.68, 0.42, 1.0)
     shapes: list[Shape] = [
-        rectangle((0.0, goal_x), (-width / 2, width / 2), GRASS),
-        rectangle((goal_x, length), (-width / 2, width / 2), pen),
+        rectangle((begin, goal_x), (-width / 2, width / 2), GRASS),
+        rectangle((goal_x, end), (-width / 2, width / 2), pen),
     ]
     tones = ((0.44, 0.60, 0.33, 1.0), (0.50, 0.66, 0.38, 1.0))
     patches: list[tuple[float, float, float]] = []
-    for number in range(round(6 * goal_x)):
+    for number in range(round(6 * (goal_x - begin))):
         radius = random.uniform(0.1, 0.35)
-        x, y = random.uniform(0.4, goal_x - 0.5), random.uniform(-0.44, 0.44) * width
+        x, y = random.uniform(begin + 0.4, goal_x - 0.5), random.uniform(-0.44, 0.44) * width
         if all(np.hypot(x - other_x, y - other_y) > radius + other for other_x, other_y, other in patches):
             patches.append((x, y, radius))
             shapes.append(mark((x, y, 0.0), (radius,), tones[number % 2], 2))
-    for number in range(round(3.0 * length)):
-        x, y = random.uniform(0.2, length - 0.2), random.choice([-1, 1]) * random.uniform(0.52, 0.85) * width
+    for number in range(round(3.0 * (end - begin))):
+        x, y = random.uniform(begin + 0.2, end - 0.2), random.choice([-1, 1]) * random.uniform(0.52, 0.85) * width
         flower = number % 3 == 0
         half = (0.045, 0.045, 0.04) if flower else (0.16, 0.12, 0.10)
         color = ((0.98, 0.93, 0.55, 1.0), WHITE)[number % 2] if flower else tones[0]
@@ -147,7 +148,7 @@ def climb(length: float, width: float, top: tuple[float, float, float], size: tu
     base = rectangle((x - size[0] / 2, x + size[0] / 2), (y - half, y + half), WHITE, 1, z)
     line_ = finish(x - size[0] / 2, (y - half, y + half), 10, z)
     points = tuple((x + sign * size[0] / 2, y, z) for sign in (-1, 1))
-    return dataclasses.replace(track(length, width, 4, (base, *line_)), goals=points)
+    return dataclasses.replace(track((0.0, length), width, 4, (base, *line_)), goals=points)
 
 
 def dohyo(top: tuple[float, float, float], size: tuple[float, float, float], radius: float) -> Ground:

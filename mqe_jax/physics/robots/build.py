@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mqe_jax.physics.appearance import HIDDEN_GROUP, ROBOT_COLORS, VISUAL_GROUP
+from mqe_jax.physics.appearance import HIDDEN_GROUP, ROBOT_COLORS, VISUAL_GROUP, bodies
 from mqe_jax.physics.collision import robot_bits
 from mqe_jax.physics.robots.robot import JOINT_NAMES, JOINTS, LEGS, Link, Primitive, Robot
 
@@ -44,6 +44,12 @@ def _add_geom(body: Any, primitive: Primitive, left: int, **properties: Any) -> 
     body.add_geom(type=_GEOM_TYPES[primitive.kind], size=size, mass=0.0, **place, **properties)
 
 
+def _back(robot: Robot) -> float:
+    """Returns the height of the highest visual shape of the trunk above the trunk's origin, m."""
+    shapes = [shape.primitive for shape in robot.visuals if shape.link == "trunk"]
+    return max(max(x.position[2], (x.end or x.position)[2]) + np.atleast_1d(x.size)[-1] for x in shapes)
+
+
 def build_robot(
     robot: Robot,
     number: int,
@@ -54,11 +60,13 @@ def build_robot(
     torque_control: bool = False,
     joint_mechanics: bool = False,
     color: int | None = None,
+    numbered: bool = False,
 ) -> mujoco.MjSpec:
     """Builds one robot with a free base as an `MjSpec`, to be attached to a scene under a prefix.
 
     `number` is its index in the scene, for its collision bits and, without `color`, its colour in `ROBOT_COLORS`. The
-    others are those of `Scene`; with `torque_control` actuators take torques (N m) instead of joint targets (rad).
+    others are those of `Scene`; with `torque_control` actuators take torques (N m) instead of joint targets (rad). If
+    `numbered`, the index + 1 is on its back.
     """
     agent_color = ROBOT_COLORS[(number if color is None else color) % len(ROBOT_COLORS)]
     shapes = robot.shapes(contacts)
@@ -96,6 +104,8 @@ def build_robot(
     trunk.add_freejoint(name="base")
     _add_inertial(trunk, robot.trunk)
     add_shapes(trunk, "trunk", "", 1)
+    if visual and numbered:
+        bodies.back_number(trunk, number + 1, _back(robot))
     for leg in LEGS:
         front = 1 if leg[0] == "F" else -1
         left = 1 if leg[1] == "L" else -1

@@ -5,23 +5,44 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.policies.scripted import Observation, go_to, pose
+from mqe_jax.terrain import ROW, rows_of
+
+# Narrow Gate: the first robot passes the gate while the second waits until the gate is clear. Of more than two robots
+# the others stand until the one before them is through. Each walks across the track behind the gate, then ahead to its
+# place; the places of the first ones are at the far end.
+_WIDTH = 3.0  # m, of the track
+_LANE_X = 4.65  # m, x of the way across, at most
 
 
-# Narrow Gate: the first robot passes the gate while the second waits until the gate is clear.
 def plan_gate(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3)."""
+    """Returns the robots' actions (A, 3)."""
     (position, yaw), gate = pose(obs["base"]), obs["gate"]
+    agents = len(position)
     before = gate - jnp.array([0.65, 0.0])
     behind = gate + jnp.array([0.75, 0.0])
-    side = jnp.array([1.0, -1.0])
-    wait = gate + jnp.stack([jnp.array([-0.65, -1.3]), -0.7 * side], axis=-1)  # each on its spawn side
-    rest = jnp.stack([jnp.full(2, 5.3), 0.75 * side], axis=-1)
-    x = position[:, 0] - gate[:, 0]
-    lined_up = (jnp.abs(position[:, 1] - gate[:, 1]) < 0.1) & (x > -1.0)
+    wait = (gate + jnp.array([[-0.65, -0.7], [-1.3, 0.7]])[:agents]) if agents < 3 else position
+    rest = jnp.asarray(_rest(agents))
+    x, y = (position - gate).T
+    free = x[:-1] > 0.9
+    if agents > 2:
+        across = jnp.minimum(behind[:, 0], _LANE_X)
+        rest = jnp.where(jnp.abs(position[:, 1:] - rest[:, 1:]) < 0.1, rest, rest.at[:, 0].set(across))
+        free |= (x[:-1] > 0.4) & (jnp.abs(y[:-1]) > 0.6)
+    lined_up = (jnp.abs(y) < 0.1) & (x > -1.0)
     goal = jnp.where((lined_up | (x > -0.3))[:, None], behind, before)
     goal = jnp.where((x > 0.6)[:, None], rest, goal)
-    free = jnp.array([True, False]) | (x[::-1] > 0.9)
+    free = jnp.concatenate([jnp.array([True]), free])
     return go_to(position, yaw, jnp.where(free[:, None] | (x > 0.0)[:, None], goal, wait))
+
+
+def _rest(agents: int) -> np.ndarray:
+    """Returns where robots rest beyond the gate (A, 2), m, mirrored from where they start."""
+    columns, behind = rows_of(agents, _WIDTH)
+    place = np.arange(agents)
+    row, count = place // columns, np.minimum(columns, agents - place // columns * columns)
+    across = (place % columns - (count - 1) / 2) * _WIDTH / columns
+    last = 5.3 if agents < 3 else 5.5
+    return np.stack([last + behind - ROW * row, -across], axis=-1).astype(np.float32)
 
 
 # Climb on Seesaw: one robot walks up to the platform, the other stands on the plank's near end.
@@ -48,70 +69,102 @@ def plan_seesaw(obs: Observation) -> jax.Array:
 
 
 # Sheep Dog: drive one sheep from behind, or gather a flock towards the gate.
-_SIDE = np.array([-1.0, 1.0], np.float32)  # side of the sheep's path on which each robot walks
+_BESIDE = 0.7  # m, between robots that walk behind one sheep
+_FREE = 1.2  # m, between robots below which those of a larger team keep apart
+
+
+def _sides(agents: int) -> np.ndarray:
+    """Returns on which side of the sheep's path each robot walks (A, 1), from -1, the right, to 1."""
+    place = np.arange(agents) - (agents - 1) / 2
+    return (2 * place / max(agents - 1, 1)).astype(np.float32)[:, None]
+
+
+def _apart(position: jax.Array, goal: jax.Array) -> jax.Array:
+    """Returns the goals (A, 2), m, in teams of more than two moved away from robots that are close."""
+    if len(position) < 3:
+        return goal
+    between = position[:, None] - position[None]
+    close = jnp.linalg.norm(between, axis=-1) + _FREE * jnp.eye(len(position))
+    return goal + jnp.sum(jnp.maximum(_FREE / close - 1.0, 0.0)[..., None] * between, axis=1)
 
 
 def plan_sheep_easy(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3).
+    """Returns the robots' actions (A, 3).
 
-    They walk behind the sheep, on either side of the line from the gate through it, and stop when it is through.
+    They walk behind the sheep, side by side across the line from the gate through it, and stop when it is through. Of
+    several sheep they drive the mean of those that are not.
     """
-    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0]
+    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
+    left = sheep[:, 0] <= gate[0] + 0.4
+    sheep = left @ sheep / jnp.maximum(jnp.sum(left), 1)
     way = gate + jnp.array([0.6, 0.0]) - sheep
     way = way / jnp.maximum(jnp.linalg.norm(way), 1e-3)
     across = jnp.array([-way[1], way[0]])
-    goal = sheep - 0.8 * way + (0.35 * _SIDE)[:, None] * across
-    return jnp.where(sheep[0] > gate[0] + 0.4, 0.0, go_to(position, yaw, goal))
+    goal = sheep - 0.8 * way + _BESIDE * (len(position) - 1) / 2 * _sides(len(position)) * across
+    return jnp.where(~jnp.any(left), 0.0, go_to(position, yaw, _apart(position, goal)))
 
 
 def plan_sheep_hard(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3).
+    """Returns the robots' actions (A, 3).
 
     Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, on
     the robot's side and close to it. Stragglers are thus driven back to the flock, whose cohesion keeps it together.
+    Of more than two robots those in the middle prefer no side, and robots keep apart.
     """
+    side = _sides(len(obs["base"]))
     (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
     through = sheep[:, 0] > gate[0]
     way = sheep - gate - jnp.array([0.8, 0.0])
     apart = position[:, None] - sheep[None]
     near = jnp.linalg.norm(apart, axis=-1)
-    own_side = _SIDE[:, None] * (sheep[:, 1] - gate[1])
+    own_side = side * (sheep[:, 1] - gate[1])
     score = 5.0 * jnp.linalg.norm(way, axis=-1) + 3.5 * own_side - 1.5 * near
     weight = jax.nn.softmax(jnp.where(through, -1e3, score), axis=-1)
     back = weight @ way
     back /= jnp.maximum(jnp.linalg.norm(back, axis=-1, keepdims=True), 1e-3)
-    goal = weight @ sheep + 0.8 * back + _SIDE[:, None] * jnp.array([0.0, 0.2])
+    goal = weight @ sheep + 0.8 * back + side * jnp.array([0.0, 0.2])
     goal = jnp.clip(goal, jnp.array([0.0, -2.6]), jnp.stack([gate[0] - 0.45, 2.6]))
     # Repulsion from close sheep.
     goal += jnp.sum(0.8 * jnp.maximum(0.75 / near - 1.0, 0.0)[..., None] * apart, axis=1)
-    return jnp.where(jnp.all(through), 0.0, go_to(position, yaw, goal))
+    return jnp.where(jnp.all(through), 0.0, go_to(position, yaw, _apart(position, goal)))
 
 
 # Push Box: both robots push the box side by side and correct its heading.
 _PUSH_FROM = 0.95  # m, from the box's centre to a robot before it pushes
-_APART = 0.3  # m, lateral distance of each robot from the line of motion through the box
+_APART = 0.6  # m, between two robots that push side by side, at most
+_ABREAST = 3  # robots that push side by side, at most; further rows push the robots before them
+_FACE = 0.8  # m, of the box's face on which they push
+_LENGTH = 0.8  # m, between the rows
 _LOOKAHEAD = 0.4  # m, of travel along the box's heading over which its lateral error is predicted; damps the steering
 
 
 def plan_pushbox(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3)."""
+    """Returns the robots' actions (A, 3)."""
     (position, yaw), gate, box = pose(obs["base"]), obs["gate"][0], obs["box"][0]
+    row, column, columns = _places(len(position))
+    lateral = column * min(_APART, _FACE / max(columns - 1, 1))
     w, x, y, z = obs["box_quaternion"][0]
     turned = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     turned = (turned + jnp.pi / 4) % (jnp.pi / 2) - jnp.pi / 4  # the box is symmetric under quarter turns
-    side = jnp.array([-1.0, 1.0])
     # Predicted lateral offset of the gate's centre from the box.
     offset = jnp.clip(gate[1] - box[1] - _LOOKAHEAD * jnp.sin(turned), -0.5, 0.5)
     along = jnp.array([jnp.cos(turned), jnp.sin(turned)])
     across = jnp.array([-jnp.sin(turned), jnp.cos(turned)])
-    place = box - _PUSH_FROM * along + (side * _APART)[:, None] * across
+    place = box - (_PUSH_FROM + _LENGTH * row)[:, None] * along + lateral[:, None] * across
     apart = position - box
     behind = apart @ along < -0.55
-    lined_up = behind & (jnp.abs(apart @ across - side * _APART) < 0.15)
-    both = jnp.all(lined_up)
+    lined_up = behind & (jnp.abs(apart @ across - lateral) < 0.15)
+    ready = jnp.all(lined_up)
     # The robot on the side to which the box should turn pushes less.
     heading = jnp.clip(1.2 * offset, -0.35, 0.35)
-    lead = jnp.clip(4.0 * (heading - turned), -0.7, 0.7) * -side
+    lead = jnp.clip(4.0 * (heading - turned), -0.7, 0.7) * -2.0 * column / max(columns - 1, 1)
     walk = go_to(position, yaw, place, turned)
     push = walk.at[:, 0].set(jnp.clip(0.4 + 0.5 * lead, 0.1, 0.5))
-    return jnp.where(both, push, walk)
+    return jnp.where(ready, push, walk)
+
+
+def _places(agents: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Returns each robot's row behind the box and its column from the middle one (A,), and the number of columns."""
+    columns, place = min(agents, _ABREAST), np.arange(agents)
+    count = np.minimum(columns, agents - place // columns * columns)
+    return place // columns, (place % columns - (count - 1) / 2).astype(np.float32), columns
