@@ -204,7 +204,7 @@ def test_wrestling_has_terms_for_pushing_and_approach_that_only_training_weighs(
     np.testing.assert_allclose(reward, [0, 0])
     # The first robot came 0.4 m nearer to the centre and pushed the other 0.4 m away from it.
     np.testing.assert_allclose(terms["push"], [0.4, -0.4], rtol=1e-4)
-    assert float(terms["approach"]) == pytest.approx(1.1 - 0.9, rel=1e-4)
+    np.testing.assert_allclose(terms["approach"], [1.1 - 0.9] * 2, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

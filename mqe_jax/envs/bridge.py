@@ -112,10 +112,10 @@ class Go1Bridge(Duel[None, BridgeParams]):
         return Entity("platform", "platform0"), Entity("platform", "platform1")
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        out = self.eliminated(after.robots)
+        out = self.eliminated(after.state, after.robots)
         return {"win": self.zero_sum(out[::-1] & ~out), "far_side": self.zero_sum(self.across(after.robots))}
 
-    def eliminated(self, robot_state: RobotState) -> jax.Array:
+    def eliminated(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns which robots are off the bridge or have fallen (2,) bool."""
         return self.fallen(robot_state) | robot_state.count(robot_state.position_w[:, 2] < self.params.off_height)
 
@@ -134,4 +134,4 @@ class Go1Bridge(Duel[None, BridgeParams]):
 
     def ending(self, state: State, robot_state: RobotState) -> jax.Array:
         """The episode ends when a robot is off the bridge or has fallen."""
-        return jnp.any(self.eliminated(robot_state))
+        return jnp.any(self.eliminated(state, robot_state))

@@ -1,4 +1,4 @@
-"""go1football-1vs1 and go1football-2vs2, and the field, ball and kick-off poses shared by all football tasks.
+"""go1football-1vs1 and go1football-2vs2, one match of any size, and what all football tasks share: field and ball.
 
 The field extends from x 2 to 12; the goals are gaps in the thick walls behind both goal lines.
 """
@@ -6,6 +6,7 @@ The field extends from x 2 to 12; the goals are gaps in the thick walls behind b
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
@@ -13,18 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.limits import Distance, Few, Fraction, Length, TimeLimit
+from mqe_jax.core.limits import Distance, Fraction, Length, Robots, TimeLimit
 from mqe_jax.core.settings import record
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
-from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.observation import Block, ObservationLayout
+from mqe_jax.envs.params import TaskParams, check_gap, check_teams
 from mqe_jax.envs.state import Moment, S, State
-from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.appearance import grounds, team_colors
 from mqe_jax.physics.objects import Ball
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
-from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
+from mqe_jax.terrain import LANE, EndWall, Gate, Plane, SpawnArea, Track
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -80,9 +81,17 @@ class Play:
 class Football(QuadrupedEnv[S, F]):
     """Base of the football tasks: the field, the ball and the kick-off."""
 
-    kick_off: ClassVar[tuple[tuple[float, float, float], ...]] = ()  # spawn pose x, y, yaw of each robot, m and rad
     ball_spot: ClassVar[tuple[float, float]] = (7.0, 0.0)  # x, y of the ball at reset, m
-    colors: ClassVar[tuple[int, ...]] = ()  # colours of the robots, as in `Scene`
+
+    @property
+    def kick_off(self) -> tuple[tuple[float, float, float], ...]:
+        """Spawn pose x, y, yaw of each robot, m and rad."""
+        raise NotImplementedError(f"{type(self).__name__}: kick_off is not defined")
+
+    @property
+    def colors(self) -> tuple[int, ...]:
+        """Colours of the robots, as in `Scene`."""
+        return ()
 
     def scene(self) -> Scene:
         params = self.params
@@ -202,33 +211,67 @@ class FootballMatchState:
     play: Play  # touches of the ball
 
 
+_LINES, _IN_LINE = 4, 4  # lines of a team at the kick-off, at most; robots in a line while there are fewer lines
+
+
 @record
-class Football1vs1Params(FootballParams):
-    """Parameters of Football (1 vs 1)."""
+class FootballMatchParams(FootballParams):
+    """Parameters of the football matches, with the defaults of Football (1 vs 1)."""
 
     rewards: FootballMatchRewards = FootballMatchRewards()
     """Weights of the reward terms."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        most = _LINES * max(int(self.field_width / LANE) - 1, 1)
+        check_teams(self.num_agents, most, f"field_width {self.field_width:g}")
+
 
 @record
-class Football2vs2Params(Football1vs1Params):
-    """Parameters of Football (2 vs 2)."""
+class Football2vs2Params(FootballMatchParams):
+    """Parameters of the football matches, with the defaults of Football (2 vs 2)."""
 
-    num_agents: Few = 4
+    num_agents: Robots = 4
 
 
-class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F]):
-    """Base of the football matches.
+class Go1Football1vs1(
+    Football[FootballMatchState, FootballMatchParams], Match[FootballMatchState, FootballMatchParams]
+):
+    """Football, by default 1 vs 1.
 
     - Scene: the field with the ball in its centre. Team 0 attacks the goal at x 12, team 1 that at x 2.
-    - Observation, in the team's own frame: one-hot within the team, own base info 6, teammate's, opponents',
+    - Observation, in the team's own frame: one-hot within the team, own base info 6, teammates', opponents',
       ball position 3, ball velocity 3.
     - Reward: see `FootballMatchRewards`; zero-sum, shared by the team.
     - End: a goal, a fall, or 20 s. Win: a goal, or the opponents' fall.
-    - In 2 vs 2, evaluations count a team's passes, and its goals after touches by both robots.
+    - In teams with mates, evaluations count a team's passes, and its goals after touches by all its robots.
+    - Sizes: any even `num_agents`; at the kick-off larger teams stand in lines, the first robots in front.
 
     Source: paper, section III; the released system leaves rewards and observations undefined.
     """
+
+    name = "go1football-1vs1"
+    title = "Football (1 vs 1)"
+    aim = "Score in the opponent's goal."
+    Params = FootballMatchParams
+    variable_num_agents = True
+
+    @property
+    def kick_off(self) -> tuple[tuple[float, float, float], ...]:
+        """Team 0's lines, and the same after a half turn about the centre."""
+        team, (x, y) = self.num_agents // 2, self.center
+        lines = min(math.ceil(team / _IN_LINE), _LINES)
+        columns = math.ceil(team / lines)
+        apart = min(4.0, (self.params.field_width - 2 * LANE) / max(columns - 1, 1))
+        own = []
+        for line, first in enumerate(range(0, team, columns)):
+            count = min(columns, team - first)
+            own += [(4.0 + (lines - 1) / 2 - line, (i - (count - 1) / 2) * apart, 0.0) for i in range(count)]
+        return (*own, *((2 * x - a, 2 * y - b, np.pi) for a, b, _ in own))
+
+    @property
+    def colors(self) -> tuple[int, ...]:
+        return team_colors(self.num_agents // 2)
 
     @property
     def center(self) -> tuple[float, float]:
@@ -255,33 +298,13 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        team = self.num_agents // 2
-        teammate = (entities("teammate", "robot", team - 1, 6, BASE_INFO),) if team > 1 else ()
-        return ObservationLayout(
-            (
-                one_hot(team, "agent's id within its team"),
-                Block("base", 6, BASE_INFO),
-                *teammate,
-                entities("opponents", "robot", team, 6, BASE_INFO),
-                *BALL_BLOCKS,
-            )
-        )
+        return ObservationLayout((*self.teams_blocks(), *BALL_BLOCKS))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (A, width), each in its agent's own frame."""
-        team, side = self.num_agents // 2, self.team_of
-        both = self.views(robot_state.base_info).reshape(2, 2, team, 6)  # (observing team, observed team, robot, info)
-        own, opponents = both[[0, 1], [0, 1]], both[[0, 1], [1, 0]].reshape(2, -1)
-        blocks = {
-            "one_hot": jnp.tile(jnp.eye(team), (2, 1)),
-            "base": own.reshape(-1, 6),
-            "opponents": opponents[side],
-            "ball": self.view_points(self.ball(state.data))[side],
-            "ball_velocity": self.view_vectors(self.ball_velocity(state.data))[side],
-        }
-        if team > 1:
-            blocks["teammate"] = jax.vmap(others)(own).reshape(self.num_agents, -1)
-        return blocks
+        ball, velocity = self.view_points(self.ball(state.data)), self.view_vectors(self.ball_velocity(state.data))
+        blocks = {"ball": ball[self.team_of], "ball_velocity": velocity[self.team_of]}
+        return {**self.observe_teams(robot_state), **blocks}
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         (goal_before, robot_before), (goal, robot) = self.distances(before), self.distances(after)
@@ -289,7 +312,7 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
             "goal": self.zero_sum(self.in_goal(after.state.data)),
             "progress": self.zero_sum(goal_before - goal),
             "approach": self.zero_sum(robot_before - robot),
-            "fall": self.zero_sum(self.eliminated(after.robots)),
+            "fall": self.zero_sum(self.eliminated(after.state, after.robots)),
             "advance": (before.state.task.nearest - after.state.task.nearest)[self.team_of],
             "chase": (robot_before - robot)[self.team_of],
         }
@@ -309,24 +332,10 @@ class FootballMatch(Football[FootballMatchState, F], Match[FootballMatchState, F
         return {"passes": play.passes, "both_touched": together} if self.num_agents > 2 else {}
 
 
-class Go1Football1vs1(FootballMatch[Football1vs1Params]):
-    """Football (1 vs 1), see `FootballMatch`."""
-
-    name = "go1football-1vs1"
-    title = "Football (1 vs 1)"
-    aim = "Score in the opponent's goal."
-    Params = Football1vs1Params
-    kick_off = ((4.0, 0.0, 0.0), (10.0, 0.0, np.pi))
-    colors = (0, 2)
-
-
-class Go1Football2vs2(FootballMatch[Football2vs2Params]):
-    """Football (2 vs 2), see `FootballMatch`."""
+class Go1Football2vs2(Go1Football1vs1):
+    """Football, by default 2 vs 2; see `Go1Football1vs1`."""
 
     name = "go1football-2vs2"
     title = "Football (2 vs 2)"
     aim = "Score in the opponents' goal."
     Params = Football2vs2Params
-    # The second team's poses are the first's after a half turn about the centre.
-    kick_off = ((4.0, -2.0, 0.0), (4.0, 2.0, 0.0), (10.0, 2.0, np.pi), (10.0, -2.0, np.pi))
-    colors = (0, 1, 2, 3)

@@ -13,7 +13,7 @@ import numpy as np
 from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Outcome
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
 from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
 from mqe_jax.physics.robots.index import RobotState
@@ -58,7 +58,7 @@ class Match(QuadrupedEnv[S, P]):
                 given = self.params.command_ranges[name]
                 fail(f"command_ranges.{name}", given, f"symmetric in {self.name}, which mirrors team 1")
 
-    def eliminated(self, robot_state: RobotState) -> jax.Array:
+    def eliminated(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns which team is eliminated (2,) bool: by default one with a fallen active robot."""
         return jnp.any(self.fallen(robot_state).reshape(2, -1), axis=1)
 
@@ -68,12 +68,28 @@ class Match(QuadrupedEnv[S, P]):
 
     def wins(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns which team wins if the episode ends in this step (2,) bool, at most one."""
-        out, leading = self.eliminated(robot_state), self.leading(state, robot_state)
+        out, leading = self.eliminated(state, robot_state), self.leading(state, robot_state)
         return jnp.where(jnp.any(out), out[::-1] & ~out, leading & ~leading[::-1])
 
     def further(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns further results of both teams by name (2,), if the episode ends in this step."""
         return {}
+
+    def teams_blocks(self, masked: bool = False) -> tuple[Block, ...]:
+        """Returns the first blocks of teams of robots; `observe_teams` fills them, if they are not `masked`."""
+        team = self.num_agents // 2
+        mates = (entities("teammate", "robot", team - 1, 6, BASE_INFO, masked=masked),) if team > 1 else ()
+        opponents = entities("opponents", "robot", team, 6, BASE_INFO, masked=masked)
+        return one_hot(team, "agent's id within its team"), Block("base", 6, BASE_INFO), *mates, opponents
+
+    def observe_teams(self, robot_state: RobotState) -> dict[str, jax.Array]:
+        """Returns the blocks of `teams_blocks` (A, width), each in its agent's own frame."""
+        team = self.num_agents // 2
+        both = self.views(robot_state.base_info).reshape(2, 2, team, 6)  # (observing team, observed team, robot, info)
+        own, opponents = both[[0, 1], [0, 1]], both[[0, 1], [1, 0]].reshape(2, -1)
+        mates = {"teammate": jax.vmap(others)(own).reshape(self.num_agents, -1)} if team > 1 else {}
+        one_hot = jnp.tile(jnp.eye(team), (2, 1))
+        return {"one_hot": one_hot, "base": own.reshape(-1, 6), **mates, "opponents": opponents[self.team_of]}
 
     def views(self, info: jax.Array) -> jax.Array:
         """Transforms base information (R, 6), position and roll, pitch, yaw, to both teams' frames: (2, R, 6)."""

@@ -1,4 +1,4 @@
-"""go1wrestling, the paper's Sumo Wrestling: two robots try to push each other out of a ring or tip each other over."""
+"""go1wrestling, the paper's Sumo Wrestling: teams, by default of one, push each other out of a ring, or over."""
 
 from collections.abc import Sequence
 
@@ -9,14 +9,19 @@ import numpy as np
 from mqe_jax.core.limits import Distance, Length, Positive, TimeLimit
 from mqe_jax.core.settings import fail, record
 from mqe_jax.envs.match import Duel
-from mqe_jax.envs.params import TaskParams, check_above
+from mqe_jax.envs.observation import ObservationLayout, by_entity, others
+from mqe_jax.envs.params import TaskParams, check_above, check_teams
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.physics.appearance import grounds
+from mqe_jax.physics.appearance import grounds, team_colors
 from mqe_jax.physics.objects import Platform, Ring
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
 from mqe_jax.sensors.scene import Entity
 from mqe_jax.terrain import Plane, SpawnArea, Track
+
+_APART = 0.7  # m, between mates at the start, at least
+_ARC = np.radians(140.0)  # on which a team stands at the start, at most
+_MARGIN = 0.4  # m, from the ring's edge to the robots at the start, at least
 
 
 @record
@@ -24,11 +29,11 @@ class WrestlingRewards:
     """Weights of the reward terms; `win` is zero-sum, the others are for training alone."""
 
     win: float = 10.0
-    """When the opponent falls or leaves the ring, which ends the episode; minus the same of the opponent."""
+    """When all opponents have fallen or left the ring, which ends the episode; minus the same of the opponents."""
     push: float = 0.0
-    """Per m of increase of the opponent's distance from the ring's centre."""
+    """Per m of increase of the opponents' summed distances from the ring's centre; only of those still in."""
     approach: float = 0.0
-    """Per m of decrease of the distance between the robots."""
+    """Per m of decrease of the distance between a robot and the nearest opponent that is still in."""
 
 
 @record
@@ -46,7 +51,8 @@ class WrestlingParams(TaskParams):
     ring_depth: Distance = 0.2
     """Distance of a trunk below the platform's top at which the robot counts as out, m."""
     spawn_y: Distance = 1.0
-    """Distance of the robots from the ring's centre, m; the first robot is on the side of negative y."""
+    """Distance of the robots from the ring's centre, m; the first team is on the side of negative y. A team that has no
+    room on this arc stands further out."""
     head_start: Distance = 0.0
     """Curriculum: both robots start up to head_start x `State.assistance` further along y, m, to a side drawn at
     random, so that one is near the edge of the ring. Inactive at assistance 0."""
@@ -56,18 +62,31 @@ class WrestlingParams(TaskParams):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_above(self.spawn_height, self.platform.center[2], self.robot)
-        room = self.ring_radius - self.spawn_y - self.spawn_noise
+        ring = min(self.ring_radius, min(self.platform.size[:2]) / 2) - _MARGIN
+        most = 1 + int(_ARC / (2 * np.arcsin(_APART / 2 / max(ring, _APART / 2))))
+        room = f"ring_radius {self.ring_radius:g} and platform.size {self.platform.size}"
+        check_teams(self.num_agents, most, room)
+        room = self.ring_radius - self.arc[0] - self.spawn_noise
         if self.head_start > max(room, 0.0):
             fail("head_start", self.head_start, f"at most {room:.2f}, the distance of the robots from the ring's edge")
 
+    @property
+    def arc(self) -> tuple[float, float]:
+        """Radius, m, and angle between neighbours, rad, of the arc on which each team stands at the start."""
+        gaps = self.num_agents // 2 - 1
+        radius = max(self.spawn_y, _APART / 2 / np.sin(_ARC / gaps / 2)) if gaps else self.spawn_y
+        return radius, 2 * np.arcsin(_APART / 2 / max(radius, _APART / 2))
 
-class Go1Wrestling(Duel[None, WrestlingParams]):
-    """Sumo Wrestling.
+
+class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
+    """Sumo Wrestling; its own state says which robots have been out (A,) bool.
 
     - Scene: a platform with a ring of 3.4 m diameter marked on it; the robots face each other, 2 m apart.
-    - Observation: own base info 6, the opponent's base info 6, in the agent's own frame.
+    - Observation, in the agent's own frame: own base info 6, the opponent's base info 6. In larger teams: one-hot
+      within the team, own base info 6, those of the teammates and of the opponents, each with 1 while it is in, else 0.
     - Reward: see `WrestlingRewards`.
-    - End: a robot has fallen or left the ring, or 15 s. Win: only the opponent has.
+    - End: all robots of a team have fallen or left the ring, or 15 s. Win: only the opponents have.
+    - Sizes: any even `num_agents` for which the ring has room. A robot that is out stands still and remains out.
 
     Source: paper, section III.
     """
@@ -76,6 +95,7 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
     title = "Sumo Wrestling"
     aim = "Push the opponent out of the ring, or over."
     Params = WrestlingParams
+    variable_num_agents = True
 
     @property
     def center(self) -> tuple[float, float]:
@@ -88,17 +108,20 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
         ground = grounds.dohyo(params.platform.center, params.platform.size, params.ring_radius)
         blocks = (SpawnArea(2.0, back_wall=False), Plane(4.2))
         track = Track(blocks=blocks, width=6.0, walled=False, ground=ground)
-        return Scene(track, num_robots=2, objects={"platform": params.platform, "ring": ring}, colors=(0, 2))
+        objects, colors = {"platform": params.platform, "ring": ring}, team_colors(self.num_agents // 2)
+        return Scene(track, num_robots=self.num_agents, objects=objects, colors=colors)
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
-        """Facing each other across the ring."""
-        (x, y), apart = self.center, self.params.spawn_y
-        return (x, y - apart, 0.5 * np.pi), (x, y + apart, -0.5 * np.pi)
+        """Two arcs, whose robots face the ring's centre."""
+        (x, y), (radius, apart), team = self.center, self.params.arc, self.num_agents // 2
+        turns = [(place - (team - 1) / 2) * apart for place in range(team)]
+        places = [(radius * np.sin(turn), radius * np.cos(turn), 0.5 * np.pi + turn) for turn in turns]
+        return *((x + a, y - b, yaw) for a, b, yaw in places), *((x - a, y + b, yaw - np.pi) for a, b, yaw in places)
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Moves both robots by the head start."""
+        """Moves all robots by the head start."""
         if not self.params.head_start:
             return qpos, qvel
         side = self.params.head_start * assistance * jax.random.uniform(key, minval=-1.0)
@@ -109,23 +132,73 @@ class Go1Wrestling(Duel[None, WrestlingParams]):
         """The ring, in whose centre the platform is too."""
         return (Entity("ring", "ring"),)
 
-    def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        outward = self.distance(after.robots) - self.distance(before.robots)
-        apart = [jnp.linalg.norm(now.robots.position_w[0] - now.robots.position_w[1]) for now in (before, after)]
+    @property
+    def falls_end(self) -> bool:
+        """Only in a duel."""
+        return self.num_agents == 2
+
+    def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> jax.Array:
+        return jnp.zeros(self.num_agents, bool)
+
+    def step_task(self, before: Moment[jax.Array], after: Moment[jax.Array]) -> jax.Array:
+        return before.state.task | self.beaten(after.robots)
+
+    def acting(self, state: State[jax.Array]) -> jax.Array:
+        return state.active & ~state.task
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        duel = super().observation_layout
+        return duel if self.num_agents == 2 else ObservationLayout(self.teams_blocks(masked=True))
+
+    def observe(self, state: State[jax.Array], robot_state: RobotState) -> dict[str, jax.Array]:
+        """Blocks (A, width), each in its agent's own frame."""
+        if self.num_agents == 2:
+            return super().observe(state, robot_state)
+        blocks, agents = self.observe_teams(robot_state), self.num_agents
+        teams = self.acting(state).reshape(2, -1)
+        there = {
+            "teammate": jax.vmap(others)(teams[..., None]).reshape(agents, -1),
+            "opponents": teams[::-1][self.team_of],
+        }
+        masked = {name: by_entity(blocks[name].reshape(agents, -1, 6), there[name]) for name in there}
+        return {**blocks, **masked}
+
+    def rewards(
+        self, before: Moment[jax.Array], after: Moment[jax.Array], collision: jax.Array
+    ) -> dict[str, jax.Array]:
+        still_in = self.acting(before.state)  # all that were in at the beginning of the step
+        outward = jnp.where(still_in, self.distance(after.robots) - self.distance(before.robots), 0.0)
+        pushed = jnp.sum(outward.reshape(2, -1), axis=1)[::-1]
+        gaps = [self.gap(now.robots, still_in) for now in (before, after)]
         wins = self.zero_sum(self.wins(after.state, after.robots))
-        return {"win": wins, "push": outward[::-1], "approach": apart[0] - apart[1]}
+        return {"win": wins, "push": pushed[self.team_of], "approach": gaps[0] - gaps[1]}
+
+    def gap(self, robot_state: RobotState, still_in: jax.Array) -> jax.Array:
+        """Returns each robot's distance to the nearest opponent that is still in (A,), m; 0 if one of them is not."""
+        position, team = robot_state.position_w, self.team_of
+        apart = jnp.linalg.norm(position[:, None] - position, axis=-1)
+        meets = (team[:, None] != team) & still_in & still_in[:, None]
+        nearest = jnp.min(jnp.where(meets, apart, jnp.inf), axis=1)
+        return jnp.where(jnp.any(meets, axis=1), nearest, 0.0)
 
     def distance(self, robot_state: RobotState) -> jax.Array:
-        """Returns each robot's horizontal distance from the ring's centre (2,), m."""
+        """Returns each robot's horizontal distance from the ring's centre (A,), m."""
         return jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array(self.center), axis=-1)
 
-    def eliminated(self, robot_state: RobotState) -> jax.Array:
-        """Returns which robots have fallen or left the ring (2,) bool."""
+    def beaten(self, robot_state: RobotState) -> jax.Array:
+        """Returns which robots have fallen or are outside the ring (A,) bool."""
         params = self.params
         below = robot_state.position_w[:, 2] < params.platform.center[2] - params.ring_depth
         out = (self.distance(robot_state) > params.ring_radius) | below
         return self.fallen(robot_state) | robot_state.count(out)
 
-    def ending(self, state: State, robot_state: RobotState) -> jax.Array:
-        """The episode ends when a robot has fallen or left the ring."""
-        return jnp.any(self.eliminated(robot_state))
+    def eliminated(self, state: State[jax.Array], robot_state: RobotState) -> jax.Array:
+        """Returns which teams have no robot left (2,) bool."""
+        active, out = robot_state.active, state.task | self.beaten(robot_state)
+        active, gone = (x.reshape(2, -1) for x in (active, out | ~active))
+        return jnp.any(active, axis=1) & jnp.all(gone, axis=1)
+
+    def ending(self, state: State[jax.Array], robot_state: RobotState) -> jax.Array:
+        """The episode ends when a team has no robot left."""
+        return jnp.any(self.eliminated(state, robot_state))

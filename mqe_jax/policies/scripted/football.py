@@ -15,6 +15,8 @@ _INNER_AIMS = np.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]], np.float32)  
 _TURN_IN = 9.4  # m, x of the ball from which it is pushed towards the goal
 _BOTH = 11.2  # m, x of the ball from which both robots attack: a first attack that failed leaves it at the goal line
 _LEAD = 0.3  # s, over which the ball's motion is predicted
+_OWN_GOAL = np.array([2.5, 0.0], np.float32)  # m
+_WING = 1.8  # m, y of covering robots from the line between ball and own goal
 _KEEP_BACK = 2.0  # m, distance behind the ball of the supporting robot, which stays on the centre line
 
 
@@ -42,24 +44,37 @@ def plan_defender(obs: Observation) -> jax.Array:
 
 
 def plan_match(obs: Observation) -> jax.Array:
-    """Returns the actions (T, 3) of a team of one or two robots in their team's frame."""
-    opponents = obs["opponents"].reshape(len(obs["base"]), -1, 6)[..., :2]
-    teammate = obs.get("teammate", jnp.full_like(obs["base"], 1e3))  # far away where there is none
-    return jax.vmap(_play)(obs["base"], teammate, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
+    """Returns the actions (T, 3) of a team in its own frame."""
+    mates = obs.get("teammate", jnp.full_like(obs["base"], 1e3))  # far away where there is none
+    mates, opponents = (x.reshape(len(x), -1, 6)[..., :2] for x in (mates, obs["opponents"]))
+    return jax.vmap(_play)(obs["base"], mates, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 
 
-def _play(own: jax.Array, teammate: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Returns one robot's action (3,): the nearer of two attacks the ball, the other supports from behind it.
+def _play(own: jax.Array, mates: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Returns one robot's action (3,) by its place in the order of distances to the ball.
 
-    `own` and `teammate` are base information (6,), the others as for `_attack`.
+    The nearest robot attacks the ball, the second one supports from behind it, and the others stand between ball and
+    own goal, alternately on either side. `own` is base information (6,), `mates` are positions (K, 2), m; the others
+    are those of `_attack`.
     """
     attack, way = _attack(own, opponents, ball, velocity, _GOAL_AIMS)
     ball = ball + _LEAD * velocity
     left = way[::-1] * jnp.array([-1.0, 1.0])
     offset = own[:2] - ball
     support = ball - 1.5 * way + 0.8 * jnp.sign(offset @ left) * left
-    nearer = jnp.linalg.norm(offset) < jnp.linalg.norm(teammate[:2] - ball)
-    return _walk(own, jnp.where(nearer, attack, support), way)
+    others = jnp.linalg.norm(mates - ball, axis=-1)
+    place = jnp.sum(jnp.linalg.norm(offset) >= others)
+    goal = jnp.where(place == 0, attack, support)
+    if len(mates) > 1:
+        goal = jnp.where(place > 1, _cover(place, len(mates) - 1, ball), goal)
+    return _walk(own, goal, way)
+
+
+def _cover(place: jax.Array, count: int, ball: jax.Array) -> jax.Array:
+    """Returns where one of `count` robots stands that neither attack nor support (2,), m; `place` () from 2."""
+    share = (place - 1) / (count + 1)  # of the way to the own goal
+    side = jnp.where(place % 2 == 0, 1.0, -1.0)
+    return (1.0 - share) * ball + share * _OWN_GOAL + side * jnp.array([0.0, _WING])
 
 
 def _attack(

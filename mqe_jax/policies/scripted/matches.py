@@ -47,8 +47,8 @@ _EDGE = (1.5, 1.64)  # m, range of the distance from the centre at which the rob
 
 
 def plan_wrestling(obs: Observation) -> jax.Array:
-    """Returns the robot's action (1, 3) in its own frame."""
-    (position, yaw), opponent = pose(obs["base"]), obs["opponent"][:, :2]
+    """Returns a team's actions (T, 3) in its own frame; each robot of a larger team meets the nearest opponent."""
+    (position, yaw), opponent = pose(obs["base"]), _nearest(obs)
     far = jnp.linalg.norm(opponent - _CENTER, axis=-1)
     outward = (opponent - _CENTER) / jnp.maximum(far, 1e-3)[:, None]
     left = jnp.stack([-outward[:, 1], outward[:, 0]], axis=-1)
@@ -64,6 +64,17 @@ def plan_wrestling(obs: Observation) -> jax.Array:
     back = go_to(position, yaw, jnp.broadcast_to(_CENTER, position.shape), yaw)
     at_edge = jnp.linalg.norm(position - _CENTER, axis=-1) > jnp.clip(far - 0.08, *_EDGE)
     return jnp.where(at_edge[:, None], back, go_to(position, yaw, goal, heading))
+
+
+def _nearest(obs: Observation) -> jax.Array:
+    """Returns the position (T, 2), m, of the opponent or, of several, of the nearest one that is still in."""
+    if "opponent" in obs:
+        return obs["opponent"][:, :2]
+    opponents = obs["opponents"].reshape(len(obs["base"]), -1, 7)  # base information, and whether it is in
+    apart = jnp.linalg.norm(opponents[..., :2] - obs["base"][:, None, :2], axis=-1)
+    apart = jnp.where(opponents[..., 6] > 0.5, apart, 1e3)
+    chosen = jax.nn.one_hot(jnp.argmin(apart, axis=-1), apart.shape[-1])  # as an index ONNX graphs cannot batch it
+    return jnp.sum(chosen[..., None] * opponents[..., :2], axis=-2)
 
 
 # Traverse Bridge: push the opponent back from the end of the bridge, then walk beside it.
