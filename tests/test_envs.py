@@ -292,7 +292,8 @@ def test_a_block_of_entities_says_who_is_there() -> None:
     assert layout.entities(packed, "sheep")[0].shape == (2, 2, 1) and layout.entities(packed, "sheep")[1].all()
     with pytest.raises(KeyError, match="'own' has no entities"):
         layout.entities(packed, "own")
-    assert [b.entities.kind for b in made("go1sheep-hard").observation_layout.blocks if b.entities] == ["robot", "sheep"]
+    blocks = made("go1sheep-hard").observation_layout.blocks
+    assert [block.entities.kind for block in blocks if block.entities] == ["robot", "sheep"]
 
 
 def test_a_block_of_an_image_has_its_shape() -> None:
