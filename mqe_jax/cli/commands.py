@@ -3,16 +3,18 @@
 Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 """
 
+import contextlib
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, Seed, TaskOptions, print_table
+from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, RobotFile, Seed, TaskOptions, print_table
 from mqe_jax.core.limits import Environments, Episodes, Horizon
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import fail, record
 
 _ZOO = Path(__file__).parents[1] / "policies" / "zoo"
 _RATES = {
@@ -125,13 +127,19 @@ class Eval(PolicyOptions):
     sides: Literal["both", "first"] = "first"
     """Side of the policy in a match: the task's team 0 in all episodes (first), or in half of them (both)."""
     dump_diverged: DumpDiverged = None
+    export: RobotFile = None
+    """Graph of one robot, which `mqe export` writes with `--per-robot`, instead of a policy: each robot is a process of
+    its own, which has this file and its own readings only. The file says whether it samples actions."""
+    opponent_export: RobotFile = None
+    """The same for the robots of the opponents."""
 
     def run(self) -> dict[str, Any]:
         """Evaluates a policy; prints a table, or returns the object for `--json`."""
         from mqe_jax.runs.playing import evaluate
 
         options = {"episodes": self.episodes, "num_envs": self.num_envs, "sides": self.sides, "seed": self.seed}
-        result = evaluate(**self.playing, **options, dump_diverged=self.dump_diverged)
+        with self._robots() as robots:
+            result = evaluate(**self.playing | robots, **options, dump_diverged=self.dump_diverged)
         if result.overflow:
             echo(
                 f"mqe: warning: the engine may have dropped contacts in {result.overflow} environment steps; "
@@ -140,6 +148,22 @@ class Eval(PolicyOptions):
         if not self.json:
             print(result)
         return result.to_dict()
+
+    @contextlib.contextmanager
+    def _robots(self) -> Iterator[dict[str, Any]]:
+        """Yields the teams that are processes, by the names of `evaluate`'s arguments."""
+        files = {"policy": self.export, "opponent": self.opponent_export}
+        with contextlib.ExitStack() as stack:
+            teams = {}
+            for number, (name, file) in enumerate(files.items()):
+                if file is None:
+                    continue
+                from mqe_jax.export.robot_team import open_team
+
+                if (given := getattr(self, name)) is not None:
+                    fail(name, given, "left out beside the file of a robot")
+                teams[name] = stack.enter_context(open_team(file, (self.seed + number) % 2**32))
+            yield teams
 
 
 @record

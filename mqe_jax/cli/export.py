@@ -16,12 +16,17 @@ from mqe_jax.core.settings import record
 
 @record
 class Export:
-    """Write a trained policy, together with the walk policy, as one ONNX graph."""
+    """Write a trained policy as one ONNX graph: of a team, together with the walk policy, or of one robot."""
 
     run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK|RUN")]
     """Task with a shipped policy, run folder, or policy file."""
     onnx: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write (.onnx)."""
+    per_robot: bool = False
+    """Write the graph of one robot, for any of the team: from its own readings to its action, without the walk policy.
+    `mqe eval` runs it with `--export`."""
+    sampled: bool = False
+    """Of one robot: let it sample its actions, as the policy does by default in `mqe eval`; else they are means."""
     json: Json = False
 
     def run(self) -> dict[str, Any]:
@@ -30,6 +35,8 @@ class Export:
         from mqe_jax.runs.build import make_env
 
         _check_installed()
+        if self.sampled and not self.per_robot:
+            raise InputError("sampled: is not allowed for the graph of a team; it needs --per-robot")
         if self.onnx.suffix != ".onnx":
             raise InputError(f"onnx: {str(self.onnx)!r} is not allowed; it must be a file that ends in .onnx")
         check_output(self.onnx, "onnx")
@@ -40,9 +47,13 @@ class Export:
 
         from mqe_jax.export.check import STEPS, checked_onnx
         from mqe_jax.export.policy import shapes
+        from mqe_jax.export.robot_graph import checked_robot_onnx
 
         env, _ = make_env(task, "auto", policy.config.env, 1)
-        model, error = checked_onnx(policy, env)
+        if self.per_robot:
+            model, error = checked_robot_onnx(policy if self.sampled else policy.acting(True), env)
+        else:
+            model, error = checked_onnx(policy, env)
         write_atomically(self.onnx, model.SerializeToString())
         sizes = shapes(model)
         echo(f"mqe: wrote {self.onnx}, {self.onnx.stat().st_size / 1e6:.1f} MB")

@@ -22,6 +22,7 @@ Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing el
 Seed = Annotated[settings.Seed, tyro.conf.arg(help="Random seed.")]
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
 PolicyName = Annotated[str | None, tyro.conf.arg(metavar="NAME|RUN|FILE")]
+RobotFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 DumpDiverged = Annotated[
     Path | None,
     tyro.conf.arg(

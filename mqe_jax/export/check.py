@@ -30,19 +30,20 @@ Arrays = dict[str, np.ndarray]
 def checked_onnx(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above `LARGEST_ERROR`."""
     model = to_onnx(policy, env)
-    return model, _largest(errors(model, *record_actions(policy, env, STEPS)), f"{STEPS} steps of {env.name}")
+    return model, check_errors(model, *record_actions(policy, env, STEPS), f"{STEPS} steps of {env.name}")
 
 
 def verify(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays) -> onnx.ModelProto:
     """Returns the graph of a function after comparing both for inputs with leading axis N; errors as `checked_onnx`."""
     model = translate(function, shapes, name)
     expected = jax.device_get(jax.jit(jax.vmap(function))(inputs))
-    _largest(errors(model, inputs, expected), name)
+    check_errors(model, inputs, expected, name)
     return model
 
 
-def _largest(errors: Mapping[str, float], where: str) -> float:
-    error, output = max((error, name) for name, error in errors.items())
+def check_errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays, where: str) -> float:
+    """Returns the largest error of a graph, for arguments as of `errors`; InputError above `LARGEST_ERROR`."""
+    error, output = max((error, name) for name, error in errors(model, inputs, expected).items())
     if not error <= LARGEST_ERROR:
         raise InputError(
             f"export: nothing is written, because in {where} the graph's output {output!r} differs from JAX by "

@@ -50,7 +50,7 @@ def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
     """
     check_policy(policy, env)
     step = functools.partial(policy_step, policy, env)
-    return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), _properties(policy, env))
+    return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), properties(policy, env))
 
 
 def input_shapes(policy: Trained, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
@@ -106,7 +106,8 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
     return {"inputs": of(model.graph.input), "outputs": of(model.graph.output)}
 
 
-def _properties(policy: Trained, env: QuadrupedEnv) -> dict[str, str]:
+def properties(policy: Trained, env: QuadrupedEnv) -> dict[str, str]:
+    """Returns the metadata of a policy's graph."""
     seen = {"policy": env.observation_layout, **env.groups}[policy.needs.group]
     layout = [[block.name, block.width, block.meaning] for block in seen.blocks]
     return {

@@ -159,18 +159,30 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
 
 def policy_function(policy: Policy, functions: TaskFunctions) -> tuple[Function, Shapes]:
     """Returns a policy as a function of one team, and the shapes of its inputs; it samples where `policy` does."""
-    env, sensed = functions.env, groups_of(policy) == {ONBOARD}
+    sensed = groups_of(policy) == {ONBOARD}
+    act, shapes = _act_on_readings(policy, functions.env.group_sizes[ONBOARD if sensed else "policy"])
+    return _with_noise(*(_sensing(act, shapes, functions) if sensed else (act, shapes)))
+
+
+def readings_function(policy: Policy, size: int) -> tuple[Function, Shapes]:
+    """Returns a policy as a function of the observations `obs` (A, size) of one team; see `policy_function`."""
+    return _with_noise(*_act_on_readings(policy, size))
+
+
+def _act_on_readings(policy: Policy, size: int) -> tuple[Function, Shapes]:
     memory = jax.tree.map(lambda x: x[0], policy.initial_memory(1))
     key = jax.random.PRNGKey(0)
-    shapes = {"obs": (policy.agents, env.group_sizes[ONBOARD if sensed else "policy"])}
-    shapes |= {name: x.shape for name, x in name_arrays("memory", memory).items()}
 
-    def choose(inputs: Arrays) -> dict[str, jax.Array]:
+    def act(inputs: Arrays) -> dict[str, jax.Array]:
         state = jax.tree.map(lambda x: x[None], fill_arrays("memory", memory, inputs))
         action, state = policy.act(inputs["obs"][None], state, key)
         return {"action": action[0]} | {name: x[0] for name, x in name_arrays("next_memory", state).items()}
 
-    act, shapes = _sensing(choose, shapes, functions) if sensed else (choose, shapes)
+    return act, {"obs": (policy.agents, size)} | {n: x.shape for n, x in name_arrays("memory", memory).items()}
+
+
+def _with_noise(act: Function, shapes: Shapes) -> tuple[Function, Shapes]:
+    """Returns a function whose normal numbers are the input `noise` (K,), and its inputs; itself if it draws none."""
 
     def act_with_noise(inputs: Arrays) -> dict[str, jax.Array]:
         with normal_numbers(inputs["noise"]):

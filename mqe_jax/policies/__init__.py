@@ -232,8 +232,9 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
                 policy = population.resolve(source, task)
                 scripted = [TASKS[task].Params().actions("command")] if policy == "scripted" else scripted
                 policy = load_policy(policy)
-        if isinstance(policy, Trained) and policy.needs.control is not None and policy.task == task:
-            every.append(policy.needs)
+        needs: Any = getattr(policy, "needs", None)
+        if isinstance(needs, Needs) and needs.control is not None and needs.task == task:
+            every.append(needs)
     for needs in every:
         usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
         asked = {name: value for name in usual if (value := getattr(needs, name)) != usual[name]}

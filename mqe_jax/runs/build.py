@@ -17,7 +17,6 @@ from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, Vec
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.policies import all_agents, load_as, load_policy, parameters_for, zoo
-from mqe_jax.policies.mixture import Trained
 from mqe_jax.runs.presets import base_config
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
@@ -300,8 +299,8 @@ def players(
     if opponent is not None:
         other, against = load_as("opponent", opponent, task_env, deterministic=deterministic), opponent
     about: dict[str, Any] = {"policy": str(chosen)}
-    if isinstance(trained := getattr(own, "policy", own), Trained):
-        about["actions"] = "mean" if trained.deterministic else "sampled"
+    if (mean := getattr(getattr(own, "policy", own), "deterministic", None)) is not None:
+        about["actions"] = "mean" if mean else "sampled"
     if match:
         about["opponent"] = str(against)
     everyone = all_agents(task_env, own, other)

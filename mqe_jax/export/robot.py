@@ -1,0 +1,80 @@
+"""The program of one robot: an exported graph turns its readings into its actions. Needs numpy and onnxruntime only.
+
+`python -m mqe_jax.export.robot FILE [SEED]` acts for the robot in N episodes at once until its standard input ends. The
+file is what `mqe export` writes with `--per-robot`. In each environment step the program reads a frame (N, 1 + O):
+whether the row's episode starts, 1 or 0, then the robot's readings. It answers with the frame of its actions (N, D). A
+frame is the number of rows and of columns as little-endian uint32, then the numbers as float32. The seed is that of the
+normal numbers with which a graph samples.
+"""
+
+import struct
+import sys
+from collections.abc import Mapping
+from typing import IO, Any
+
+import numpy as np
+
+_HEAD = struct.Struct("<II")
+
+
+class Robot:
+    """One robot in N episodes; it keeps the recurrent state of its graph."""
+
+    properties: Mapping[str, str]
+    """Metadata of the graph."""
+
+    def __init__(self, graph: str | bytes, seed: int = 0) -> None:
+        """Loads a graph, a file or its content."""
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        options.intra_op_num_threads = 1  # a team has one program per robot
+        self._session: Any = onnxruntime.InferenceSession(graph, options, ["CPUExecutionProvider"])
+        self._shapes = {x.name: tuple(x.shape[1:]) for x in self._session.get_inputs()}
+        self._outputs = [x.name for x in self._session.get_outputs()]
+        self._random = np.random.default_rng(seed)
+        self._memory: dict[str, np.ndarray] = {}
+        self.properties = self._session.get_modelmeta().custom_metadata_map
+
+    def act(self, readings: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Returns the actions (N, D) for readings (N, O); `starts` (N,) is 1 where an episode starts, else 0."""
+        count = len(readings)
+        inputs = {"obs": readings.reshape(count, *self._shapes["obs"])}
+        if "noise" in self._shapes:
+            inputs["noise"] = self._random.standard_normal((count, *self._shapes["noise"]), np.float32)
+        for name in self._shapes.keys() - inputs:
+            zero = np.zeros((count, *self._shapes[name]), np.float32)
+            kept = self._memory.get(name, zero)
+            first = starts.reshape(count, *(1,) * (zero.ndim - 1)) > 0.5
+            inputs[name] = zero if first.all() else np.where(first, zero, kept)
+        found = dict(zip(self._outputs, self._session.run(self._outputs, inputs), strict=True))
+        action = found.pop("action").reshape(count, -1)
+        self._memory = {name.removeprefix("next_"): x for name, x in found.items()}
+        return action
+
+
+def write_frame(stream: IO[bytes], numbers: np.ndarray) -> None:
+    """Writes a frame (rows, columns)."""
+    stream.write(_HEAD.pack(*numbers.shape) + np.ascontiguousarray(numbers, "<f4").tobytes())
+    stream.flush()
+
+
+def read_frame(stream: IO[bytes]) -> np.ndarray | None:
+    """Returns the next frame (rows, columns), or None if the stream has ended."""
+    if len(head := stream.read(_HEAD.size)) < _HEAD.size:
+        return None
+    rows, columns = _HEAD.unpack(head)
+    content = stream.read(4 * rows * columns)
+    return np.frombuffer(content, "<f4").reshape(rows, columns) if len(content) == 4 * rows * columns else None
+
+
+def main(file: str, seed: str = "0") -> None:
+    """Runs the program."""
+    robot = Robot(file, int(seed))
+    while (frame := read_frame(sys.stdin.buffer)) is not None:
+        write_frame(sys.stdout.buffer, robot.act(frame[:, 1:], frame[:, 0]))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,107 @@
+"""The graph of one robot: the part of a team's policy that turns its own readings into its own actions.
+
+| input | output | |
+|---|---|---|
+| `obs` (N, 1, O) | `action` (N, 1, D) | the robot's row of the policy's group of observations; actions in [-1, 1] |
+| `noise` (N, K) | | standard normal numbers, of a policy that samples |
+| `memory`, `memory_NAME` | `next_memory`, ... | recurrent state, zero at an episode's start |
+"""
+
+import dataclasses
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnx
+
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import check_arguments, fail, to_mapping
+from mqe_jax.core.types import AnyTrained, observations
+from mqe_jax.envs import QuadrupedEnv, VectorEnv
+from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors
+from mqe_jax.export.policy import properties
+from mqe_jax.export.task import readings_function
+from mqe_jax.export.translate import translate
+from mqe_jax.policies.mixture import Mixture, Trained
+from mqe_jax.train.policy import check_policy
+
+
+@check_arguments(policy=AnyTrained, env=QuadrupedEnv)
+def robot_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
+    """Returns the graph of any robot of a policy's team; its actions are means if those of the policy are.
+
+    Raises:
+        InputError: for another task than the policy's, a policy whose robots do not share a network, or an operation
+            that has no translation.
+    """
+    check_policy(policy, env)
+    act, sizes = readings_function(_one_robot(policy), policy.needs.dims.observation)
+    about = properties(policy, env) | {
+        "needs": json.dumps(to_mapping(policy.needs)),
+        "actions": "mean" if policy.deterministic else "sampled",
+    }
+    return translate(act, sizes, f"{env.name.replace('-', '_')}_robot", about)
+
+
+def checked_robot_onnx(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
+    """Returns the graph of `robot_onnx` and its largest error against JAX in `STEPS` steps.
+
+    Raises:
+        InputError: as `robot_onnx`, for a policy whose robots need what others sense, or an error above
+            `LARGEST_ERROR`.
+    """
+    model = robot_onnx(policy, env)
+    inputs, outputs, apart = _record(policy, env)
+    if apart > LARGEST_ERROR:
+        fail("network", policy.config.network.name, "one whose robots act on their own readings only (--per-robot)")
+    return model, check_errors(model, inputs, outputs, f"{STEPS} steps of {env.name}")
+
+
+def _one_robot(policy: Trained) -> Trained:
+    """Returns the policy of a team of one, which acts as each robot of a team whose robots do not see each other."""
+    if policy.agents == 1:
+        return policy
+    if isinstance(policy, Mixture):
+        fail("policy", policy, "one without members (--per-robot): a mixture draws one member for all its robots")
+    needs = dataclasses.replace(policy.needs, dims=policy.dims._replace(agents=1, values=1))
+    try:
+        return dataclasses.replace(policy, needs=needs)
+    except InputError:
+        fail("policy", policy, "one whose robots share a network (--per-robot)")
+
+
+def _record(policy: Trained, env: QuadrupedEnv) -> tuple[Arrays, Arrays, float]:
+    """Returns inputs and outputs of a robot's function by name, leading axis robots and steps.
+
+    The third value is the largest difference of its actions from those that the policy computes for the team.
+    """
+    agents, size, group = policy.agents, policy.needs.dims.observation, policy.needs.group
+    batch = VectorEnv(env, 1, final=()).with_groups(policy.groups)
+    (team, team_sizes), (robot, sizes) = (readings_function(p, size) for p in (policy, _one_robot(policy)))
+    empty = lambda sizes, *lead: {n: jnp.zeros((*lead, *x)) for n, x in sizes.items() if n.startswith("memory")}  # noqa: E731
+
+    @jax.jit
+    def advance(state: Any, memories: Any, noise: jax.Array) -> Any:
+        seen = observations(state).group(group)[0, :agents]
+        drawn = {"noise": noise} if "noise" in sizes else {}
+        inputs = {"obs": seen[:, None], **drawn, **memories[0]}
+        outputs = jax.vmap(robot)(inputs)
+        drawn = {"noise": noise.reshape(-1)} if drawn else {}
+        together = team({"obs": seen, **drawn, **memories[1]})
+        action = jnp.zeros((1, env.num_agents, env.action_size)).at[0, :agents].set(together["action"])
+        state = batch.step(state, action)
+        kept = 1.0 - (state.terminated | state.truncated)[0]
+        after = [{n: kept * x[f"next_{n}"] for n in m} for x, m in zip((outputs, together), memories, strict=True)]
+        return inputs, outputs, together["action"], state, after
+
+    random, rows, apart = np.random.default_rng(0), [], 0.0
+    state = jax.jit(batch.reset)(jax.random.PRNGKey(0))
+    memories = [empty(sizes, agents), empty(team_sizes)]
+    for _ in range(STEPS):
+        noise = random.standard_normal((agents, *sizes.get("noise", (0,))), np.float32)
+        inputs, outputs, action, state, memories = advance(state, memories, noise)
+        rows.append(jax.device_get((inputs, outputs)))
+        apart = max(apart, float(jnp.abs(outputs["action"][:, 0] - action).max()))
+    return *jax.tree.map(lambda *x: np.concatenate(x), *rows), apart

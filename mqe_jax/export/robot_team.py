@@ -1,0 +1,177 @@
+"""A team whose robots are processes of their own, which have nothing but an exported graph and their own readings."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.core import limits
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import check_file, parse_json, parsing
+from mqe_jax.core.settings import PathText, build, check_arguments, fail
+from mqe_jax.core.types import Memory, Observations
+from mqe_jax.export.robot import Robot, read_frame, write_frame
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.needs import Needs
+from mqe_jax.train.policy import check_obs
+
+_PROGRAM = "mqe_jax.export.robot"
+_CLOSING = 10.0  # s, after which a process that does not end is killed
+
+
+class RobotTeam:
+    """A policy that asks a process per robot for its actions; `open_team` starts and ends them.
+
+    A process gets its row of the observations and whether an episode starts. It keeps its recurrent state, so that the
+    one of `act` only says whether the episode has started.
+    """
+
+    file: Path  # the graph of one robot
+    needs: Needs  # what the team needs of its environment
+    config: TrainConfig  # settings of which `check_policy` reads the group of observations
+    task: str
+    agents: int  # number of robots A
+    groups: tuple[str, ...]  # the group of observations that they see
+    deterministic: bool  # whether they act with their mean actions
+    failure: str  # why a process ended, if one did
+
+    def __init__(self, file: Path, needs: Needs, deterministic: bool, seed: int) -> None:
+        self.file, self.needs, self.deterministic, self.failure = file, needs, deterministic, ""
+        self.config = build(TrainConfig, {"group": needs.group})
+        self.task, self.agents, self.groups = needs.task, needs.dims.agents, (needs.group,)
+        seeds = np.random.SeedSequence(seed).generate_state(self.agents)
+        self._processes = [_Process(file, number, int(own)) for number, own in enumerate(seeds)]
+
+    def __repr__(self) -> str:
+        return str(self.file)
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns zeros (N,): no episode has started."""
+        return jnp.zeros(num_envs)
+
+    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        """Returns the actions of all robots; see `Policy`. The processes draw their own random numbers."""
+        seen = Observations.at(obs)
+        readings = seen.group(self.needs.group) if isinstance(obs, Observations) else seen.obs
+        readings = check_obs(readings, self.agents, self.needs.dims.observation)
+        kind = jax.ShapeDtypeStruct((*readings.shape[:-1], self.needs.dims.action), jnp.float32)
+        action = jax.pure_callback(self._exchange, kind, readings, memory, vmap_method="broadcast_all")
+        return action, jnp.ones_like(memory)
+
+    def close(self) -> None:
+        """Ends the processes."""
+        for process in self._processes:
+            process.close()
+
+    def _exchange(self, readings: Any, started: Any) -> np.ndarray:
+        """Sends every robot its readings (..., A, O) and returns the actions (..., A, D) that they answer."""
+        readings = np.asarray(readings)
+        rows = readings.reshape(-1, *readings.shape[-2:])
+        starts = 1.0 - np.asarray(started).reshape(-1, 1)
+        try:
+            for robot, process in enumerate(self._processes):
+                process.send(np.concatenate([starts, rows[:, robot]], axis=1))
+            shape = len(rows), self.needs.dims.action
+            actions = [process.receive(shape) for process in self._processes]
+        except OSError as error:
+            self.failure = self.failure or str(error)
+            raise
+        return np.stack(actions, axis=1).reshape(*readings.shape[:-1], -1)
+
+
+class _Process:
+    """The process of one robot."""
+
+    def __init__(self, file: Path, number: int, seed: int) -> None:
+        self._name = f"export: the process of robot {number}"
+        self._errors: IO[bytes] = tempfile.TemporaryFile()
+        command = [sys.executable, "-m", _PROGRAM, str(file), str(seed)]
+        # In a session of its own: a Ctrl-C ends the parent, whose end it sees.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, start_new_session=True
+        )
+
+    def send(self, frame: np.ndarray) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # `receive` says why
+            write_frame(self._process.stdin, frame)
+
+    def receive(self, shape: tuple[int, int]) -> np.ndarray:
+        assert self._process.stdout is not None
+        frame = read_frame(self._process.stdout)
+        if frame is None:
+            code = self._process.wait(_CLOSING)
+            self._errors.seek(0)
+            last = self._errors.read().decode("utf-8", "replace").strip().rpartition("\n")[2]
+            raise ConnectionError(f"{self._name} ended with {code} ({last or 'without a message'})")
+        if frame.shape != shape:
+            raise ConnectionError(f"{self._name} answered {frame.shape} numbers, not {shape}")
+        return frame
+
+    def close(self) -> None:
+        """Ends the process: it ends with its input."""
+        for stream in (self._process.stdin, self._process.stdout):
+            assert stream is not None
+            with contextlib.suppress(BrokenPipeError):
+                stream.close()
+        try:
+            self._process.wait(_CLOSING)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._errors.close()
+
+
+@contextlib.contextmanager
+@check_arguments(file=PathText, seed=limits.Seed)
+def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
+    """Starts the processes of a team of robots that all have one file, written with `--per-robot`; yields its policy.
+
+    Example:
+        ```python
+        with open_team("gate.onnx") as team:
+            print(mqe_jax.evaluate("go1gate", team).success)
+        ```
+
+    Raises:
+        InputError: if onnxruntime is missing, or for a file that is not the graph of a robot.
+        ConnectionError: at the end, if a process ended before.
+    """
+    team = _read(Path(file), seed)
+    logger = logging.getLogger("jax._src.callback")  # which prints the traceback of an error in a callback
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield team
+    except jax.errors.JaxRuntimeError:
+        if not team.failure:
+            raise
+    finally:
+        logger.setLevel(level)
+        team.close()
+    if team.failure:
+        raise ConnectionError(team.failure) from None
+
+
+def _read(file: Path, seed: int) -> RobotTeam:
+    if importlib.util.find_spec("onnxruntime") is None:
+        raise InputError("export: needs onnxruntime (pip install 'mqe-jax[export]')")
+    check_file(file, limits.POLICY_BYTES)
+    with parsing(file, "an ONNX graph"):
+        about = Robot(str(file)).properties
+    if not {"needs", "actions"} <= about.keys():
+        fail("export", str(file), "the graph of one robot: mqe export TASK|RUN --per-robot --onnx FILE")
+    with parsing(file, "the graph of one robot"):
+        needs = build(Needs, parse_json(about["needs"], "needs"))
+    return RobotTeam(file, needs, about["actions"] == "mean", seed)
