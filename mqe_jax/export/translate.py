@@ -79,7 +79,12 @@ def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[Any]) -> 
     for equation in jaxpr.eqns:
         values, name, params = [read(v) for v in equation.invars], equation.primitive.name, equation.params
         inner = params.get("call_jaxpr", params.get("jaxpr"))
-        if inner is not None and name != "reduce":  # whose jaxpr is that of its operator
+        outputs: list[Any] = [v.aval for v in equation.outvars]
+        if name == "concatenate":
+            values = [x for x in values if x.shape[params["dimension"]]]
+        if all(0 in getattr(x, "shape", ()) for x in outputs):  # graphs have no empty arrays
+            results = [np.zeros(x.shape, x.dtype) for x in outputs]
+        elif inner is not None and name != "reduce":  # whose jaxpr is that of its operator
             results = _evaluate(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values)
         elif any(isinstance(x, jax.core.Tracer) for x in values):
             results = REPLACED[name](*values) if name in REPLACED else equation.primitive.bind(*values, **params)
