@@ -97,7 +97,7 @@ def pooled(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
     """
     rows = x.reshape(*x.shape[:-1], entities.count, -1)
     there = rows[..., -1:] > 0.5 if entities.masked else jnp.ones_like(rows[..., :1], bool)
-    features = nn.mlp(params, jnp.where(there, rows[..., : entities.width], 0.0), jax.nn.relu, activate_last=True)
+    features = nn.mlp(params, rows[..., : entities.width], jax.nn.relu, activate_last=True)
     features = jnp.where(there, features, 0.0)  # which no maximum is below
     count = jnp.maximum(jnp.sum(there.astype(x.dtype), axis=-2), 1.0)
     return jnp.concatenate([jnp.max(features, axis=-2), jnp.sum(features, axis=-2) / count], axis=-1)
