@@ -128,7 +128,7 @@ def test_other_sensors_are_named_with_both_values() -> None:
             check_policy(policy, make("go1gate", impl="c", num_envs=1, senses=senses))
     forged = override(needs, {"dims": needs.dims._replace(blocks=needs.dims.blocks[::-1])})
     assert forged.mismatches(needs) == {} != Needs(task="go1gate", dims=needs.dims).mismatches(needs)
-    assert parameters_for("go1gate", policy) == {}  # no trained policy
+    assert parameters_for("go1gate", policy) == {"senses": needs.senses}
     check_policy(zoo.load("go1gate"), blind)  # of before files described blocks
 
 
