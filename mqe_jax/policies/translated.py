@@ -76,7 +76,7 @@ def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
         InputError: if the policy does not fit the task.
     """
     needs = policy.needs
-    if (numbers := env.action_size - env.controller.action_size) and not needs.senses:
+    if (numbers := sum(sensor.action_size for sensor in env.params.senses)) and not needs.senses:
         view = _changed(env, params=dataclasses.replace(env.params, senses=()))
         return Silent(translate(policy, view, name), numbers)
     if needs.control == "command" == env.control and len(env.controller.skill.parts) > 1:

@@ -95,13 +95,13 @@ def plan_sheep_easy(obs: Observation) -> jax.Array:
     several sheep they drive the mean of those that are not.
     """
     (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
-    left = sheep[:, 0] <= gate[0] + 0.4
+    left = (sheep[:, 0] <= gate[0] + 0.4).astype(jnp.float32)
     sheep = left @ sheep / jnp.maximum(jnp.sum(left), 1)
     way = gate + jnp.array([0.6, 0.0]) - sheep
     way = way / jnp.maximum(jnp.linalg.norm(way), 1e-3)
     across = jnp.array([-way[1], way[0]])
     goal = sheep - 0.8 * way + _BESIDE * (len(position) - 1) / 2 * _sides(len(position)) * across
-    return jnp.where(~jnp.any(left), 0.0, go_to(position, yaw, _apart(position, goal)))
+    return jnp.where(jnp.sum(left) > 0, go_to(position, yaw, _apart(position, goal)), 0.0)
 
 
 def plan_sheep_hard(obs: Observation) -> jax.Array:
