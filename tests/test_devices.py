@@ -202,6 +202,7 @@ def test_policies(name: str) -> None:
     assert_same(one, other)
 
 
+@pytest.mark.soak
 def test_another_process_steps_environments_and_policies_alike(tmp_path: Path) -> None:
     """Gymnasium's copies keep their state."""
     env, file = make("go1plane", num_envs=2, **PLANE), tmp_path / "all"

@@ -224,6 +224,7 @@ def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:
     assert rewards.shape == (2, 2) and np.isfinite(rewards).all() and (rewards[:, 0] != rewards[:, 1]).all()
 
 
+@pytest.mark.soak
 def test_self_play_trains_against_a_snapshot_and_a_scripted_opponent() -> None:
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "self_play.py"))
     results = example["main"](num_envs=4, updates=3, snapshot_every=2)

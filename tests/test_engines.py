@@ -259,6 +259,7 @@ print(hits.count("cache_hits"), hits.count("cache_misses"), float(state.data.qpo
 """
 
 
+@pytest.mark.soak
 def test_a_second_process_compiles_no_step_of_the_c_engine(tmp_path: Path) -> None:
     keep = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     run = [sys.executable, "-c", SECOND_START]

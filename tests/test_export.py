@@ -128,6 +128,7 @@ def test_a_graph_holds_the_skill_of_the_task(skill: Any, commands: Any, memory: 
     assert export_error(policy, env) < 2e-5
 
 
+@pytest.mark.soak
 def test_a_policy_that_sees_sensors_is_exported_and_senses_on_the_page(tmp_path: Path) -> None:
     """The graph has readings as inputs; that of the page has the state, for either team of a match."""
     late, near = {"all": {"delay": 1}}, {"position_noise": 0.0, "yaw_noise": 0.0, "misses": 0.0}

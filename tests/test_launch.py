@@ -101,7 +101,8 @@ def lines(said: str) -> list[str]:
     return list(without_progress(said.splitlines()))
 
 
-@pytest.mark.parametrize("task", ["fake", pytest.param("go1gate", marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("task", ["fake", "go1gate"])
 def test_two_processes_equal_one(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_env.install(monkeypatch)
     one, two = tmp_path / "one", tmp_path / "two"

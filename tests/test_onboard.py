@@ -204,6 +204,7 @@ class Pacer:
         return jnp.tanh(memory[:, None, None] + obs.group("policy")[..., :3]), memory + 1
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("shared_programs")
 def test_a_training_with_sensors_resumes_bit_for_bit(tmp_path: Path) -> None:
     (config,), cast = onboard()

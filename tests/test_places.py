@@ -59,6 +59,7 @@ def run(code: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[
     return done
 
 
+@pytest.mark.soak
 def test_nothing_needs_posix_or_a_home_folder(tmp_path: Path) -> None:
     code = mqe(
         ["train", "fake", "--run-dir", "run", *SMALL],

@@ -77,6 +77,7 @@ def sighted(env: Any, state: State) -> list[np.ndarray]:
     return [places[[row for row in np.flatnonzero(each) if row != agent]] for agent, each in enumerate(seen)]
 
 
+@pytest.mark.soak
 def test_marks_show_what_is_sensed_in_the_frame_of_the_scene() -> None:
     """Also of the second team, whose left is its robot's right."""
     senses = (*EXACT[:2], Lidar(pipeline={"all": Pipeline(scale=2.0, history=2)}))

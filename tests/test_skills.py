@@ -315,6 +315,7 @@ def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     np.testing.assert_array_equal(state.control.skill["acting"], [0, 1])
 
 
+@pytest.mark.soak
 def test_commands_seat_them(policies: Any, tmp_path: Path) -> None:
     walk, agile = policies["walk"], policies["agile"]
     result = evaluate(agile, opponent=walk, episodes=2, num_envs=2, env={"episode_length": 0.2}, impl="c", sides="both")

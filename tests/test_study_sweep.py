@@ -62,6 +62,7 @@ def load(tmp_path: Path, text: str = FILE) -> Sweep:
     return sweeps.load_sweep(path)
 
 
+@pytest.mark.soak
 def test_processes_share_a_sweep(tmp_path: Path) -> None:
     sweep, folder = load(tmp_path), tmp_path / "study"
     jobs = sweeps.plan(sweep, folder, config_of)

@@ -97,6 +97,7 @@ def test_networks_and_leagues_train_in_single_precision(learns: str) -> None:
         assert kinds(jax.eval_shape(learner.update, state)[0]) == kinds(state)
 
 
+@pytest.mark.soak
 def test_switches_do_not_change_a_training(tmp_path: Path) -> None:
     config = settings(rollout_steps=2, total_steps=32, network__recurrent=False)
     switches: dict[str, Callable[[], Any]] = {
