@@ -343,6 +343,8 @@ def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: An
     (tmp_path / "text.npz").write_text("nothing")
     refuses(r"text.npz: damaged, or not a recording", replay.load_recording, tmp_path / "text.npz")
     states = trajectory(gate, fresh, jnp.zeros((2, 2, 12)))
+    states = dataclasses.replace(states, data=states.data.replace(qpos=states.data.qpos + 0.5))
     replay.save_recording(tmp_path / "gate.npz", gate, states, jnp.zeros((2, 2, 12)))
     recording = replay.load_recording(tmp_path / "gate.npz")
+    np.testing.assert_array_equal(replay._restore(gate, recording).data.qpos, states.data.qpos[0])
     refuses(r"go1seesaw .* does not fit a recording of go1gate", replay.replay, recording, made("go1seesaw"))

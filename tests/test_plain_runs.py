@@ -24,6 +24,7 @@ from mqe_jax.policies import SimplePolicy
 from mqe_jax.selfplay.league import league, pool, tournament
 from mqe_jax.terrain import Gate, Track
 from mqe_jax.train import learner as learning
+from mqe_jax.train import monitor
 from mqe_jax.train.checkpoint import save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
@@ -116,6 +117,10 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
         assert absolute["sampled"] != one["sampled"]
         results.append(one["sampled"])
     assert results[0] != results[1]
+
+
+def test_each_policy_is_evaluated_twice_in_a_row() -> None:
+    assert monitor._twice([{"bias": 1.0}, {"bias": 2.0}])["bias"].tolist() == [1.0, 1.0, 2.0, 2.0]
 
 
 def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> None:

@@ -115,6 +115,7 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
     learner = make_learner(env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2}))
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
+    assert not state.rollout.episode_steps.any()
     monkeypatch.setattr(jax.random, "permutation", noted)
     jax.block_until_ready(jax.jit(learner.update)(state))
     jax.effects_barrier()
