@@ -34,7 +34,7 @@ import play_agreement  # noqa: E402
 
 from mqe_jax.export import site  # noqa: E402
 from mqe_jax.export.scene import scene_xml  # noqa: E402
-from mqe_jax.export.site import STARTS, entries, start_states  # noqa: E402
+from mqe_jax.export.site import LARGER, STARTS, entries, start_states, titles  # noqa: E402
 from mqe_jax.export.task import PHYSICS, TaskFunctions, state_arrays  # noqa: E402
 from mqe_jax.train.policy import save_policy  # noqa: E402
 
@@ -48,8 +48,8 @@ def write(task: str, folder: Path) -> SimpleNamespace:
         patch.setattr(site, "add_libraries", lambda folder, source: None)
         with contextlib.redirect_stderr(io.StringIO()) as said:
             assert cli.main(["play-site", task, "-o", str(folder)]) == 0
-        assert f"mqe: exporting {task}, 1 of 1" in said.getvalue()
-    own = folder / "tasks" / task
+        assert f"mqe: exporting {entry.name}, 1 of 1" in said.getvalue()
+    own = folder / "tasks" / entry.name
     settings = json.loads((own / "scene.json").read_text())
     return SimpleNamespace(entry=entry, env=entry.env, own=own, settings=settings, folder=folder)
 
@@ -118,7 +118,7 @@ def test_graphs_agree_with_the_environment_in_an_episode(built: SimpleNamespace)
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("task", PLANNERS)
+@pytest.mark.parametrize("task", [*PLANNERS, *LARGER])
 def test_graphs_of_every_task_agree_in_a_long_episode(task: str, tmp_path: Path) -> None:
     assert "terminated" in check_graphs(write(task, tmp_path), 200)
 
@@ -187,7 +187,17 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     assert first.env.params.ring_radius == 1.7 and second.env.params.ring_radius == 1.5
     assert second.env.params.randomization.push == 0  # the page has none
     refuses("did you mean 'go1gate'", entries, ["go1gaet"])
+    refuses("num_agent.*did you mean 'num_agents'", entries, ["go1gate:num_agent=4"])
     refuses("position", TaskFunctions, SimpleNamespace(control="position"))
+
+
+def test_tasks_of_other_sizes_are_played_by_their_scripted_policies() -> None:
+    found = entries(["go1football-1vs1", *LARGER])
+    assert [entry.name for entry in found] == ["go1football-1vs1", "go1football-1vs1-2", "go1sheep-hard"]
+    assert [list(entry.policies) for entry in found[1:]] == [["scripted"]] * 2
+    assert titles([*found, found[1]]) == [
+        "Football (1 vs 1)", "Football (5 vs 5)", "Sheep Dog (Hard), 4 robots, 30 sheep", "Football (5 vs 5) 2",
+    ]  # fmt: skip
 
 
 def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
@@ -251,6 +261,17 @@ def photograph(tab: Any, name: str) -> None:
         tab.screenshot(path=str(Path(folder) / f"{name}.png"))
 
 
+SHOW_SCENE = """async (start) => {
+  const [{ Box3, Vector3 }, { Camera }] = [await import('three'), await import('./camera.js')];
+  const extent = new Box3(new Vector3(-100, -100, 0), new Vector3(100, 100, 1));
+  const camera = new Camera(document.createElement('canvas'));
+  Object.assign(camera, { boxes: [[0, extent]], track: { start, length: 20, width: 6 } });
+  camera.showScene({ xpos: [0, 0, 0], xquat: [1, 0, 0, 0] });
+  return camera.controls.target.x;
+}"""
+"""The x at which the camera looks, m, to show the whole of a track that begins at `start`."""
+
+
 def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
     with opened(page, "seed=3&speed=0.5") as tab:
         assert tab.locator("#task").input_value() == TASK
@@ -262,6 +283,8 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         values = "import('./controls.js').then((own) => new own.Controls([], () => {}).values(['vx', 'skill']))"
         assert tab.evaluate(values) == [0, 1]  # of several skills, keys choose the last one
         photograph(tab, "driven")
+        shown = tab.evaluate(f"Promise.all([-5, 0].map({SHOW_SCENE}))")
+        assert shown[0] == pytest.approx(shown[1] - 5)
         tab.keyboard.press("r")
         tab.keyboard.press("Space")
         tab.wait_for_function("document.querySelector('#pause').textContent === 'Continue'")

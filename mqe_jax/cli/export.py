@@ -70,7 +70,9 @@ class PlaySite:
     """Write a web page on which policies play in the reader's browser; it needs no server but one for files."""
 
     runs: Annotated[tyro.conf.Positional[list[str]], tyro.conf.arg(metavar="TASK|RUN")] = field(default_factory=list)
-    """Tasks with their shipped and scripted policies, run folders or policy files. Default: all tasks."""
+    """Tasks with their shipped and scripted policies, tasks of other sizes with the scripted one
+    (go1sheep-hard:num_agents=4,num_sheep=30), run folders or policy files. Default: all tasks, and two of other
+    sizes."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
     """Folder to write."""
     libraries: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None

@@ -252,7 +252,7 @@ class Go1Football1vs1(
 
     name = "go1football-1vs1"
     title = "Football (1 vs 1)"
-    aim = "Score in the opponent's goal."
+    aim = "Score in the opponents' goal."
     Params = FootballMatchParams
     variable_num_agents = True
 
@@ -268,6 +268,10 @@ class Go1Football1vs1(
             count = min(columns, team - first)
             own += [(4.0 + (lines - 1) / 2 - line, (i - (count - 1) / 2) * apart, 0.0) for i in range(count)]
         return (*own, *((2 * x - a, 2 * y - b, np.pi) for a, b, _ in own))
+
+    @property
+    def heading(self) -> str:
+        return f"Football ({self.num_agents // 2} vs {self.num_agents // 2})"
 
     @property
     def colors(self) -> tuple[int, ...]:
@@ -337,5 +341,4 @@ class Go1Football2vs2(Go1Football1vs1):
 
     name = "go1football-2vs2"
     title = "Football (2 vs 2)"
-    aim = "Score in the opponents' goal."
     Params = Football2vs2Params

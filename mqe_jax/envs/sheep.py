@@ -163,6 +163,11 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     variable_num_agents = True
 
     @property
+    def heading(self) -> str:
+        sheep = self.num_sheep
+        return super().heading + (f", {sheep} sheep" if sheep != self.Params().flock_size else "")
+
+    @property
     def num_sheep(self) -> int:
         """Number of sheep S."""
         return self.params.flock_size
@@ -265,5 +270,4 @@ class Go1SheepHard(Go1SheepEasy):
 
     name = "go1sheep-hard"
     title = "Sheep Dog (Hard)"
-    aim = "Drive the nine sheep through the gate."
     Params = SheepHardParams

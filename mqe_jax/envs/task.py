@@ -84,6 +84,13 @@ class Task(Sensing, Generic[S, P]):
         return (tuple(range(self.num_agents)),)
 
     @property
+    def heading(self) -> str:
+        """The title, with the sizes that are not the task's default ones."""
+        if self.num_agents == self.Params().num_agents:
+            return self.title
+        return f"{self.title}, {' vs '.join(str(len(team)) for team in self.teams)} robots"
+
+    @property
     def extra_contacts(self) -> int:
         """Contacts for which an environment's buffers have room beyond those of its robots."""
         return 0

@@ -93,7 +93,7 @@ class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
 
     name = "go1wrestling"
     title = "Sumo Wrestling"
-    aim = "Push the opponent out of the ring, or over."
+    aim = "Push all opponents out of the ring, or over."
     Params = WrestlingParams
     variable_num_agents = True
 

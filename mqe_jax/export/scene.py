@@ -29,7 +29,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     | `dt`, `substeps`, `max_steps` | environment step, physics steps in it, environment steps until the time limit |
     | `teams`, `commands` | agents of each team; names of the action's commands, in order |
     | `robots` | of each of the R robots, colour and addresses in qpos, qvel and ctrl as in `RobotIndex` |
-    | `track` | `length` and `width` |
+    | `track` | x of its `start`, `length` and `width`, m |
     | `motors` | of all joints, constants and inputs of `mqe_jax.physics.robots.motors`, which MJCF cannot hold |
     """
     index, scene = env.index, env.compiled.scene
@@ -38,7 +38,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     colors = scene.colors or range(index.num_robots)
     return {
         "task": env.name,
-        "title": env.title,
+        "title": env.heading,
         "aim": env.aim,
         "robot": env.robot.name,
         "mujoco": mujoco.__version__,
@@ -51,7 +51,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
             {**row, "color": list(ROBOT_COLORS[color % len(ROBOT_COLORS)][:3])}
             for row, color in zip(rows, colors, strict=True)
         ],
-        "track": {"length": scene.track.length, "width": scene.track.width},
+        "track": {"start": scene.track.start, "length": scene.track.length, "width": scene.track.width},
         "motors": _motors(env),
     }
 

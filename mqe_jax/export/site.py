@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,9 @@ PAGE = Path(__file__).parent / "page"
 """Files of the page."""
 STARTS = 200
 """Initial states of each task."""
+LARGER = ("go1football-1vs1:num_agents=10", "go1sheep-hard:num_agents=4,num_sheep=30")
+"""Tasks of other sizes that the page has by default, played by their scripted policies."""
+_SIZED = re.compile(r"([\w-]+):(\w+=\d{1,9}(?:,\w+=\d{1,9})*)")
 
 
 @dataclasses.dataclass
@@ -86,8 +90,9 @@ def write_site(
 ) -> list[Entry]:
     """Writes the page with its tasks and libraries into a folder; returns the tasks.
 
-    `sources` are tasks, run folders and policy files, by default all tasks that have a policy. `libraries` is a folder
-    of the browser libraries' files, by default fetched with npm. `say` receives what is done next, in a line.
+    `sources` are tasks, also with sizes (`TASK:num_agents=4,num_sheep=30`), run folders and policy files, by default
+    all tasks that have a policy and those of `LARGER`. `libraries` is a folder of the browser libraries' files, by
+    default fetched with npm. `say` receives what is done next, in a line.
     """
     found = entries(sources)
     say("adding the browser libraries")
@@ -97,7 +102,7 @@ def write_site(
         entry.write(folder)
     for file in PAGE.iterdir():
         write_atomically(folder / file.name, file.read_bytes())
-    tasks = [{"name": entry.name, "title": _title(entry)} for entry in found]
+    tasks = [{"name": entry.name, "title": title} for entry, title in zip(found, titles(found), strict=True)]
     write_atomically(folder / "site.json", json.dumps({"tasks": tasks}).encode())
     write_atomically(folder / "package.json", b'{"type": "module"}\n')  # for Node
     return found
@@ -107,7 +112,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
     """Returns the tasks of a site; runs of one task with the same parameters share an entry."""
     playable = [task for task in TASKS if task in PLANNERS or task in zoo.names()]
     found: list[tuple[str, dict[str, Any], Entry]] = []
-    for source in dict.fromkeys(sources or playable):
+    for source in dict.fromkeys(sources or [*playable, *LARGER]):
         task, params, policies = _source(source, playable)
         params = _with_both_skills(task, params)
         entry = next((entry for *key, entry in found if key == [task, params]), None)
@@ -134,11 +139,15 @@ def entries(sources: Sequence[str]) -> list[Entry]:
 
 def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, Trained]]:
     """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a source stands for."""
+    if sized := _SIZED.fullmatch(source):
+        pairs = (pair.split("=") for pair in sized[2].split(","))
+        return _source(sized[1], playable)[0], {name: int(value) for name, value in pairs}, {}
     task = ALIASES.get(source, source)
     if os.sep not in source and (task in playable or not Path(source).exists()):
         if task not in playable:
             hint = nearest(task, playable)
-            raise InputError(f"run: {source!r} is not allowed{hint}; allowed: a run folder, a policy file, a task's id")
+            kinds = "a run folder, a policy file, a task's id, one with sizes such as go1gate:num_agents=4"
+            raise InputError(f"run: {source!r} is not allowed{hint}; allowed: {kinds}")
         return task, parameters_for(task, task), {"shipped": zoo.load(task)} if task in zoo.names() else {}
     policy = load_policy(source)
     if policy.task not in TASKS:
@@ -167,9 +176,11 @@ def _short(path: Path, taken: Iterable[str]) -> str:
     fail("run", str(path), f"a path whose last parts differ from {' and '.join(names)}, which are taken")
 
 
-def _title(entry: Entry) -> str:
-    number = entry.name.removeprefix(entry.env.name).lstrip("-")
-    return f"{entry.env.title} {number}".strip()
+def titles(found: Sequence[Entry]) -> list[str]:
+    """Returns the titles of tasks, with a number where an earlier one has the same."""
+    headings = [entry.env.heading for entry in found]
+    before = [headings[:place].count(heading) for place, heading in enumerate(headings)]
+    return [f"{heading} {count + 1}" if count else heading for heading, count in zip(headings, before, strict=True)]
 
 
 def start_states(env: QuadrupedEnv) -> dict[str, np.ndarray]:

@@ -87,15 +87,15 @@ export class Camera {
 
   /** Shows all of the scene within the track. */
   showScene({ xpos, xquat }) {
-    const { length, width } = this.track;
+    const { start, length, width } = this.track;
     const box = new three.Box3();
     for (const [body, extent] of this.boxes) {
       const [w, x, y, z] = xquat.slice(4 * body, 4 * body + 4);
       const pose = new three.Matrix4().makeRotationFromQuaternion(new three.Quaternion(x, y, z, w));
       box.union(extent.clone().applyMatrix4(pose.setPosition(point(xpos, body))));
     }
-    box.min.max(new three.Vector3(0, -width / 2, 0));
-    box.max.min(new three.Vector3(length, width / 2, 2));
+    box.min.max(new three.Vector3(start, -width / 2, 0));
+    box.max.min(new three.Vector3(start + length, width / 2, 2));
     const { min, max } = box;
     const corners = [min, max].flatMap(({ x }) => [min, max].flatMap(({ y }) => [min, max].map(({ z }) => [x, y, z])));
     const direction = this.direction();

@@ -97,11 +97,12 @@ export class Drawing {
   }
 
   addLight() {
-    const { length, width } = this.settings.track;
+    const { start, length, width } = this.settings.track;
+    const middle = start + length / 2;
     this.scene.add(new three.HemisphereLight(0xffffff, 0x9a9a92, 1.5));
     const sun = new three.DirectionalLight(0xffffff, 1.7);
-    sun.position.set(length / 2 - 2, -4, 9);
-    sun.target.position.set(length / 2, 0, 0);
+    sun.position.set(middle - 2, -4, 9);
+    sun.target.position.set(middle, 0, 0);
     sun.castShadow = !this.low;
     sun.shadow.mapSize.set(2048, 2048);
     const reach = Math.hypot(length, width) / 2 + 1;

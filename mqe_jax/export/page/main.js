@@ -7,6 +7,7 @@ const PAUSE_AFTER = 2.5; // s of page time between two episodes
 const LONGEST_WORK = 40; // ms of simulation at most before a frame, so that a slow browser stays responsive
 const LONGEST_SKIP = 70; // ms without a new picture at most, where the simulation is behind
 const SLOW = 20; // frames per second below which the page changes to low detail
+const NAMED = 4; // robots of a team, at most, that are named one by one above the picture
 const REASONS = { fall: 'a robot fell', collision: 'a collision', rule: '', time: 'time is up' };
 
 const element = (id) => document.getElementById(id);
@@ -59,6 +60,12 @@ function dot(robot) {
   return mark;
 }
 
+/** The dots of robots, one of each colour. */
+function dots(robots) {
+  const colors = robots.map((robot) => hex(episode.settings.robots[robot].color));
+  return robots.filter((_, i) => colors.indexOf(colors[i]) === i).map(dot);
+}
+
 /** Loads a task with the policies of the address, and starts an episode. */
 async function load(name, chosen) {
   const fresh = await site.episode(name);
@@ -89,7 +96,7 @@ function teamChoice(team) {
   const { settings, names } = episode;
   const row = make('label', {});
   const text = make('span', {});
-  text.append(...settings.teams[team].map(dot), isMatch() ? `Team ${team + 1}` : 'Policy');
+  text.append(...dots(settings.teams[team]), isMatch() ? `Team ${team + 1}` : 'Policy');
   const select = make('select', { id: `team${team}` });
   const known = [...settings.policies.map(({ name }) => name), 'idle'];
   fill(select, known.map((name) => [name, name]), names[team]);
@@ -176,7 +183,7 @@ function finish() {
   if (isMatch()) {
     const winner = settings.teams.findIndex((_, team) => outcome[`team${team}/win`] > 0.5);
     if (winner >= 0) scores.wins[winner] += 1;
-    const [marks, name] = winner < 0 ? [[], ''] : [settings.teams[winner].map(dot), `Team ${winner + 1} wins`];
+    const [marks, name] = winner < 0 ? [[], ''] : [dots(settings.teams[winner]), `Team ${winner + 1} wins`];
     const own = winner >= 0 && page.drive !== '' && (isOwn(settings.teams[winner]) ? 'You win' : 'You lose');
     said.replaceChildren(...marks, (own || name || 'Draw') + reason);
   } else {
@@ -204,15 +211,18 @@ function show() {
   shown = score;
   const named = (robots, name) => {
     const label = make('span', { className: 'who' });
-    label.append(...robots.map(dot), isOwn(robots) ? `${name} (you)` : name);
+    label.append(...dots(robots), isOwn(robots) ? `${name} (you)` : name);
     return label;
   };
   const { teams, robots } = settings;
   const agents = teams.flat();
   const scripted = robots.map((_, i) => i).slice(agents.length);
+  const mates = agents.length > NAMED
+    ? [named(agents, `${agents.length} robots`)]
+    : agents.map((i) => named([i], `robot ${i + 1}`));
   const sides = isMatch()
     ? teams.map((team, i) => named(team, `team ${i + 1}`))
-    : [...agents.map((i) => named([i], `robot ${i + 1}`)), ...scripted.map((i) => named([i], 'scripted'))];
+    : [...mates, ...scripted.map((i) => named([i], 'scripted'))];
   element('score').replaceChildren(...(isMatch() ? [sides[0], score, sides[1]] : [...sides, score]));
 }
 
