@@ -200,7 +200,7 @@ class Missing:
             raise ModuleNotFoundError("No module named 'warp'")
 sys.meta_path.insert(0, Missing())
 from mqe_jax.cli import main
-assert main(["tasks"]) == 0 and main(["tasks", "--json"]) == 0
+assert main(["tasks"]) == 0 and main(["tasks", "--long"]) == 0 and main(["tasks", "--json"]) == 0
 for command in ("eval gogate", "view gogate", "render gogate -o a.gif", "bench gogate", "train gogate", "evl go1gate"):
     assert main(command.split()) == 2
 for command in ("train go1gate --sed 1", "train go1gate --config demo --ppo.epoch 3", "train go1gate --config nobody",
@@ -219,10 +219,13 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     done = subprocess.run([sys.executable, "-W", "error", "-c", START], capture_output=True, text=True, check=True)
     first, *lines, last, late, name = done.stdout.splitlines()
     assert "Failed" not in done.stdout and (late, name) == ("set()", "mujoco.mjx")
-    assert first.startswith("The tasks with default parameters") and json.loads(last)["tasks"][0]["task"] == "go1plane"
-    rows = {line.split()[0]: line.split() for line in lines if line.startswith("go1")}
-    assert rows["go1gate"][-1] == "shipped" and rows["go1plane"][-1] == "none"
-    assert rows["go1football-2vs2"][5:8] == ["2", "vs", "2"] and max(map(len, lines)) <= 80
+    assert first.split() == ["task", "title", "robots", "time,", "s"]
+    assert json.loads(last)["tasks"][0]["task"] == "go1plane" and max(map(len, lines)) <= 80
+    rows = [line.split() for line in lines if line.startswith("go1")]
+    short, long = ({row[0]: row for row in half} for half in (rows[:13], rows[13:]))
+    assert short["go1gate"] == ["go1gate", "Narrow", "Gate", "2", "10"]
+    assert long["go1gate"] == ["go1gate", "2", "10", "16", "93", "shipped"] and long["go1plane"][-1] == "none"
+    assert long["go1football-2vs2"][1:4] == ["2", "vs", "2"]
     errors = [line for line in done.stderr.splitlines() if line.startswith("mqe: ")]
     assert len(errors) == 7 and all("did you mean" in line for line in errors[:6]) and "'nobody'" in errors[6]
     assert all(f"--{flag}" in done.stderr for flag in ("seed", "ppo.epochs", "network.heads"))

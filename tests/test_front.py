@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from mqe_jax.core.types import Outcome
 from mqe_jax.runs import build, playing
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Rate, evaluate_batch
+from mqe_jax.train.evaluate import Rate, Result, evaluate_batch
 from mqe_jax.train.runner import Training
 from mqe_jax.train.stages import Stages
 from tests.fake_env import SMALL, FakeEnv, FakeVectorEnv
@@ -225,12 +226,39 @@ def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     for value, episodes in wrong:
         refuses(r"^(value|episodes): ", Rate.of, value, episodes)
     assert result.success == Rate.of(1.0, 4) and result.win is None
-    assert "success_rate                 100.0% (51.0 to 100.0%)" in str(result).splitlines()
+    assert "success               100.0   51.0 to 100.0" in str(result).splitlines()
+    assert "success_rate                 100.0% (51.0 to 100.0%)" in result.details().splitlines()
     assert "<tr><td>success_rate</td><td>100.0% (51.0 to 100.0%)</td></tr>" in result._repr_html_()
-    for more in ([], ["--json"]):
-        assert cli.main(["eval", "fake", "--policy", "forward", "--episodes", "4", *more]) == 0
-    *table, line = capfd.readouterr().out.splitlines()
-    assert table == str(result).splitlines() and json.loads(line) == result.to_dict()
+    shown = {"": str(result), "--long": result.details(), "--json": json.dumps(result.to_dict())}
+    for more, text in shown.items():
+        assert cli.main(["eval", "fake", "--policy", "forward", "--episodes", "4", *more.split()]) == 0
+        assert capfd.readouterr().out == f"{text}\n"
+
+
+def test_a_table_of_a_match_has_what_happened() -> None:
+    """Its success is its wins; causes that ended no episode and counts of faults that are zero are left out."""
+    shares = {"divergence": 0.25, "fall": 0.0, "time_limit": 0.75}
+    match = {"win_rate": 0.75, "draw_rate": 0.25, "loss_rate": 0.0}
+    about = {"policy": "runs/a_b", "actions": "mean", "opponent": "scripted", "sides": "both", "seed": 0}
+    result = Result("go1tug", 4, 0.75, 0.0, {}, 0.0, 9.5, 0, 1, shares, {"both_touched": 0.5}, match, about)
+    assert [tuple(re.split(" {2,}", row)[:2]) for row in str(result).splitlines()] == [
+        ("task", "go1tug"),
+        ("policy", "runs/a_b, mean actions"),
+        ("opponent", "scripted"),
+        ("episodes", "4, on both sides"),
+        ("",),
+        ("", "%"),
+        ("win", "75.0"),
+        ("draw", "25.0"),
+        ("loss", "0.0"),
+        ("ends by divergence", "25.0"),
+        ("ends by time limit", "75.0"),
+        ("",),
+        ("steps per episode", "9.5"),
+        ("return", "0"),
+        ("both touched", "0.5"),
+        ("diverged episodes", "1"),
+    ]
 
 
 def test_a_function_is_a_policy() -> None:

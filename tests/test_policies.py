@@ -72,6 +72,12 @@ def test_the_readme_and_the_list_have_the_rates_of_the_cards(capfd: pytest.Captu
         names = ("win/scripted", "win/idle") if task in MATCHES else ("success",)
         rates = [zoo.card(task).results[name].rate.percent for name in names]
         assert rates == shown[: len(names)] and all(rate in listed[task] for rate in rates), task
+    assert [*listed] == [row[0] for row in rows]  # as in the README
+    for words in (["--long"], ["go1tug"]):
+        assert cli.main(["zoo", *words]) == 0
+        cards = capfd.readouterr().out
+        assert max(map(len, cards.splitlines())) <= 80 and ("ends by" in cards) == (words == ["--long"])
+    assert len(re.findall("^task .*go1", cards, re.MULTILINE)) == 1
     assert cli.main(["zoo", "go1tug", "--json"]) == 0
     found = json.loads(capfd.readouterr().out)["policies"]["go1tug"]["results"]["win/scripted"]
     assert 0.0 < found["low"] < found["value"] <= found["high"] <= 1.0 and found["sides"] == "both"

@@ -11,7 +11,18 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from mqe_jax.cli.options import DumpDiverged, Impl, Json, PolicyOptions, RobotFile, Seed, TaskOptions, print_table
+from mqe_jax.cli.options import (
+    DumpDiverged,
+    Impl,
+    Json,
+    Long,
+    PolicyOptions,
+    RobotFile,
+    Seed,
+    TaskOptions,
+    print_columns,
+    print_table,
+)
 from mqe_jax.core.limits import Environments, Episodes, Horizon
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail, record
@@ -19,10 +30,9 @@ from mqe_jax.core.settings import fail, record
 _ZOO = Path(__file__).parents[1] / "policies" / "zoo"
 _RATES = {
     "Success, % of the episodes (95% interval)": {"success": "success"},
-    "Wins and losses on both sides, % (95% interval)": {
-        "win/scripted": "wins, scripted",
-        "loss/scripted": "losses, scripted",
-        "win/idle": "wins, idle",
+    "Wins, % of the matches on both sides (95% interval)": {
+        "win/scripted": "against scripted",
+        "win/idle": "against idle",
     },
 }
 """Rates of the shipped policies that `mqe zoo` lists: title of each table and its columns, by name in the cards."""
@@ -30,9 +40,10 @@ _RATES = {
 
 @record
 class Tasks:
-    """List the tasks with their agents, sizes, time limits, and whether a trained policy is shipped."""
+    """List the tasks with their robots and time limits; with --long, also the sizes of their observations."""
 
     json: Json = False
+    long: Long = False
     light: ClassVar[bool] = True
 
     def run(self) -> dict[str, Any]:
@@ -41,7 +52,6 @@ class Tasks:
 
         rows = []
         for name, task in SHIPPED.items():
-            shipped = (_ZOO / f"{name}.safetensors").is_file()
             rows.append(
                 {
                     "task": name,
@@ -51,59 +61,81 @@ class Tasks:
                     "observation": task.observation,
                     "privileged": task.privileged,
                     "time_limit_s": task.time_limit,
-                    "shipped_policy": shipped,
+                    "shipped_policy": (_ZOO / f"{name}.safetensors").is_file(),
                 }
             )
-            policy = "shipped" if shipped else "scripted" if task.planner else "none"
-            agents, size = " vs ".join(map(str, task.teams)), task.observation
-            if not self.json:
-                if len(rows) == 1:
-                    print("The tasks with default parameters; `mqe render TASK -o clip.gif` shows one.\n")
-                    print(f"{'task':<20} {'title':<18} {'agents':<6}  observation  time limit  policy")
-                print(f"{name:<20} {task.title:<18} {agents:<6}  {size:>11}  {task.time_limit:>8g} s  {policy}")
-        if not self.json:
-            print("\nobservation: numbers per agent; policy: a trained one is shipped (`mqe zoo`), or")
-            print("scripted only; actions per agent: command 3 (velocities for the walk policy),")
-            print("position 12, torque 12")
+        if self.json:
+            return {"tasks": rows}
+        columns = {
+            "task": [row["task"] for row in rows],
+            "title": [row["title"] for row in rows],
+            "robots": [" vs ".join(map(str, task.teams)) for task in SHIPPED.values()],
+            "time, s": [f"{row['time_limit_s']:g}" for row in rows],
+        }
+        if self.long:
+            del columns["title"]
+            columns |= {name: [str(row[name]) for row in rows] for name in ("observation", "privileged")}
+            columns["policy"] = ["shipped" if row["shipped_policy"] else "none" for row in rows]
+        print_columns(columns, left=2 if self.long else 3)
+        if self.long:
+            print("\nobservation: numbers that an agent sees; privileged: that a critic may see")
+        else:
+            print("\nWatch one: mqe render go1gate -o gate.gif")
         return {"tasks": rows}
 
 
 @record
 class Zoo:
-    """List the shipped policies with what they reach; of one task, how it was trained too."""
+    """List the shipped teams and how good they are; of one task, also how its team was trained."""
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
-    """Id of a task, whose policy's whole card is printed."""
+    """Id of a task, whose team's card is printed."""
     json: Json = False
+    long: Long = False
 
     def run(self) -> dict[str, Any]:
-        """Lists the cards of all shipped policies, or prints that of a task."""
+        """Lists the shipped teams, or prints the card of one, or with `long` all cards."""
+        from mqe_jax.envs.registry import SHIPPED
         from mqe_jax.policies import zoo
 
-        cards = {task: zoo.card(task) for task in (zoo.names() if self.task is None else [self.task])}
+        tasks = [name for name in SHIPPED if name in zoo.names()] if self.task is None else [self.task]
+        cards = {task: zoo.card(task) for task in tasks}
         plain = {task: _plain(card, zoo.load(task).needs) for task, card in cards.items()}
         if self.json:
             return {"policies": plain}
-        if self.task is not None:
-            card, shown = plain[self.task], {"task": self.task}
-            for name, found in cards[self.task].results.items():
-                sides = {"both": ", both sides", "first": ", first side"}.get(found.sides or "", "")
-                shown[name] = f"{found.rate}, {found.episodes} episodes{sides}"
-            shown |= {f"ends by {name}": f"{100 * share:.1f}%" for name, share in card.pop("endings").items()}
-            ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in card.pop("commands").items())
-            card["skill"] = f"{card['skill']}: {', '.join(ranges)}"
-            del card["results"]
-            for name, value in {**shown, **card}.items():
-                print(textwrap.fill(f"{name:<22} {value}", 80, subsequent_indent=" " * 23))
+        if self.task is not None or self.long:
+            for number, task in enumerate(tasks):
+                print("\n" * (number > 0), end="")
+                _print_card(task, cards[task], plain[task], self.long)
             return {}
-        for title, columns in _RATES.items():
-            print(f"{title}\n\n{'task':<20}{''.join(f'{name:>20}' for name in columns.values())}")
-            for task, card in cards.items():
-                if columns.keys() <= card.results.keys():
-                    print(f"{task:<20}{''.join(f'{card.results[name].rate.percent:>20}' for name in columns)}")
+        for title, rates in _RATES.items():
+            listed = [task for task, card in cards.items() if rates.keys() <= card.results.keys()]
+            columns = {"task": listed, "title": [SHIPPED[task].title for task in listed]}
+            columns |= {
+                text: [cards[task].results[name].rate.percent for task in listed] for name, text in rates.items()
+            }
+            print(f"{title}\n")
+            print_columns(columns, left=2)
             print()
         print("How one was trained: mqe zoo TASK")
         return {"policies": plain}
+
+
+def _print_card(task: str, card: Any, plain: dict[str, Any], long: bool) -> None:
+    """Prints a policy's card: its rates, skill and training; with `long` all fields."""
+    shown = {"task": task}
+    for name, found in sorted(card.results.items(), reverse=True):  # wins first
+        sides = {"both": ", both sides", "first": ", first side"}.get(found.sides or "", "")
+        shown[name] = f"{found.rate}, {found.episodes} episodes{sides}"
+    if long:
+        shown |= {f"ends by {name}": f"{100 * share:.1f}%" for name, share in card.endings.items()}
+    ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in plain["commands"].items())
+    shown |= {"skill": f"{plain['skill']}: {', '.join(ranges)}", "trained": card.date, "command": card.command}
+    if long:
+        minutes = "not recorded" if card.gpu_minutes is None else f"{card.gpu_minutes:g}"
+        shown |= {"note": card.note, "GPU minutes": minutes, "acts": card.mode, "task version": plain["version"]}
+    for name, value in shown.items():
+        print(textwrap.fill(f"{name:<22} {value}", 80, subsequent_indent=" " * 23, break_on_hyphens=False))
 
 
 def _plain(card: Any, needs: Any) -> dict[str, Any]:
@@ -120,6 +152,7 @@ class Eval(PolicyOptions):
     """Evaluate a trained run, or a task's shipped or scripted policy, over complete episodes from fresh resets."""
 
     json: Json = False
+    long: Long = False
     episodes: Episodes = 512
     """Number of evaluation episodes, split evenly over environments."""
     num_envs: Environments = 128
@@ -146,7 +179,7 @@ class Eval(PolicyOptions):
                 "raise --set contacts_per_robot and --set constraints_per_robot"
             )
         if not self.json:
-            print(result)
+            print(result.details() if self.long else result)
         return result.to_dict()
 
     @contextlib.contextmanager

@@ -19,6 +19,7 @@ from mqe_jax.core.settings import merge, record
 Repeated = tyro.conf.UseAppendAction
 Impl = Annotated[str, tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine, CPU).")]
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object, and nothing else, on standard output.")]
+Long = Annotated[bool, tyro.conf.arg(help="Print everything; without it only what most readers need.")]
 Seed = Annotated[settings.Seed, tyro.conf.arg(help="Random seed.")]
 Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
 PolicyName = Annotated[str | None, tyro.conf.arg(metavar="NAME|RUN|FILE")]
@@ -107,6 +108,16 @@ def print_table(values: Mapping[str, Any]) -> None:
         flat.update({f"reward/{n}": v for n, v in value.items()} if isinstance(value, Mapping) else {name: value})
     for name, value in flat.items():
         print(f"{line(name):<28} {value:.4g}" if isinstance(value, float) else f"{line(name):<28} {line(value)}")
+
+
+def print_columns(columns: Mapping[str, Sequence[str]], left: int) -> None:
+    """Prints a table from its columns by header, of which the first `left` ones are aligned on the left."""
+    padded = []
+    for number, (name, texts) in enumerate(columns.items()):
+        side, width = "<" if number < left else ">", max(map(len, (name, *texts)))
+        padded.append([f"{text:{side}{width}}" for text in (name, *texts)])
+    for row in zip(*padded, strict=True):
+        print("  ".join(row).rstrip())
 
 
 @contextlib.contextmanager

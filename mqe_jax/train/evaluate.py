@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -143,12 +144,41 @@ class Result:
                 found[name] = f"{value:.4g}" if isinstance(value, float) else line(value)
         return found
 
-    def __repr__(self) -> str:
+    def details(self) -> str:
+        """Returns all results, one a line."""
         return "\n".join(f"{name:<28} {text}" for name, text in self.rows().items())
+
+    def __repr__(self) -> str:
+        about = {name: str(self.about[name]) for name in ("policy", "opponent") if name in self.about}
+        if "actions" in self.about:
+            about["policy"] += f", {self.about['actions']} actions"
+        sides = ", on both sides" if self.about.get("sides") == "both" else ""
+        who = {"task": self.task, **about, "episodes": f"{self.episodes}{sides}"}
+        hidden = {f"ending/{name}" for name, share in self.endings.items() if share == 0}
+        rates = {name: rate for name, rate in self.rates.items() if name not in hidden}
+        if self.match:
+            del rates["success_rate"]  # that of `win`
+        rates = {_plain_words(name): rate for name, rate in rates.items()}
+        outcomes = {_plain_words(name): mean for name, mean in self.outcomes.items()}
+        means = {"steps per episode": self.episode_length, "return": self.episode_return, **outcomes}
+        faults = {"diverged episodes": self.diverged, "overflowing steps": self.overflow}
+        means |= {name: count for name, count in faults.items() if count}
+        wide = max(20, *map(len, rates))
+        lines = [f"{name:<{wide}} {line(text)}" for name, text in who.items()]
+        lines += ["", f"{'':{wide}} {'%':>6}   95% interval"]
+        for name, (value, low, high) in rates.items():
+            lines.append(f"{line(name):<{wide}} {100 * value:>6.1f}   {100 * low:.1f} to {100 * high:.1f}")
+        return "\n".join([*lines, "", *(f"{line(name):<{wide}} {value:>6.4g}" for name, value in means.items())])
 
     def _repr_html_(self) -> str:
         cells = ((to_html(name), to_html(text)) for name, text in self.rows().items())
         return "<table>" + "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in cells) + "</table>"
+
+
+def _plain_words(name: str) -> str:
+    """Returns the name of a result as its table shows it; a population's members keep theirs."""
+    short = re.sub("_rate$|_rate(?=/)", "", name).replace("ending/", "ends by ")
+    return short if short.startswith("win/") else short.replace("_", " ")
 
 
 def pool(results: Mapping[str, Result], opponent: str) -> Result:
