@@ -47,6 +47,24 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
+def test_pictures_on_pages_have_alternative_texts() -> None:
+    texts = [text for page in NAMES for text in re.findall(r"!\[([^\]]*)\]\(", read(page))]
+    assert len(texts) > 20 and all(len(text.split()) >= 4 for text in texts)
+
+
+def test_drawings_are_made_from_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every drawing is on a page, and drawing twice gives the same bytes."""
+    drawings = importlib.import_module("drawings")
+    pages = "".join(map(read, NAMES))
+    published = {file.stem for file in (ROOT / "docs" / "drawings").iterdir()}
+    assert published == {*drawings.DRAWINGS} and all(f"drawings/{name}.svg" in pages for name in published)
+    monkeypatch.setattr(drawings, "DRAWINGS", {name: drawings.DRAWINGS[name] for name in ("observation", "league")})
+    for folder in ("a", "b"):
+        drawings.main(tmp_path / folder)
+    for file in (tmp_path / "a").iterdir():
+        assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
+
+
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Trainings of two updates and episodes of 20 steps, of examples as a user writes them, in an empty folder.

@@ -1,0 +1,307 @@
+"""Draws the pictures of docs/drawings from the code, the settings and results/.
+
+`python tools/drawings.py [FOLDER [png]]` draws all of them. The same versions of the package and of matplotlib write
+the same bytes.
+"""
+
+import csv
+import gzip
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
+
+import mqe_jax
+from mqe_jax.core.files import replacing
+from mqe_jax.envs.match import Match
+from mqe_jax.runs.build import base_config
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs" / "drawings"
+WIDTH = 640  # px, of every drawing; a phone shows it at half the size
+INK, FAINT, LINE = "#23252b", "#5f6672", "#8a93a3"
+BLUE, ORANGE, GREEN, VIOLET, GREY = "#2f7fd6", "#d9731a", "#2e8b57", "#7a55c7", "#6b7280"
+
+Size: TypeAlias = tuple[float, float]
+Point: TypeAlias = Size | np.ndarray
+
+
+def canvas(height: float) -> tuple[Figure, Axes]:
+    """Returns an empty drawing whose coordinates are pixels, with the origin at the lower left."""
+    figure = Figure((WIDTH / 100, height / 100))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, WIDTH), ylim=(0, height))
+    axes.set_axis_off()
+    return figure, axes
+
+
+def write(axes: Axes, at: Point, text: str, size: float = 11, color: str = INK, **look: object) -> None:
+    """Writes a text, by default centred on a point."""
+    style = {"ha": "center", "va": "center", "linespacing": 1.35} | look
+    axes.text(at[0], at[1], text, fontsize=size, color=color, **style)  # pyright: ignore[reportArgumentType]
+
+
+def box(axes: Axes, corner: Size, size: Size, title: str, body: str, color: str, room: str = "") -> None:
+    """Draws a box with a title, what it does, and the folder of its code."""
+    (x, y), (width, height) = corner, size
+    style = FancyBboxPatch((x, y), width, height, "round,pad=0,rounding_size=8", fc=f"{color}18", ec=color, lw=1.6)
+    axes.add_patch(style)
+    write(axes, (x + 12, y + height - 24), title, 14, color, ha="left", va="baseline", weight="bold")
+    write(axes, (x + 12, y + height - 38), body, 10.5, ha="left", va="top")
+    write(axes, (x + width - 10, y + height - 24), room, 9.5, FAINT, ha="right", va="baseline", family="monospace")
+
+
+def arrow(axes: Axes, start: Point, end: Point, color: str = INK, **look: object) -> None:
+    """Draws an arrow."""
+    style = {"arrowstyle": "-|>", "mutation_scale": 15, "lw": 1.8, "shrinkA": 0, "shrinkB": 0} | look
+    axes.add_patch(FancyArrowPatch(start, end, color=color, **style))  # pyright: ignore[reportArgumentType]
+
+
+def robot(axes: Axes, pose: tuple[float, float, float], color: str, scale: float, name: str = "") -> None:
+    """Draws a robot from above, at x, y and yaw; `scale` is the length of its trunk."""
+    x, y, yaw = pose
+    outline = np.array([[-0.5, -0.25], [0.25, -0.25], [0.55, 0], [0.25, 0.25], [-0.5, 0.25]]) * scale
+    turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    axes.add_patch(Polygon(outline @ turn + (x, y), fc=color, ec="white", lw=1.2, zorder=4))
+    if name:
+        write(axes, (x, y), name, 9, "white", weight="bold", zorder=5)
+
+
+def architecture() -> Figure:
+    """The loop of an environment step through four of the six boxes, and what training adds."""
+    figure, axes = canvas(560)
+    left, right, size = 16, 404, (220, 112)
+    top, middle, bottom = 436, 256, 76
+    boxes = (
+        (left, top, "Learner", "train/", VIOLET, "PPO: improves the policy.\nKnows no task, no robot,\nno physics."),
+        (
+            right,
+            top,
+            "Opponents",
+            "selfplay/",
+            VIOLET,
+            "Act for the other team:\nscripted, trained, or\nearlier versions.",
+        ),
+        (left, middle, "Policy", "policies/", BLUE, "A robot's observation\nto its action, which lies\nin [-1, 1]."),
+        (right, middle, "Skill", "skills/", BLUE, "A frozen network turns\nvelocity commands into\njoint targets."),
+        (left, bottom, "Task", "envs/", GREEN, "Scene, observation,\nrewards, and when an\nepisode ends."),
+        (right, bottom, "Engine", "physics/", GREEN, "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."),
+    )
+    for x, y, title, room, color, body in boxes:
+        box(axes, (x, y), size, title, body, color, room)
+    inner, mid, down = left + size[0], WIDTH / 2, right + 70
+    arrows = (  # from, to, what, where that is written, whether to the left, the middle or the right
+        ((inner, middle + 56), (right, middle + 56), BLUE, "actions", (mid, middle + 70), "center"),
+        ((down, middle), (down, bottom + 112), BLUE, "joint targets", (down + 10, 222), "left"),
+        ((right, bottom + 56), (inner, bottom + 56), GREEN, "poses, velocities,\ncontacts", (mid, 156), "center"),
+        ((left + 150, bottom + 112), (left + 150, middle), GREEN, "observations", (left + 140, 222), "right"),
+        (
+            (left + 40, middle + 112),
+            (left + 40, top),
+            VIOLET,
+            "observations,\nactions, rewards",
+            (left + 50, 402),
+            "left",
+        ),
+        ((left + 190, top), (left + 190, middle + 112), VIOLET, "weights", (left + 200, 402), "left"),
+        ((inner, top + 56), (right, top + 56), VIOLET, "copies", (mid, top + 70), "center"),
+        ((down, top), (down, middle + 112), VIOLET, "actions of the\nother team", (down + 10, 402), "left"),
+    )
+    for start, end, color, text, at, side in arrows:
+        loop = color != VIOLET
+        arrow(axes, start, end, color, lw=2.6 if loop else 1.8)
+        write(axes, at, text, 11, color, ha=side, weight="bold" if loop else "normal")
+    write(axes, (mid, 228), "one environment\nstep: 20 ms", 11.5, INK, weight="bold")
+    note = "The loop is a pure function of one environment. jax.vmap makes thousands of it,\n"
+    note += "and jax.jit compiles an update into one program, the loop included."
+    write(axes, (mid, 34), note, 10.5, FAINT)
+    return figure
+
+
+def observation() -> Figure:
+    """What agent 0 of Narrow Gate observes: the scene with its frame, and the numbers by block."""
+    env = mqe_jax.make("go1gate", impl="c")
+    figure, axes = canvas(480)
+    scale, origin = 100, (24, 310)
+    at = lambda x, y: (origin[0] + scale * x, origin[1] + scale * y)  # noqa: E731
+    colors = {"one_hot": GREY, "base": BLUE, "teammate": ORANGE, "gate": GREEN}
+    width = env.params.track_width
+    axes.add_patch(Rectangle(at(0, -width / 2), 6 * scale - 8, width * scale, fc="#f4f5f7", ec=LINE, lw=1))
+    gate = (3.5, 0.3)
+    for wall in env.compiled.layout.walls:
+        x, y, _ = np.add(wall.center, (*gate, 0))
+        low, high = max(y - wall.size[1] / 2, -width / 2), min(y + wall.size[1] / 2, width / 2)
+        axes.add_patch(
+            Rectangle(at(x - wall.size[0] / 2, low), wall.size[0] * scale, (high - low) * scale, fc="#c9ced6")
+        )
+    own, mate = (1.3, -0.65, 0.35), (1.9, 0.75, -0.1)
+    for pose, color, name in ((own, BLUE, "0"), (mate, ORANGE, "1")):
+        robot(axes, (*at(*pose[:2]), pose[2]), color, 60, name)
+    axes.plot(*at(*gate), "o", color=GREEN, ms=9)
+    start = at(0, 0)
+    for point, color in ((own, BLUE), (mate, ORANGE), (gate, GREEN)):
+        axes.plot(*zip(start, at(*point[:2]), strict=True), color=color, ls=(0, (4, 3)), lw=1.4)
+    for tip, name, beside in ((at(0.75, 0), "x", (12, 0)), (at(0, 0.75), "y", (0, 14))):
+        arrow(axes, start, tip, INK, lw=2.2)
+        write(axes, np.add(tip, beside), name, 12, weight="bold")
+    write(axes, at(0.12, 0.84), "environment frame", 10, FAINT, ha="left")
+    write(axes, at(1.3, -1.2), "agent 0, which observes", 11, BLUE, weight="bold")
+    write(axes, at(1.9, 1.2), "agent 1, its teammate", 11, ORANGE, weight="bold")
+    write(axes, at(3.7, 0.3), "centre of the gap", 11, GREEN, weight="bold", ha="left")
+    names = {
+        "one_hot": ["1", "0"],
+        "base": ["x", "y", "z", "roll", "pitch", "yaw"],
+        "teammate": ["x", "y", "z", "roll", "pitch", "yaw"],
+        "gate": ["x", "y"],
+    }
+    blocks = env.observation_layout.blocks
+    assert {block.name: block.width for block in blocks} == {name: len(cells) for name, cells in names.items()}
+    cell, x = 37, 24
+    for block in blocks:
+        color = colors[block.name]
+        write(axes, (x + cell * block.width / 2, 116), block.name, 11, color, family="monospace", weight="bold")
+        for text in names[block.name]:
+            axes.add_patch(Rectangle((x, 66), cell, 38, fc=f"{color}22", ec=color, lw=1.2))
+            write(axes, (x + cell / 2, 82), text, 9.5, va="baseline")
+            x += cell
+    total = f"The observation of agent 0: {env.observation_size} numbers, in m and rad.\n"
+    total += "Agent 1 has 0 1 in front, and itself before its teammate."
+    write(axes, (WIDTH / 2, 32), total, 10.5, FAINT)
+    return figure
+
+
+def match_frames() -> Figure:
+    """One moment of two matches, as each team observes it: after a half turn, and after a reflection."""
+    figure, axes = canvas(590)
+    football, door = ((4.6, 1.9, -0.5), (10.2, -0.6, 2.9)), ((1.4, -0.55, 0.5), (0.95, 0.85, 0.1))
+    rows = (
+        ("go1football-1vs1", "Football: team 1 sees the field after a half turn", 572, 350, 22.0, football),
+        ("go1revolvingdoor", "Revolving Door: team 1 sees the field reflected", 280, 76, 51.0, door),
+    )
+    for name, title, top, bottom, scale, poses in rows:
+        env = mqe_jax.make(name, impl="c")
+        assert isinstance(env, Match)
+        write(axes, (WIDTH / 2, top), title, 12, weight="bold")
+        for team in (0, 1):
+            _seen_by(axes, env, team, poses, (16 + team * 316, bottom), scale)
+    write(axes, (WIDTH / 2, 26), "Each team finds itself on the same side, so one policy can play both.", 11, FAINT)
+    return figure
+
+
+def _seen_by(axes: Axes, env: Match, team: int, poses: Sequence[Sequence[float]], corner: Size, scale: float) -> None:
+    """Draws a match for two from above in the frame of a team; `poses` are x, y, yaw in the frame of team 0."""
+    (length, width) = (float(np.ptp([x.point[i] for x in env.compiled.layout.barriers])) for i in (0, 1))
+    at = lambda point: (corner[0] + scale * point[0], corner[1] + scale * (point[1] + width / 2))  # noqa: E731
+    seen = lambda x, y: np.asarray(env.view_points(jnp.array([x, y, 0.0])))[team, :2]  # noqa: E731
+    axes.add_patch(Rectangle(corner, length * scale, width * scale, fc="#eef2ee", ec=LINE, lw=1))
+    for wall in env.compiled.layout.walls:
+        x, y = np.add(wall.center[:2], env.compiled.layout.anchors[wall.anchor or 0].position)
+        middle, size = at(seen(x, y)), np.array(wall.size[:2]) * scale
+        axes.add_patch(Rectangle((middle - size / 2).tolist(), *size, fc="#c9ced6"))
+    if "ball" in env.objects:
+        axes.plot(*at(seen(6.6, 1.2)), "o", color="white", mec=INK, ms=8, zorder=5)
+    if "door" in env.objects:
+        tips = [at(seen(2.6 + 0.97 * np.sin(0.5) * sign, 0.97 * np.cos(0.5) * sign)) for sign in (-1, 1)]
+        axes.plot(*zip(*tips, strict=True), color=INK, lw=4, solid_capstyle="round")
+    info = jnp.array([(x, y, 0.3, 0.0, 0.0, yaw) for x, y, yaw in poses])
+    for number, (x, y, _, _, _, yaw) in enumerate(np.asarray(env.views(info))[team]):
+        robot(axes, (*at((x, y)), yaw), (BLUE, ORANGE)[number], 44)
+        name = "self" if number == team else "opponent"
+        write(axes, np.add(at((x, y)), (0, -26)), name, 10.5, (BLUE, ORANGE)[number], weight="bold")
+    color = (BLUE, ORANGE)[team]
+    start = np.add(corner, (10 if "ball" in env.objects else 210, 10))
+    for along, name in ((np.array([34, 0]), "x"), (np.array([0, 34]), "y")):
+        arrow(axes, start, start + along, mutation_scale=10)
+        write(axes, start + 1.3 * along, name, 10, weight="bold")
+    write(axes, np.add(corner, (length * scale / 2, -15)), f"as team {team} observes it", 11, color, weight="bold")
+
+
+def league() -> Figure:
+    """Whom a policy meets in a league: itself, its earlier versions, and fixed opponents, in equal shares."""
+    config = base_config("go1tug", "league")
+    steps, quarter = (share * config.league.snapshot_steps / 1e6 for share in (1, 0.25))
+    own = {"newest": BLUE, "older": VIOLET, "uniform": VIOLET}
+    names = sorted(config.opponents, key=lambda name: [*own].index(name) if name in own else -1)
+    figure, axes = canvas(450)
+    row, top, left, width = 34, 392, 226, 150
+    write(axes, (left + width / 2, top + 22), f"{config.num_envs} matches at once", 12, weight="bold")
+    for number, name in enumerate(names):
+        color, y = own.get(name, GREEN), top - row * (number + 1)
+        axes.add_patch(Rectangle((left, y + 3), width, row - 6, fc=f"{color}22", ec=color, lw=1.2))
+        write(axes, (left + width / 2, y + row / 2), f"against {name}", 10.5, color)
+    box(axes, (16, 40), (150, 346), "Policy", "plays team 0\nand learns", BLUE)
+    right = 424
+    pool = f"{config.league.members} earlier versions.\nolder: one that it beats\nless often than others\n"
+    pool += "uniform: any of them"
+    count = sum(name not in own for name in names)
+    ends = {
+        GREEN: ("Fixed opponents", "scripted, idle, random,\nor a trained team\nfrom a file", 252, 134, range(count)),
+        BLUE: ("The policy itself", "as it is now", 184, 60, [count]),
+        VIOLET: ("Pool", pool, 26, 150, range(count + 1, len(names))),
+    }
+    for color, (title, body, bottom, height, rows) in ends.items():
+        box(axes, (right, bottom), (200, height), title, body, color)
+        for number in rows:
+            y = top - row * (number + 0.5)
+            arrow(axes, (right, min(y, bottom + height - 10)), (left + width, y), color, lw=1.3, mutation_scale=10)
+    arrow(axes, (166, 270), (left, 270), BLUE)
+    write(axes, (196, 284), "acts", 10.5, BLUE)
+    arrow(axes, (left, 210), (166, 210), BLUE)
+    write(axes, (196, 224), "learns", 10.5, BLUE)
+    arrow(axes, (166, 56), (right, 56), VIOLET)
+    note = f"a copy every {steps:g} M steps,\nor every {quarter:g} M while it wins\n"
+    note += f"{100 * config.league.snapshot_win_rate:.0f}% against the pool"
+    write(axes, (295, 90), note, 10, VIOLET)
+    return figure
+
+
+def curves() -> Figure:
+    """Success in evaluations during trainings with tuned settings, of each seed and their mean."""
+    with gzip.open(ROOT / "results" / "paper" / "evaluations.csv.gz", "rt", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if (row["variant"], row["kind"]) == ("tuned", "training")]
+    figure = Figure((WIDTH / 100, 2.8), layout="constrained")
+    titles = {"go1gate": "Narrow Gate", "go1pushbox": "Push Box"}
+    for axes, (task, title) in zip(figure.subplots(1, len(titles), sharey=True), titles.items(), strict=True):
+        own = [row for row in rows if row["task"] == task]
+        table: dict[float, list[float]] = {}
+        for seed in sorted({row["seed"] for row in own}):
+            points = [
+                (float(x["env_steps"]) / 1e6, 100 * float(x["sampled/success_rate"])) for x in own if x["seed"] == seed
+            ]
+            axes.plot(*zip(*points, strict=True), color=BLUE, alpha=0.35, lw=1.2)
+            for step, success in points:
+                table.setdefault(step, []).append(success)
+        axes.plot([*table], [np.mean(values) for values in table.values()], color=BLUE, lw=2.4)
+        axes.set_title(title, fontsize=12, color=INK, loc="left", weight="bold")
+        axes.set_xlabel("environment steps, millions", fontsize=10.5)
+        axes.set(xlim=(0, 41), ylim=(0, 102))
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].plot([], [], color=BLUE, alpha=0.35, lw=1.2, label="one seed")
+    figure.axes[0].plot([], [], color=BLUE, lw=2.4, label="mean of three")
+    figure.axes[0].legend(loc="lower right", frameon=False, fontsize=10)
+    figure.axes[0].set_ylabel("success, % of the episodes", fontsize=10.5)
+    return figure
+
+
+DRAWINGS: dict[str, Callable[[], Figure]] = {
+    each.__name__: each for each in (architecture, observation, match_frames, league, curves)
+}
+
+
+def main(folder: Path = FOLDER, form: str = "svg") -> None:
+    """Writes all drawings into a folder, as svg or png files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, draw in DRAWINGS.items():
+        with matplotlib.rc_context({"svg.hashsalt": name}), replacing(folder / f"{name}.{form}") as temporary:
+            draw().savefig(temporary, format=form, metadata={"Date": None} if form == "svg" else {})
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER, *sys.argv[2:3])
