@@ -1,71 +1,52 @@
-"""Draws the figures and fills the tables of docs/results/paper.md from published runs; called by tools/publish.py.
+"""Draws the figure and fills the tables of docs/results/paper.md from published runs; called by tools/publish.py.
 
 The text between `<!-- begin NAME -->` and `<!-- end NAME -->` is replaced; NAME is one of those in `sections`.
 """
 
 import io
-import json
 import math
 import re
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
-from mqe_jax.study.estimates import Cells, aggregate_tables, evaluated, final_rows, group
-from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles, draw_terms
+from mqe_jax.study.estimates import Cells, Rows, aggregate_tables, estimate, final_rows, group
+from mqe_jax.study.figures import draw_curves
 from mqe_jax.study.report import markdown
-from mqe_jax.study.runs import Cell, Reference, Run, load_reference
+from mqe_jax.study.runs import Reference, Run, load_reference, table
+from mqe_jax.study.statistics import interquartile_mean
 
-PAPER, SCRATCH, TUNED = "hierarchical", "scratch", "tuned"
-"""Variants: the paper's settings with the walk policy, the same from scratch, and those of configs/tuned.yaml."""
-SHAPED = (TUNED, "no-curriculum", "plain-network", "plain-curriculum", "shaped", "shaped-tuned", "unshaped")
-"""The tuned settings and changes of them; their training rewards may include shaping."""
-GATE_TERMS = {"reward/approach": "Distance to Target Reward", "reward/success": "Success Reward"}
-"""Terms of the paper's appendix figure of Narrow Gate (MAPPO), by column; it ends at `GATE_STEPS`."""
-GATE_STEPS = 20_000_000
+PAPER, SCRATCH = "hierarchical", "scratch"
+"""Variants: the paper's settings with the walk policy, and the same from scratch."""
 MIN_SEEDS = 3
 """Seeds that a verdict requires: the interval of a single seed is a point."""
 
 
 def update(runs: Sequence[Run], folder: Path, page: Path) -> None:
-    """Writes the page's figures, and fills its tables, with the paper's values in FOLDER/reference.yaml."""
+    """Writes the page's figure and tables, and every estimate into CSV files of FOLDER.
+
+    FOLDER/reference.yaml has the paper's values.
+    """
     reference = load_reference(folder / "reference.yaml")
     cells = group(runs, reference)
-    for name, figure in figures(cells, reference).items():
-        content = reduced(figure)
-        if not (path := page.parent / name).is_file() or path.read_bytes() != content:
-            write_atomically(path, content)
-    text = filled(page.read_text(encoding="utf-8"), sections(cells, reference, folder))
-    write_atomically(page, text.encode())
+    drawn = of(cells, reference.values)
+    figure = reduced(draw_curves(drawn, reference))
+    if not (path := page.parent / "curves.png").is_file() or path.read_bytes() != figure:
+        write_atomically(path, figure)
+    estimates = estimated(cells, reference)
+    for name, rows in {"estimates": estimates, **aggregate_tables(drawn)}.items():
+        write_atomically(folder / f"{name}.csv", table(rows).encode())
+    write_atomically(page, filled(page.read_text(encoding="utf-8"), sections(estimates)).encode())
 
 
 def of(cells: Cells, variants: Container[str]) -> Cells:
     """Returns the cells of some variants."""
     return {cell: runs for cell, runs in cells.items() if cell.variant in variants}
-
-
-def figures(cells: Cells, reference: Reference) -> dict[str, bytes]:
-    """Returns the page's figures as PNG, by file name: curves of the paper's variants, evaluations of `SHAPED`."""
-    drawn, others = of(cells, reference.values), of(cells, SHAPED)
-    return {
-        "curves.png": draw_curves(drawn, reference),
-        "evaluations.png": draw_evaluations(
-            {cell: others[cell] for cell in evaluated(others)},
-            reference,
-            background={c: runs for c, runs in drawn.items() if (c.variant, c.algorithm) == (PAPER, "mappo")},
-            background_label="MAPPO, paper's settings",
-            best={task: max(values.values()) for task, values in reference.values[PAPER].items()},
-            best_label="paper's best, after 40 M steps",
-        ),
-        "profiles.png": draw_profiles(drawn, reference),
-        "gate_terms.png": draw_terms(
-            cells[Cell("go1gate", "mappo", PAPER)], GATE_TERMS, "Narrow Gate, MAPPO", GATE_STEPS
-        ),
-    }
 
 
 def reduced(png: bytes) -> bytes:
@@ -85,37 +66,55 @@ def filled(text: str, contents: Mapping[str, str]) -> str:
     return text
 
 
-def sections(cells: Cells, reference: Reference, folder: Path) -> dict[str, str]:
+def estimated(cells: Cells, reference: Reference) -> Rows:
+    """Returns final values of all cells: those of `final_rows`, success with mean actions, and the verdict."""
+    rows = final_rows(cells, reference)
+    for row, runs in zip(rows, cells.values(), strict=True):
+        values = [(run.absolute or {"deterministic": {}})["deterministic"].get("success_rate") for run in runs]
+        known = np.array(values, np.float64)[:, None]
+        three = estimate(interquartile_mean, known) if np.isfinite(known).all() else (math.nan,) * 3
+        row |= dict(zip(("mean", "mean_low", "mean_high"), map(float, three), strict=True))
+        row["ours"] = verdict(row)
+    return rows
+
+
+def sections(estimates: Rows) -> dict[str, str]:
     """Returns the generated sections of the page by name: Markdown tables."""
-    fresh = json.loads((folder.parent / "measurements.json").read_text(encoding="utf-8"))["paper/fresh_episodes"]
-    rows = final_rows(of(cells, (*reference.values, *SHAPED)), reference)
-    for row in rows:
-        task, variant = row["task"], row["variant"]
-        best = max(reference.values[PAPER][task].values())
-        row["paper"] = best if variant in SHAPED else reference.value(variant, task, row["algorithm"])
-        row["ours"] = verdict(row, "training" if variant in reference.values else "absolute")
-        seeds = sorted(fresh["tasks"][task].items()) if variant == TUNED else []
-        row["fresh"] = ", ".join(f"{100 * seed['success_rate']:.1f}" for _, seed in seeds) + "%" * bool(seeds)
-    cell = {"task": "task", "algorithm": "algorithm", "seeds": "seeds"}
-    reward = {"training": "average step reward", "paper": "paper"}
-    absolute = {"ours": "ours is", "absolute": "best checkpoint", "success": "success rate"}
-    made = {
-        **{v: markdown([r for r in rows if r["variant"] == v], cell | reward | absolute) for v in (PAPER, SCRATCH)},
-        "aggregates": "\n\n".join(markdown(table) for table in aggregate_tables(of(cells, reference.values)).values()),
-        TUNED: markdown(
-            [row for row in rows if row["variant"] in SHAPED],
-            cell
-            | {"variant": "settings", "absolute": "best checkpoint", "paper": "paper's best", "ours": "ours is"}
-            | {"success": "success rate", "fresh": "success rate, 512 fresh episodes"},
-        ),
+    rewards, scratch = ([row for row in estimates if row["variant"] == name] for name in (PAPER, SCRATCH))
+    solved = {row["task"] for row in rewards if row["mean_high"] > 0}
+    names = {"task": "task", "algorithm": "algorithm", "training": "average step reward", "reference": "paper"}
+    return {
+        PAPER: pivot(rewards, {"training": "{}", "reference": "{}, paper"}),
+        SCRATCH: markdown(scratch, names | {"ours": "ours is"}),
+        "success": pivot([row for row in rewards if row["task"] in solved], {"success": "{}", "mean": "{}, mean"}),
     }
-    return {name: text.replace("| below", "| **below**") for name, text in made.items()}
 
 
-def verdict(row: Mapping[str, Any], column: str) -> str:
-    """Returns where a column's estimate and interval lie relative to the paper's value; empty for too few seeds."""
-    middle, low, high, value = row[column], row[f"{column}_low"], row[f"{column}_high"], row["paper"]
-    if row["seeds"] < MIN_SEEDS or not math.isfinite(middle):
+def pivot(rows: Rows, columns: Mapping[str, str]) -> str:
+    """Returns a Markdown table with a line per task and `columns` of each algorithm: their headings, by its name."""
+    heads = [
+        head.format(name.upper())
+        for name in dict.fromkeys(row["algorithm"] for row in rows)
+        for head in columns.values()
+    ]
+    lines = [["task", *heads], ["---"] * (1 + len(heads))]
+    for task in dict.fromkeys(row["task"] for row in rows):
+        lines.append([task, *(cell(row, name) for row in rows if row["task"] == task for name in columns)])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def cell(row: Mapping[str, Any], name: str) -> str:
+    """Returns a value with its interval, success in %; bold is a reward whose interval is above the paper's value."""
+    form = "{:.3g}" if name in ("training", "reference") else "{:.1%}"
+    values = [form.format(row[key]).rstrip("%") for key in (name, f"{name}_low", f"{name}_high") if key in row]
+    text = values[0] if len(values) == 1 else "{} [{}, {}]".format(*values)
+    return f"**{text}**" if name == "training" and row["ours"] == "above" else text
+
+
+def verdict(row: Mapping[str, Any]) -> str:
+    """Returns where the reward and its interval lie relative to the paper's value; empty for too few seeds."""
+    middle, low, high, value = row["training"], row["training_low"], row["training_high"], row["reference"]
+    if row["seeds"] < MIN_SEEDS or not math.isfinite(value):
         return ""
     if middle > value:
         return "above" if low > value else "above, within the interval"

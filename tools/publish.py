@@ -1,8 +1,8 @@
-"""Publishes sweeps: curves and evaluations as two compressed tables, and the page with their figures.
+"""Publishes sweeps: curves and evaluations as two compressed tables, and the page with their figure.
 
 `python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and evaluations.csv.gz in
-results/paper, thinned. It then regenerates the figures and tables of docs/results/paper.md from results/ alone; without
-a SWEEP only this.
+results/paper, thinned. It then regenerates the figure and tables of docs/results/paper.md, and the estimates in
+results/paper, from results/ alone; without a SWEEP only this.
 
 `python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into results/measurements.json under NAME.
 """

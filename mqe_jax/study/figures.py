@@ -1,4 +1,4 @@
-"""Figures of a study as PNG: learning curves, evaluations during training, profiles, terms of the reward."""
+"""Figures of a study as PNG: learning curves, evaluations during training, profiles."""
 
 import io
 import itertools
@@ -74,40 +74,22 @@ def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
         axes.axhline(value, color=_COLORS.get(name, _INK), lw=1.0, ls=_DASHES, alpha=0.8)
 
 
-def draw_evaluations(
-    cells: Cells,
-    reference: Reference,
-    *,
-    background: Cells | None = None,
-    background_label: str = "",
-    best: Mapping[str, float] | None = None,
-    best_label: str = "",
-) -> bytes:
+def draw_evaluations(cells: Cells, reference: Reference) -> bytes:
     """Returns the evaluations during training, of the unmodified task with sampled actions: a panel for each task.
 
-    Every panel has its own legend. `background` has at most one cell for each task, drawn pale. Dashed lines are
-    the values in `best`, by task.
+    Every panel has its own legend.
     """
-    background, best = background or {}, best or {}
-    tasks = names(cells, "task")
+    tasks, chosen = names(cells, "task"), evaluated(cells)
     figure = _figure(max(5.0, 3.7 * min(2, len(tasks))), 2.7 * -(-len(tasks) // 2) + 0.6)
-    pale = {cell.task: runs for cell, runs in evaluated(background).items()}
-    chosen = evaluated(cells)
     for axes, task in _panels(figure, tasks):
-        if task in pale:
-            _draw_band(axes, pale[task], _PALE, "")
         drawn = [cell for cell in chosen if cell.task == task]
         for cell, color in zip(drawn, itertools.cycle(_COLORS_OF_VARIANTS)):
             _draw_band(axes, chosen[cell], color, f"{cell.algorithm.upper()}, {cell.variant}")
-        if task in best:
-            _draw_values(axes, {"best": best[task]})
         _style_axes(axes, reference.tasks.get(task, task))
         if drawn:
             bottom, top = axes.get_ylim()
             axes.set_ylim(bottom, top + 0.09 * len(drawn) * (top - bottom))  # room for the legend
             axes.legend(frameon=False, fontsize=6.5, loc="upper left")
-    if pale or best:
-        _key(figure, {background_label: _PALE} if pale else {}, best_label if best else None)
     return _png(figure)
 
 
@@ -157,17 +139,4 @@ def draw_profiles(cells: Cells, reference: Reference) -> bytes:
         axes.set_xlabel("score, fraction of each task's range", fontsize=8)
         axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
     _key(figure, {name.upper(): _color(name, algorithms) for name in algorithms}, None)
-    return _png(figure)
-
-
-def draw_terms(runs: Sequence[Run], terms: Mapping[str, str], title: str, last: float) -> bytes:
-    """Returns the curves of reward terms, given their labels by column, up to `last` environment steps."""
-    figure = _figure(5.2, 3.2)
-    axes = figure.add_subplot()
-    for (column, label), color in zip(terms.items(), itertools.cycle(_COLORS.values())):
-        steps, *values = band(runs, column)
-        kept = steps <= last
-        _draw_interval(axes, steps[kept] / 1e6, [x[kept] for x in values], color, label)
-    _style_axes(axes, title, "reward per step")
-    axes.legend(frameon=False, fontsize=8)
     return _png(figure)
