@@ -1,12 +1,13 @@
-"""Renders the clips of the documentation: typical episodes of the shipped policies.
+"""Renders the clips of the documentation: typical episodes of the shipped policies, and of scripted teams of any size.
 
-`python tools/clips.py [TASK ...]` writes docs/clips/TASK.webp of each task (without tasks, of all), and docs/teams.webp
-from the clips of all tasks, side by side. Each shows how the median successful one of 48 episodes succeeds, in matches
-against the scripted policy.
+`python tools/clips.py [NAME ...]` writes docs/clips/NAME.webp of each task or entry of `SIZES` (without names, of all),
+and docs/teams.webp from all clips, side by side. Each shows how the median successful one of 48 episodes succeeds, in
+matches against the scripted policy.
 """
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -24,25 +25,38 @@ from mqe_jax.viz.render import render_frames
 
 DOCS = Path(__file__).parents[1] / "docs"
 EPISODES, SECONDS, AFTER, FPS = 48, 4.4, 1.2, 10.0  # AFTER: duration shown after the success, s
-SIZE, TILE, COLUMNS = (640, 360), (240, 135), 4
+SIZE, SMALL, TILE, COLUMNS = (640, 360), (480, 270), (240, 135), 4  # SMALL: of clips with many moving bodies
+SIZES: dict[str, tuple[str, dict[str, Any]]] = {
+    "gate-8": ("go1gate", {"num_agents": 8, "episode_length": 60.0}),
+    "sheep-30": ("go1sheep-hard", {"num_agents": 4, "num_sheep": 30, "episode_length": 40.0}),
+    "pushbox-6": ("go1pushbox", {"num_agents": 6, "episode_length": 30.0}),
+    "football-5vs5": ("go1football-1vs1", {"num_agents": 10}),
+}
+"""Tasks with sizes that their scripted policies play, by the names of their clips."""
 
 
-def write(task: str) -> None:
-    """Writes a task's clip, from a fixed camera."""
-    env = make(task, impl="c", num_envs=EPISODES, **parameters_for(task, task))
-    policy = all_agents(env, load_policy(task, env), load_policy("scripted", env) if len(env.teams) > 1 else None)
-    episode = typical(record_episodes(env, policy, jax.random.PRNGKey(0), episodes=EPISODES))
+def write(name: str) -> None:
+    """Writes the clip of a task or an entry of `SIZES`, from a fixed camera."""
+    task, settings = SIZES.get(name) or (name, parameters_for(name, name))
+    env = make(task, impl="c", num_envs=EPISODES, **settings)
+    scripted = load_policy("scripted", env)
+    policy = scripted if name in SIZES else load_policy(task, env)
+    policy = all_agents(env, policy, scripted if len(env.teams) > 1 else None)
+    limit = env.params.episode_length
+    episode = typical(record_episodes(env, policy, jax.random.PRNGKey(0), episodes=EPISODES, seconds=limit))
     end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
     shown = episode.cut(slice(max(0, end - round(SECONDS / episode.dt)), end, round(1 / (FPS * episode.dt))))
-    views = cameras(rendering_model(env.mj_model, shown), shown, "near", SIZE[0] / SIZE[1])
-    write_clip(DOCS / "clips" / f"{task}.webp", map(legend(env, SIZE), render_frames(env, shown, views, SIZE)), FPS)
+    size = SMALL if name in SIZES else SIZE
+    views = cameras(rendering_model(env.mj_model, shown), shown, "near", size[0] / size[1])
+    write_clip(DOCS / "clips" / f"{name}.webp", map(legend(env, size), render_frames(env, shown, views, size)), FPS)
 
 
-def tiles(task: str) -> list[np.ndarray]:
-    """Returns the frames of a task's clip as tiles, with its title in place of the legend."""
-    title, font = TASKS[task].title, ImageFont.load_default(11)
+def tiles(name: str) -> list[np.ndarray]:
+    """Returns the frames of a clip as tiles, with the task's title in place of the legend."""
+    task, settings = SIZES.get(name, (name, {}))
+    title, font = make(task, impl="c", **settings).heading, ImageFont.load_default(11)
     found = []
-    with Image.open(DOCS / "clips" / f"{task}.webp") as clip:
+    with Image.open(DOCS / "clips" / f"{name}.webp") as clip:
         for frame in ImageSequence.Iterator(clip):
             tile = frame.convert("RGB").resize(TILE, Image.Resampling.LANCZOS)
             ImageDraw.Draw(tile).rectangle((0, TILE[1] - 17, font.getlength(title) + 9, TILE[1]), fill=(28, 32, 40))
@@ -53,9 +67,9 @@ def tiles(task: str) -> list[np.ndarray]:
 
 if __name__ == "__main__":
     SHOWN = [task for task in TASKS if task != "go1plane"]
-    for name in sys.argv[1:] or SHOWN:
+    for name in sys.argv[1:] or [*SHOWN, *SIZES]:
         write(name)
-    TILES = list(map(tiles, SHOWN[: len(SHOWN) // COLUMNS * COLUMNS]))
+    TILES = list(map(tiles, [*SHOWN[: len(SHOWN) // COLUMNS * COLUMNS], *SIZES]))
     length = max(map(len, TILES))  # a tile that ends early keeps its last frame
     still = np.array([tile + tile[-1:] * (length - len(tile)) for tile in TILES])  # (tasks, T, height, width, 3)
     rows = [np.concatenate(list(still[i : i + COLUMNS]), axis=2) for i in range(0, len(still), COLUMNS)]
