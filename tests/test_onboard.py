@@ -55,6 +55,9 @@ def test_sensors_select_the_settings_of_policies_that_see_them() -> None:
     demo = settings_of("go1gate", {"config": "demo", "group": "policy"}, SENSES)
     assert demo.group == "policy" and demo.num_envs == 128
     assert settings_of("go1tug", None, {"senses": ["lidar"]}).group == "onboard"
+    listed = parse_train(["go1gate", "--senses", "[lidar, {name: detections, range: 2.0}]"])
+    assert listed.overrides() == {"senses": ["lidar", {"name": "detections", "range": 2.0}]}
+    assert listed.settings.group == "onboard"
 
 
 def test_a_task_gets_what_its_teacher_needs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,15 +44,16 @@ class TaskOptions:
     run's mode."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Robot of the task: go1 or go2. Default: go1, or the run's robot."""
-    senses: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Sensors: onboard, full (none). Short for --set senses=NAME; a training then reads them. Default: full, or those
-    of the run."""
+    senses: Annotated[str | None, tyro.conf.arg(metavar="NAME|LIST")] = None
+    """Sensors: onboard, full (none), or a list such as '[proprioception, lidar]'. Short for --set senses=VALUE; a
+    training then reads them. Default: full, or those of the run."""
     set: Annotated[list[str], Repeated, tyro.conf.arg(metavar="KEY=VALUE")] = field(default_factory=list)
     """Task parameter, such as gate_width=0.7 (metre); may be repeated. Values are read as YAML."""
 
     def overrides(self) -> dict[str, Any]:
         """Returns the task parameters given by --set, --control, --robot and --senses."""
-        flags = {"control": self.control, "robot": self.robot, "senses": self.senses}
+        senses = None if self.senses is None else parse_yaml(self.senses, "senses")
+        flags = {"control": self.control, "robot": self.robot, "senses": senses}
         return parse_overrides(self.set) | {name: value for name, value in flags.items() if value is not None}
 
 
