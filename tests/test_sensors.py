@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +11,17 @@ import pytest
 
 from mqe_jax.core.blocks import Block, Entities, image
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import override, to_mapping
+from mqe_jax.core.settings import override, record, to_mapping
 from mqe_jax.envs import State, VectorEnv, make
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import ObservationLayout, entities
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
+from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.detections import Detections
 from mqe_jax.sensors.lidar import Lidar
 from mqe_jax.sensors.pipeline import Pipeline
+from mqe_jax.sensors.suite import Suite
 from mqe_jax.viz import recording
 from tests.sensing import EXACT, RANGE, SENSING, Shapes, rays, readings, scattered, sense
 from tests.states import initial, made, placed
@@ -244,8 +246,8 @@ def test_senses_are_settings() -> None:
     [
         ("onbord", r"^senses: 'onbord' .*full, onboard.*did you mean 'onboard'"),
         (["lidr"], r"^senses: 'lidr' .*lidar.*did you mean 'lidar'"),
-        ([{"name": "lidar", "rays": 0}], r"senses.*rays: 0 .*greater than 0"),
-        ([{"name": "lidar", "beams": 8}], r"senses.*beams: unknown name"),
+        ([{"name": "lidar", "rays": 0}], r"^senses\.lidar\.rays: 0 .*greater than 0"),
+        ([{"name": "lidar", "beams": 8}], r"^senses\.lidar\.beams: unknown name"),
         (["lidar", "lidar"], r"^senses: .*sensors of different names"),
         (3, r"^senses: 3 .*full, onboard"),
         ([{"name": "lidar", "pipeline": {"lida": {}}}], r"senses.lidar.pipeline: 'lida' .*one of all, lidar"),
@@ -254,3 +256,52 @@ def test_senses_are_settings() -> None:
 def test_bad_senses_are_named(senses: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         _ = make("go1gate", impl="c", senses=senses).groups
+
+
+@record
+class Faulty(Sensor):
+    """A sensor with one of several mistakes."""
+
+    name: Literal["faulty"] = "faulty"
+    mistake: str = ""
+
+    def layout(self, scene: Any) -> tuple[Block, ...]:
+        return (Block("lidar" if self.mistake == "block" else "yaw", 1),)
+
+    def init_memory(self, scene: Any) -> Any:
+        return jnp.zeros(3)
+
+    def observe(self, scene: Any, snapshot: Any, memory: Any, key: Any) -> Any:
+        yaw = snapshot.pose[:, 2:]
+        readings = {"name": {"jaw": yaw}, "shape": {"yaw": yaw[:, 0]}}.get(self.mistake, {"yaw": yaw})
+        return readings, jnp.broadcast_to(memory, (2, 3)) if self.mistake == "memory" else memory
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        ("name", r"^Faulty.observe: \['jaw'\]; .*\['yaw'\]"),
+        ("shape", r"^Faulty.observe: yaw: \(2,\) .*\(2, 1\)"),
+        ("memory", r"^Faulty.observe: memory: \(2, 3\) .*\(3,\)"),
+        ("block", r"^senses: \['lidar', 'lidar'\] .*different names"),
+    ],
+)
+def test_mistakes_of_a_sensor_are_named(mistake: str, message: str) -> None:
+    env = made("go1gate")
+    suite = Suite(env.suite.scene, (Lidar(rays=1), Faulty(mistake=mistake, pipeline={"all": Pipeline(delay=1)})))
+
+    def read(state: State) -> Any:
+        return suite.observe(env.snapshot(state, env.read(state.data)), suite.reset(), state.key)
+
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(read, initial(env))
+
+
+def test_a_sensor_needs_a_name_and_both_decorators() -> None:
+    class Bare(Sensor):
+        pass
+
+    with pytest.raises(InputError, match=r"^sensor: .*Bare.* below @register and @record"):
+        register(Bare)
+    with pytest.raises(InputError, match=r"^sensor Bare: the field name has no default"):
+        register(record(Bare))

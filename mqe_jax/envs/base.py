@@ -21,13 +21,13 @@ from mqe_jax import skills
 from mqe_jax.core.errors import InputError, warn
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
+from mqe_jax.core.returned import alike, check_shape, results, weights_of
 from mqe_jax.core.settings import check, check_arguments, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
-from mqe_jax.envs.returned import alike, check_shape, results, weights_of
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
 from mqe_jax.physics import engines, robots

@@ -13,8 +13,8 @@ from mqe_jax.core.blocks import Block as Block
 from mqe_jax.core.blocks import by_entity as by_entity
 from mqe_jax.core.blocks import entities as entities
 from mqe_jax.core.blocks import image as image
+from mqe_jax.core.returned import check_names, check_shape
 from mqe_jax.core.settings import fail
-from mqe_jax.envs.returned import check_names, check_shape
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.envs.returned import check_names, check_shape
+from mqe_jax.core.returned import check_names, check_shape
 
 
 def weigh(

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.returned import weights_of
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout, box
 from mqe_jax.envs.params import P, TaskParams
-from mqe_jax.envs.returned import weights_of
 from mqe_jax.envs.reward import fade, weigh
 from mqe_jax.envs.sensing import Sensing
 from mqe_jax.envs.state import Moment, S, State

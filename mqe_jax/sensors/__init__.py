@@ -74,11 +74,12 @@ def register(sensor: S) -> S:
     """Registers a record under the default of its field `name`, and returns it; a class decorator.
 
     Raises:
-        InputError: for anything else, or if another class is registered under the name.
+        InputError: for anything else, without a name, or if another class is registered under it.
     """
     if not (isinstance(sensor, type) and issubclass(sensor, Sensor) and is_record(sensor)):
-        fail("sensor", sensor, "a record derived from Sensor")
-    name = sensor().name
+        fail("sensor", sensor, "a class derived from Sensor, below @register and @record")
+    if not (name := sensor().name):
+        raise InputError(f"sensor {sensor.__name__}: the field name has no default")
     if SENSORS.setdefault(name, sensor) is not sensor:
         raise InputError(f"sensor: the name {name!r} is already registered")
     return sensor

@@ -14,7 +14,8 @@ import numpy as np
 import pydantic
 
 from mqe_jax.core.blocks import Block
-from mqe_jax.core.errors import nearest
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.returned import alike, check_names, check_shape
 from mqe_jax.core.settings import build, fail
 from mqe_jax.sensors import SENSORS, Sensor, depth, messages  # noqa: F401
 from mqe_jax.sensors.detections import Detections
@@ -44,6 +45,8 @@ SETS: dict[str, tuple[Sensor, ...]] = {
 }
 """Sensors by the names that the parameter `senses` has for them; `full` are the task's own observations alone."""
 
+_ALLOWED = f"{', '.join(SETS)}, or a list of sensors, such as [proprioception, lidar]"
+
 
 def sensors_of(value: Any) -> tuple[Sensor, ...]:
     """Returns sensors from the name of a set, or from a sequence of sensors, of their names and of mappings.
@@ -53,10 +56,10 @@ def sensors_of(value: Any) -> tuple[Sensor, ...]:
     """
     if isinstance(value, str):
         if value not in SETS:
-            fail("senses", value, f"{', '.join(SETS)}, or a list of sensors{nearest(value, SETS)}")
+            fail("senses", value, f"{_ALLOWED}{nearest(value, SETS)}")
         return SETS[value]
     if not isinstance(value, Sequence):
-        fail("senses", value, f"{', '.join(SETS)}, or a list of sensors")
+        fail("senses", value, _ALLOWED)
     sensors = tuple(map(_sensor, value))
     if len({sensor.name for sensor in sensors}) < len(sensors):
         fail("senses", [sensor.name for sensor in sensors], "sensors of different names")
@@ -72,7 +75,10 @@ def _sensor(value: Any) -> Sensor:
     name = settings.get("name")
     if not isinstance(name, str) or name not in SENSORS:
         fail("senses", value, f"a registered sensor: {', '.join(SENSORS)}{nearest(name, SENSORS)}")
-    return build(SENSORS[name], settings)
+    try:
+        return build(SENSORS[name], settings)
+    except InputError as error:
+        raise InputError(f"senses.{name}.{error}") from None
 
 
 Senses = Annotated[tuple[pydantic.SerializeAsAny[Sensor], ...], pydantic.BeforeValidator(sensors_of)]
@@ -110,7 +116,11 @@ class Suite:
             names = ["all", *(block.name for block in blocks)]
             if unknown := [name for name in sensor.pipeline if name not in names]:
                 fail(f"senses.{sensor.name}.pipeline", unknown[0], f"one of {', '.join(names)}")
-        return [(sensor, block) for sensor, blocks in found for block in blocks]
+        measured = [(sensor, block) for sensor, blocks in found for block in blocks]
+        names = [block.name for _, block in measured]
+        if len({*names}) < len(names):
+            fail("senses", names, "sensors whose blocks have different names")
+        return measured
 
     def reset(self) -> SensorState:
         """Returns the state at the start of an episode."""
@@ -131,7 +141,7 @@ class Suite:
         readings, memory = {}, {}
         for number, sensor in enumerate(self.sensors):
             own_key = jax.random.fold_in(key, number)
-            blocks, memory[sensor.name] = sensor.observe(self.scene, snapshot, state.memory[sensor.name], own_key)
+            blocks, memory[sensor.name] = self._read(sensor, snapshot, state.memory[sensor.name], own_key)
             readings |= blocks
         piped = {x.name: (sensor.pipeline_of(x), x) for sensor, x in self._measured if x.name in state.queues}
         noise, lost = self._chances(piped, jax.random.fold_in(key, len(self.sensors)))
@@ -140,6 +150,18 @@ class Suite:
             chances = noise.get(name, 0.0), lost.get(name, False)
             readings[name], queues[name] = pipeline.apply(block, readings[name], state.queues[name], *chances)
         return readings, SensorState(state.action, memory, queues)
+
+    def _read(
+        self, sensor: Sensor, snapshot: Snapshot, memory: Any, key: jax.Array
+    ) -> tuple[dict[str, jax.Array], Any]:
+        """Returns what a sensor observes; ValueError for blocks unlike its layout, or a memory unlike the last."""
+        method = f"{type(sensor).__name__}.observe"
+        readings, after = sensor.observe(self.scene, snapshot, memory, key)
+        widths = {block.name: block.width for owner, block in self._measured if owner is sensor}
+        check_names(method, readings, widths)
+        for name, width in widths.items():
+            check_shape(f"{method}: {name}", readings[name], (self.scene.num_agents, width))
+        return readings, alike(f"{method}: memory", after, memory)
 
     def _chances(
         self, piped: Mapping[str, tuple[Pipeline, Block]], key: jax.Array

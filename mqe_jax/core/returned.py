@@ -1,4 +1,4 @@
-"""Checks of what the methods of a task return; a ValueError names the method, what it returned and what is expected."""
+"""Checks of what methods of tasks and sensors return; a ValueError names the method, the value and what is expected."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
