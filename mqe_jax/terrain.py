@@ -165,7 +165,16 @@ class Gate(TerrainBlock):
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """A row of blocks between two side walls."""
+    """A row of blocks between two side walls.
+
+    Example:
+        ```python
+        from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track
+
+        track = Track((SpawnArea(2.0), Gate(3.0, width=0.7), EndWall()), width=4.0)
+        print(track.layout().anchors[0].position)  # (3.5, 0.0), the middle of the gap
+        ```
+    """
 
     blocks: tuple[TerrainBlock, ...] = ()
     """Blocks in order along x."""

@@ -145,7 +145,14 @@ def infer(params: Params, history: jax.Array, *, precision: str = "highest") -> 
 
 @register
 class WalkPolicy(Skill):
-    """The walk policy as a skill."""
+    """The walk policy as a skill.
+
+    Example:
+        ```python
+        env = mqe_jax.make("go1plane", gait="pace", commands=("vx", "body_height"))
+        print(env.action_size)  # 2
+        ```
+    """
 
     name = "walk"
     commands = COMMANDS

@@ -1,7 +1,6 @@
 """The documentation's pages: their code, notebooks and examples run, their commands are parsed by the program."""
 
 import importlib
-import inspect
 import json
 import os
 import re
@@ -9,6 +8,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from mqe_jax.cli import demo
 from mqe_jax.cli.arguments import COMMANDS, parse
 from mqe_jax.core.settings import override
 from mqe_jax.envs import PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs.registry import NAMED_PLANNERS
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.runs import build
 from mqe_jax.train.config import TrainConfig
@@ -97,14 +98,32 @@ def test_python_blocks_run(page: str) -> None:
             del TASKS[name]
 
 
+# Examples of trainings that take minutes; that of a team of processes needs an exported file.
+LONG = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_team")
+SLOW = ("export/policy",)
+SOURCES = {
+    file.relative_to(ROOT / "mqe_jax").with_suffix("").as_posix(): file.read_text(encoding="utf-8")
+    for file in sorted((ROOT / "mqe_jax").rglob("*.py"))
+}
+
+
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize(
-    "name", ["bench", "evaluate", "learn", "learn_seeds", "load_run", "make_learner", "render", "sweep", "tournament"]
+    "module",
+    [
+        pytest.param(name, marks=pytest.mark.soak if name in SLOW else ())
+        for name in SOURCES
+        if "```python" in SOURCES[name] and name not in LONG
+    ],
 )
-def test_examples_of_docstrings_run(name: str) -> None:
-    text = re.sub("^    ", "", inspect.getdoc(getattr(mqe_jax, name)) or "", flags=re.MULTILINE)
-    (example,) = blocks(text, "python")
-    exec(example, {"mqe_jax": mqe_jax, "jax": jax})
+def test_examples_of_docstrings_run(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(NAMED_PLANNERS, "go1tug", {})  # one of them registers a policy
+    for example in re.findall(r"^ +```python\n(.*?)^ +```", SOURCES[module], re.DOTALL | re.MULTILINE):
+        exec(textwrap.dedent(example), {"mqe_jax": mqe_jax, "jax": jax})
+
+
+def test_everything_that_the_package_exports_has_an_example() -> None:
+    assert [name for name in mqe_jax.__all__ if "```python" not in getattr(mqe_jax, name).__doc__] == []
 
 
 def commands(text: str) -> list[list[str]]:

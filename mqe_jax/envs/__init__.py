@@ -31,7 +31,13 @@ def __getattr__(name: str) -> Any:
 
 
 def tasks() -> tuple[str, ...]:
-    """Returns the ids of all registered tasks."""
+    """Returns the ids of all registered tasks.
+
+    Example:
+        ```python
+        print(mqe_jax.tasks())  # ('go1plane', 'go1gate', ...)
+        ```
+    """
     return tuple(TASKS)
 
 
@@ -40,6 +46,12 @@ def make(
     task: str, *, impl: str = "auto", control: str = "command", num_envs: int = 4096, **overrides: Any
 ) -> "QuadrupedEnv":
     """Creates the environment of a task.
+
+    Example:
+        ```python
+        env = mqe_jax.make("go1gate", gate_width=0.8, rewards={"collision": -5.0})
+        print(env)  # sizes, parts of the observation, ranges of the commands
+        ```
 
     Args:
         task: id, such as 'go1gate'.

@@ -85,7 +85,15 @@ class EnvBatch:
 
 
 class VectorEnv(EnvBatch):
-    """A batch of environments with automatic reset, as used for training and evaluation."""
+    """A batch of environments with automatic reset, as used for training and evaluation.
+
+    Example:
+        ```python
+        batch = mqe_jax.VectorEnv(mqe_jax.make("go1gate"), 64)
+        state = jax.jit(batch.reset)(jax.random.PRNGKey(0))
+        print(state.obs.shape)  # (64, 2, 16)
+        ```
+    """
 
     groups: tuple[str, ...] = ()
     """Groups that are observed besides `policy`."""

@@ -1,8 +1,7 @@
 """The environment core: one environment of several robots as pure `reset` and `step` functions, batched by `jax.vmap`.
 
-A task is a subclass in its own file that implements the interface in `mqe_jax.envs.task`. This module implements what
-all tasks share: spawning, control, physics, randomisation, falls, collisions, the time limit and the detection of
-diverged physics.
+A task is a subclass in its own file (`mqe_jax.envs.task`). This module has what all tasks share: spawning, control,
+physics, randomisation, falls, collisions, the time limit, and the detection of diverged physics.
 """
 
 from __future__ import annotations
@@ -42,12 +41,18 @@ from mqe_jax.skills.control import Controller, check_mode
 if TYPE_CHECKING:
     from mujoco import mjx
 
-_NOISE = 7919  # folded into a state's key for the noise of its observations
-_SENSING = 7907  # and for its sensors
+_NOISE, _SENSING = 7919, 7907  # folded into a state's key for the noise of its observations, and for its sensors
 
 
 class QuadrupedEnv(Task[S, P]):
-    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`."""
+    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`.
+
+    Example:
+        ```python
+        env = mqe_jax.make("go1gate")
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))  # then jax.jit(env.step)(state, action)
+        ```
+    """
 
     @single
     def __init__(

@@ -27,6 +27,13 @@ class Match(QuadrupedEnv[S, P]):
     Result: an `eliminated` team (by default one with a fallen robot) loses unless both are; otherwise the `leading`
     team wins, and it is a draw if both or neither lead.
     Success is a win. Diverged physics is a draw.
+
+    Example:
+        ```python
+        match = mqe_jax.make("go1football-1vs1")
+        own, other = match.view_points(jax.numpy.array([2.0, 1.0, 0.0]))  # as each team sees it
+        print(other)  # [12. -1.  0.]
+        ```
     """
 
     symmetry: ClassVar[str] = "turn"

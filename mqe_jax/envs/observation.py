@@ -22,7 +22,15 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class ObservationLayout:
-    """Ordered blocks of an observation vector."""
+    """Ordered blocks of an observation vector.
+
+    Example:
+        ```python
+        env = mqe_jax.make("go1gate")
+        parts = env.observation_layout.split(jax.numpy.zeros((2, env.observation_size)))
+        print(parts["teammate"].shape)  # (2, 6)
+        ```
+    """
 
     blocks: tuple[Block, ...]
     """Blocks in the order in which they are packed."""

@@ -31,7 +31,14 @@ from mqe_jax.skills.control import Commander
 
 @record
 class TaskParams:
-    """Parameters common to all tasks; a task adds its own."""
+    """Parameters common to all tasks; a task adds its own.
+
+    Example:
+        ```python
+        params = mqe_jax.make("go1gate", episode_length=20.0).params
+        print(params.robot, params.action_ranges()["vx"])  # go1 (-1.0, 1.0)
+        ```
+    """
 
     num_agents: Robots = 2
     """Number of controlled robots; in a match those of both teams."""

@@ -17,7 +17,14 @@ if TYPE_CHECKING:
 
 @record
 class Randomization:
-    """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables."""
+    """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables.
+
+    Example:
+        ```python
+        ranges = mqe_jax.Randomization(friction=(0.5, 1.25), payload=(0.0, 2.0), push=0.3)
+        env = mqe_jax.make("go1gate", randomization=ranges)
+        ```
+    """
 
     friction: Range | None = None
     """Sliding friction of the robots' collision geoms (lowest, highest)."""

@@ -96,7 +96,16 @@ NAMED_PLANNERS: dict[str, dict[str, Planner]] = {}
 
 @check_arguments(task=str, name=str, planner=Callable)
 def register_planner(task: str, name: str, planner: Planner) -> None:
-    """Registers a further scripted policy of a task under a name that no other one has."""
+    """Registers a further scripted policy of a task under a name that no other one has.
+
+    Example:
+        ```python
+        from mqe_jax.envs.registry import register_planner
+
+        register_planner("go1tug", "wait", lambda obs: jax.numpy.zeros((len(obs["base"]), 3)))
+        policy = mqe_jax.load_policy("wait", mqe_jax.make("go1tug"))
+        ```
+    """
     if not name:
         fail("name", name, "a text that is not empty")
     if task not in TASKS:
@@ -127,7 +136,15 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | None = None) -> t
 
 
 def task_id(name: str) -> str:
-    """Returns the id of a task from it or an alias; raises an InputError that names the nearest for an unknown one."""
+    """Returns the id of a task from it or an alias; raises an InputError that names the nearest for an unknown one.
+
+    Example:
+        ```python
+        from mqe_jax.envs.registry import task_id
+
+        print(task_id("go1bridgewrestling"))  # go1wrestling
+        ```
+    """
     return known_name("task: unknown id", ALIASES.get(name, name), TASKS)
 
 

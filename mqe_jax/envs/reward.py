@@ -50,7 +50,15 @@ def fade(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float
 
 
 def crowding(position: jax.Array, active: jax.Array) -> jax.Array:
-    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below 0.5 m: (A, D) -> ()."""
+    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below 0.5 m: (A, D) -> ().
+
+    Example:
+        ```python
+        from mqe_jax.envs.reward import crowding
+
+        print(crowding(jax.numpy.array([[0.0, 0.0], [0.25, 0.0]]), jax.numpy.ones(2, bool)))  # 32.0
+        ```
+    """
     count = position.shape[0]
     apart = position[:, None] - position[None]
     square = jnp.sum(jnp.square(apart), axis=-1) + jnp.eye(count)

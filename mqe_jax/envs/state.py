@@ -66,6 +66,13 @@ class State(EnvironmentState, Generic[S]):
 
     Its metrics include `average_step_reward`, `collision`, `diverged` and `overflow` (1 where the physics engine may
     have dropped contacts or constraints in any physics step of this step); its outcome has the `ENDINGS`.
+
+    Example:
+        ```python
+        env = mqe_jax.make("go1tug")
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))  # shapes and types only
+        print(state.obs.shape, state.outcome.win.shape)  # (2, 10) (2,)
+        ```
     """
 
     data: "mjx.Data"

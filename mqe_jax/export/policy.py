@@ -45,6 +45,14 @@ SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JO
 def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of a policy with its mean actions; its task defines control mode, robot and walk policy.
 
+    Example:
+        ```python
+        from mqe_jax.export.policy import to_onnx
+
+        graph = to_onnx(mqe_jax.load_policy("go1gate"), mqe_jax.make("go1gate"))
+        print([output.name for output in graph.graph.output])
+        ```
+
     Raises:
         InputError: for another task than the policy's, or a network with an operation that has no translation.
     """

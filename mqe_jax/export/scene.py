@@ -13,7 +13,17 @@ from mqe_jax.physics.scene import build_spec
 
 @check_arguments(env=QuadrupedEnv)
 def scene_xml(env: QuadrupedEnv) -> str:
-    """Returns the MJCF of the task's rendering model, with six significant digits."""
+    """Returns the MJCF of the task's rendering model, with six significant digits.
+
+    Example:
+        ```python
+        from pathlib import Path
+
+        from mqe_jax.export.scene import scene_xml
+
+        Path("gate.xml").write_text(scene_xml(mqe_jax.make("go1gate")))
+        ```
+    """
     spec, _ = build_spec(env.compiled.scene, visual=True)
     spec.compile()
     return spec.to_xml()

@@ -83,7 +83,15 @@ def _add_joint(body: Any, suffix: str, kind: Any, damping: float = 0.0, **option
 
 @record
 class Box(Object):
-    """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body)."""
+    """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
+
+    Example:
+        ```python
+        from mqe_jax.physics.objects import Box
+
+        env = mqe_jax.make("go1pushbox", box=Box(mass=8.0))
+        ```
+    """
 
     size: Size = (1.0, 1.0, 1.0)
     """Full extents, m."""

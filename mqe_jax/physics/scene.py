@@ -166,7 +166,17 @@ def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> N
 
 
 def compile_scene(scene: Scene) -> CompiledScene:
-    """Compiles a scene for the physics and indexes it by name."""
+    """Compiles a scene for the physics and indexes it by name.
+
+    Example:
+        ```python
+        from mqe_jax.physics.scene import Scene, compile_scene
+        from mqe_jax.terrain import Gate, SpawnArea, Track
+
+        compiled = compile_scene(Scene(Track((SpawnArea(2.0), Gate(3.0, width=0.7)))))
+        print(compiled.model.nq)  # 38: two robots of 19
+        ```
+    """
     model, layout = build_model(scene, visual=False)
     moving = [wall for wall in layout.walls if wall.anchor is not None]
     index = index_robots(model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors)

@@ -156,6 +156,13 @@ def load_policy(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = 
 def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False) -> Policy:
     """Returns the policy of a name, a run folder or a policy file.
 
+    Example:
+        ```python
+        env = mqe_jax.make("go1gate")
+        team = mqe_jax.load_policy("go1gate", env)  # the shipped one
+        action, memory = team.act(jax.numpy.zeros((1, 2, 16)), team.initial_memory(1), jax.random.PRNGKey(0))
+        ```
+
     Args:
         source: one of `NAMES`, of the task's `NAMED_PLANNERS`, a task with a shipped policy
             (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path; a folder with one of these

@@ -32,7 +32,15 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run:
-    """A training: its policy, and how it learned."""
+    """A training: its policy, and how it learned.
+
+    Example:
+        ```python
+        run = mqe_jax.learn("go1gate", "demo")
+        run.plot().savefig("curve.png")
+        run.save("runs/saved")
+        ```
+    """
 
     policy: TrainedPolicy
     """The newest policy."""

@@ -203,7 +203,14 @@ def render(
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Clip:
-    """Recorded episodes, of which the best one is shown."""
+    """Recorded episodes, of which the best one is shown.
+
+    Example:
+        ```python
+        clip = mqe_jax.render("go1gate", seconds=5)
+        clip.save("gate.png", at=2.0)  # or a clip: gate.mp4, gate.gif
+        ```
+    """
 
     env: QuadrupedEnv
     """The task."""

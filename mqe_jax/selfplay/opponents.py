@@ -203,6 +203,13 @@ def versus(
     The environments meet the opponents, policies or what `load_policy` accepts, in turn, equally many each. Trained
     policies act as they are loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`). A draw adds
     `draw_reward`. InputError for a task that is not a match, and for a policy of another task.
+
+    Example:
+        ```python
+        batch = mqe_jax.VectorEnv(mqe_jax.make("go1tug"), 8)
+        matches = mqe_jax.versus(batch, ["scripted", "idle"])  # four against each
+        print(matches.num_agents)  # 1
+        ```
     """
     alone = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
     given: Any = [opponents] if alone else opponents

@@ -212,7 +212,17 @@ def register(skill: type[S]) -> type[S]:
 
 @check_arguments(name=str | Sequence[str], robot=Robot)
 def make(name: str | Sequence[str], robot: Robot) -> Skill:
-    """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with the nearest one."""
+    """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with the nearest one.
+
+    Example:
+        ```python
+        from mqe_jax import skills
+        from mqe_jax.physics import robots
+
+        walk = skills.make("walk", robots.get("go1"))
+        print([command.name for command in walk.commands])  # vx, vy, yaw_rate, ...
+        ```
+    """
     from mqe_jax.skills.choice import Choice
 
     if not isinstance(name, str):

@@ -175,7 +175,14 @@ class EvaluationSettings:
 
 @record
 class TrainConfig:
-    """Settings of a training run; the defaults are mostly OpenRL's, but with one ratio per agent."""
+    """Settings of a training run; the defaults are mostly OpenRL's, but with one ratio per agent.
+
+    Example:
+        ```python
+        config = mqe_jax.TrainConfig(task="go1gate", num_envs=256, rollout_steps=32)
+        print(config.num_updates)  # updates of mqe_jax.learn("go1gate", config)
+        ```
+    """
 
     task: Annotated[str | None, tyro.conf.Suppress] = None
     """Id of the task."""
@@ -257,7 +264,18 @@ class TrainConfig:
 
 
 def load_config(path: str | Path) -> TrainConfig:
-    """Reads settings from a YAML file; InputError naming the file, for invalid content."""
+    """Reads settings from a YAML file; InputError naming the file, for invalid content.
+
+    Example:
+        ```python
+        from pathlib import Path
+
+        from mqe_jax.train.config import load_config
+
+        Path("own.yaml").write_text("{task: go1gate, num_envs: 256}")
+        config = load_config("own.yaml")
+        ```
+    """
     values = load_yaml(path)
     try:
         return override(TrainConfig(), values)

@@ -40,7 +40,15 @@ _NORMAL = 1.959964  # two-sided 95% quantile
 
 
 class Rate(NamedTuple):
-    """A rate of episodes with its 95% Wilson interval (Wilson 1927, doi 10.1080/01621459.1927.10502953)."""
+    """A rate of episodes with its 95% Wilson interval (Wilson 1927, doi 10.1080/01621459.1927.10502953).
+
+    Example:
+        ```python
+        from mqe_jax.train.evaluate import Rate
+
+        print(Rate.of(0.9, episodes=100))  # 90.0% (82.6 to 94.5%)
+        ```
+    """
 
     value: float
     low: float
@@ -66,7 +74,15 @@ class Rate(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """Results of an evaluation; means are over the steps of the counted episodes or over episodes."""
+    """Results of an evaluation; means are over the steps of the counted episodes or over episodes.
+
+    Example:
+        ```python
+        result = mqe_jax.evaluate("go1gate", episodes=64)
+        print(result)  # a table
+        print(result.success.low, result.endings["fall"])
+        ```
+    """
 
     task: str
     episodes: int

@@ -176,7 +176,15 @@ def network_settings(value: Any) -> Any:
 
 @register_network("actor_critic")
 class ActorCritic(GaussianSettings):
-    """Settings of actor and critic: hidden layers, an optional recurrent unit, a Gaussian policy."""
+    """Settings of actor and critic: hidden layers, an optional recurrent unit, a Gaussian policy.
+
+    Example:
+        ```python
+        from mqe_jax.train.networks import ActorCritic
+
+        config = mqe_jax.TrainConfig(network=ActorCritic(hidden_sizes=(128, 64), recurrent=False))
+        ```
+    """
 
     critic_input: Literal["privileged", "observations", "own"] = "privileged"
     """Critic input: the privileged observation, all agents' observations, or each agent's own."""

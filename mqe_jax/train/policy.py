@@ -285,6 +285,14 @@ def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_F
 
     The file holds whether the policy acts with its mean actions.
 
+    Example:
+        ```python
+        from mqe_jax.train.policy import save_policy
+
+        file = save_policy("runs/own", mqe_jax.load_policy("go1gate"))
+        policy = mqe_jax.load_policy(file)
+        ```
+
     Raises:
         InputError: for a folder that cannot be written.
         NonFiniteError: for weights or statistics that are NaN or infinite.

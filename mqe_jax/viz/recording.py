@@ -77,6 +77,19 @@ def record_episodes(
 
     `policy` is that of all agents, or a function like its `act` without recurrent state; batched over episodes.
     `sensors` also records what shows the readings of the task's sensors.
+
+    Example:
+        ```python
+        from pathlib import Path
+
+        from mqe_jax.viz.recording import best, record_episodes
+        from mqe_jax.viz.render import render_episode
+
+        env = mqe_jax.make("go1gate")
+        policy = mqe_jax.load_policy("go1gate", env)
+        episodes = record_episodes(env, policy, jax.random.PRNGKey(0), episodes=4, seconds=5)
+        render_episode(env, best(episodes), Path("gate.gif"))
+        ```
     """
     groups = tuple({*groups_of(policy), *([ONBOARD] if sensors else [])} - {"policy"})
     size = env.mj_model.nq + 7 * env.mj_model.nmocap + (_DRAWN * env.num_agents if sensors else 0)

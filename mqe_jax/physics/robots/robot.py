@@ -178,7 +178,15 @@ class WalkSettings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Robot:
-    """A quadruped; make a variant with `dataclasses.replace`. Arrays (12,) are in the order of `JOINT_NAMES`."""
+    """A quadruped; make a variant with `dataclasses.replace`. Arrays (12,) are in the order of `JOINT_NAMES`.
+
+    Example:
+        ```python
+        from mqe_jax.physics import robots
+
+        print(robots.get("go2").stall_torque[:3])  # of hip, thigh and calf, N m
+        ```
+    """
 
     name: str
     """Short name, as in the registry."""

@@ -33,6 +33,15 @@ def planner_of(task: str, name: str = "scripted") -> Planner:
 def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
     """Returns the scripted policy of a task, from the observations (A, O) of one team to its actions (A, 3).
 
+    Example:
+        ```python
+        from mqe_jax.policies.scripted import scripted_policy
+
+        env = mqe_jax.make("go1gate")
+        act = jax.vmap(scripted_policy(env))
+        print(act(jax.numpy.zeros((8, 2, env.observation_size))).shape)  # (8, 2, 3)
+        ```
+
     Raises:
         InputError: if the task has none of this name.
     """
