@@ -19,6 +19,7 @@ def flock(
     step: float,
     friction: float = 1.0,
     top_speed: float = 2.0,
+    there: jax.Array | None = None,
 ) -> jax.Array:
     """Returns the velocities (S, 2), m/s, of S sheep during the next environment step, s.
 
@@ -27,18 +28,20 @@ def flock(
     component is clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
     before and half after this, so that the sheep moves at the step's mean speed. p are the sheep's positions (S, 2), m,
     v their velocities, p_robot those of the robots (A, 2), s is the restlessness, m/s.
+    Sheep that are not `there` (S,) stand still and do not belong to the flock; by default all do.
     Source: paper, section III, with the constants of the released system.
     """
     half = friction * GRAVITY * step / 2
     velocity = slow_down(velocity, half)
     velocity += 2 * restlessness * jax.random.normal(key, position.shape)
     if len(position) > 1:
-        inward = jnp.mean(position, axis=0) - position
+        inward = jnp.mean(position, axis=0, where=None if there is None else there[:, None]) - position
         velocity += restlessness / 1.5 * inward / jnp.maximum(_length(inward), 1e-6)
     away = position[:, None] - robots[None]
     nearness = jnp.maximum(_length(jnp.square(away)), 1e-3)
     velocity += jnp.sum(jnp.where(nearness > 9.0, 0.0, 0.2 * away / nearness**1.4), axis=1)
-    return slow_down(jnp.clip(velocity, -top_speed, top_speed), half)
+    velocity = slow_down(jnp.clip(velocity, -top_speed, top_speed), half)
+    return velocity if there is None else jnp.where(there[:, None], velocity, 0.0)
 
 
 def slow_down(velocity: jax.Array, loss: float) -> jax.Array:

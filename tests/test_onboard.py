@@ -123,7 +123,7 @@ def test_other_sensors_are_named_with_both_values() -> None:
     blind = make("go1gate", impl="c", num_envs=1)
     first, near, *others = needs.senses
     for senses, message in (
-        ("full", "needs group 'onboard'; the environment has 'policy, proprioception'"),
+        ("full", "needs group 'onboard'; the environment has 'entities, policy, proprioception'"),
         ([first], r"needs senses \('proprioception', 'detections', 'lidar'\); .* has \('proprioception',\)"),
         ([first, {**near, "range": 4.0}, *others], "needs senses.detections.range 6.0; the environment has 4.0"),
     ):

@@ -23,10 +23,11 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, results, weights_of
 from mqe_jax.core.settings import check, check_arguments, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
-from mqe_jax.envs.observation import ObservationLayout
+from mqe_jax.envs.observation import ObservationLayout, finite
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
+from mqe_jax.envs.sizes import Sizes, check_sizes, hide
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
 from mqe_jax.physics import engines, robots
@@ -60,15 +61,13 @@ class QuadrupedEnv(Task[S, P]):
     ) -> None:
         self.params = self.Params() if params is None else params
         self.weights = weights_of(self.params)
-        offset, expected = self.params.randomization.motor_offset, self.Params().num_agents
-        if self.params.num_agents != expected and not self.variable_num_agents:
-            fail("num_agents", self.params.num_agents, f"{expected}, the size of {self.name}")
+        offset = self.params.randomization.motor_offset
         self.control = check_mode(control)
         if offset and control == "torque":
             fail("randomization.motor_offset", offset, "0 with control torque, which has no joint targets")
         num_envs = check("num_envs", num_envs, Environments)
-        self.num_agents = self.params.num_agents
-        self.robot = robots.get(self.params.robot)
+        self.num_agents, self.robot = self.params.num_agents, robots.get(self.params.robot)
+        check_sizes(self)
         scene = self.scene()
         network = self.params.actuator_network if control != "torque" else None
         # NPC robots follow joint targets in every mode.
@@ -132,6 +131,7 @@ class QuadrupedEnv(Task[S, P]):
             lag=self.params.randomization.action_lag,
             position_scale=self.params.position_scale,
         )
+        self.sizes = Sizes(self)
         self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
         self.privileged = PrivilegedObservation(
             self.robot,
@@ -188,14 +188,16 @@ class QuadrupedEnv(Task[S, P]):
     def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns the state of `reset` without observations."""
         keys = jax.random.split(key, 9)
-        next_key, anchor_key, spawn_key, body_key, object_key, physics_key, task_key, _, freeze_key = keys
+        next_key, anchor_key, spawn_key, body_key, object_key, physics_key, task_key, size_key, freeze_key = keys
         assistance = jnp.asarray(assistance, jnp.float32)
         anchors = self.compiled.sample_anchors(anchor_key)
-        qpos, qvel = self._sample_robots(spawn_key, body_key)
+        active = self.sizes.draw(size_key, assistance)
+        qpos, qvel = self._sample_robots(self.sizes.line_up(self.spawn(spawn_key), active), body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel, assistance)
         ctrl = self._ctrl(jnp.asarray(self.controller.neutral))
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
-        robot_state = self.read(data)
+        data = self.sizes.park(data, active)
+        robot_state = self.read(data, active)
         no, empty = jnp.zeros((), bool), jnp.zeros((0,))
         nothing: Any = None
         state = State(
@@ -218,7 +220,7 @@ class QuadrupedEnv(Task[S, P]):
             assistance=assistance,
             frozen_steps=self._sample_frozen_steps(freeze_key, assistance),
             key=next_key,
-            active=jnp.ones(self.num_agents, bool),
+            active=active,
             senses=self.suite.reset() if self.params.senses else (),
         )
         state = dataclasses.replace(state, task=self.reset_task(task_key, state, robot_state))
@@ -244,7 +246,7 @@ class QuadrupedEnv(Task[S, P]):
         """Returns the state of `step` with the observations from before it."""
         self.check_state(state)
         action = self.controller.check_action(action, self.action_size)
-        bad_action = ~jnp.all(jnp.isfinite(action))
+        bad_action = ~jnp.all(jnp.isfinite(action) | ~state.active[:, None])
         action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
         still = (state.step < state.frozen_steps) | ~self.acting(state)
         own_action = jnp.where(still[:, None], 0.0, action)
@@ -261,8 +263,10 @@ class QuadrupedEnv(Task[S, P]):
         )
         if self.params.randomization.motor_offset:
             target = target + state.randomized.motor_offset
+        target = self.sizes.hold(target, state.active)
         data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key)
-        fields, forces = self.randomizer.fields(state.randomized), self.external_forces(state)
+        data = self.sizes.park(data, state.active)
+        fields, forces = self.randomizer.fields(state.randomized) | self.fields(state), self.external_forces(state)
         if self.actuators is None:
             actuators = ()
             data, overflow = self.physics.step(data, self._ctrl(target), fields=fields, xfrc_applied=forces)
@@ -279,6 +283,7 @@ class QuadrupedEnv(Task[S, P]):
     def with_observations(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
         """Returns the state with the observations that belong to it, and those of further groups; once a step."""
         robots, noise, seen = self.read(state.data, state.active), self.params.randomization.observation_noise, {}
+        there = self.there(state) if self.varies else {}
         for number, (name, layout) in enumerate({"policy": self.observation_layout, **self.groups}.items()):
             if name != "policy" and name not in groups:
                 continue
@@ -292,6 +297,7 @@ class QuadrupedEnv(Task[S, P]):
             if noise:
                 key = jax.random.fold_in(state.key, _NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
+            obs = hide(layout, obs, there) if there else obs
             seen[name] = jnp.where(state.active[:, None], finite(obs), 0.0)
         privileged = self.observe_privileged(state, robots)
         seen = {"obs": seen.pop("policy"), "privileged_obs": finite(privileged), "groups": seen}
@@ -353,10 +359,9 @@ class QuadrupedEnv(Task[S, P]):
         """Returns the engine's control (nu,) from targets of all robots (R, 12)."""
         return scatter(np.zeros(self.compiled.model.nu), self.index.actuator, targets)
 
-    def _sample_robots(self, spawn_key: jax.Array, body_key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _sample_robots(self, pose: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         params, model, index = self.params, self.compiled.model, self.index
-        pose = self.spawn(spawn_key)
-        joint_key, velocity_key = jax.random.split(body_key)
+        joint_key, velocity_key = jax.random.split(key)
         low, high = params.spawn_joint_scale
         factor = jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
         joints = jnp.clip(self.robot.default_joints * factor, self.robot.joint_lower, self.robot.joint_upper)
@@ -393,8 +398,3 @@ class QuadrupedEnv(Task[S, P]):
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         position = data.qpos[self.index.base_qpos[:, :3]]
         return ~(finite & jnp.all(jnp.abs(data.qvel) < 1e3) & jnp.all(jnp.abs(position) < 1e3))
-
-
-def finite(x: jax.Array) -> jax.Array:
-    """Returns observations without numbers that are not finite or beyond 1e4."""
-    return jnp.clip(jnp.nan_to_num(x), -1e4, 1e4)

@@ -146,6 +146,7 @@ class Football(QuadrupedEnv[S, F]):
         """
         changed = jnp.linalg.norm((self.ball_velocity(after.state.data) - self.ball_velocity(before.state.data))[:2])
         apart = jnp.linalg.norm(after.robots.position_w[:, :2] - self.ball(after.state.data)[:2], axis=-1)
+        apart = jnp.where(after.robots.active, apart, FAR)
         nearest = jnp.arange(len(apart)) == jnp.argmin(apart)
         return nearest & (apart < _REACH) & (changed > _IMPULSE)
 
@@ -332,7 +333,8 @@ class Go1Football1vs1(
     def further(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns, of teams with mates, `passes` and `both_touched`: a goal after touches by all robots of the team."""
         play = state.task.play
-        together = self.in_goal(state.data) & jnp.all(play.touched.reshape(2, -1), axis=1)
+        touched = (play.touched | ~state.active).reshape(2, -1)
+        together = self.in_goal(state.data) & jnp.all(touched, axis=1)
         return {"passes": play.passes, "both_touched": together} if self.num_agents > 2 else {}
 
 

@@ -127,7 +127,7 @@ class Match(QuadrupedEnv[S, P]):
     def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (A, width), each in its agent's own frame."""
         blocks = super().observe_group(name, state, robot_state)
-        if not self.reflected:
+        if not self.reflected or name != "proprioception":
             return blocks
         image = {"gravity": blocks["gravity"] * np.array([1.0, -1.0, 1.0], np.float32)}
         image |= {x: blocks[x][:, MIRRORED_JOINTS] * MIRRORED_SIGNS for x in ("joint_position", "joint_velocity")}

@@ -136,6 +136,11 @@ def for_all(value: jax.Array, agents: int) -> jax.Array:
     return jnp.broadcast_to(value.reshape(-1), (agents, value.size))
 
 
+def finite(x: jax.Array) -> jax.Array:
+    """Returns observations without numbers that are not finite or beyond 1e4."""
+    return jnp.clip(jnp.nan_to_num(x), -1e4, 1e4)
+
+
 def box(bound: float, shape: tuple[int, ...]) -> "Box":
     """Returns the space of arrays of a shape with numbers from -bound to bound."""
     from gymnasium.spaces import Box  # on demand: importing Gymnasium takes 0.1 s

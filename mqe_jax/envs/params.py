@@ -42,6 +42,12 @@ class TaskParams:
 
     num_agents: Robots = 2
     """Number of controlled robots; in a match those of both teams."""
+    fewest_agents: Robots | None = None
+    """Fewest robots that take part in an episode, in a match those of both teams: the number is drawn at reset, at most
+    `num_agents`, and the other robots are parked. None: all take part."""
+    growing: bool = False
+    """Curriculum: at `State.assistance` a the highest number of robots or sheep that is drawn is that much nearer to
+    the fewest, so that agents first learn in small teams. Inactive at assistance 0."""
     robot: str = "go1"
     """Name of the robot, such as go1 or go2 (`mqe_jax.physics.robots`)."""
     episode_length: TimeLimit = 10.0

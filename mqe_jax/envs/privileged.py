@@ -25,6 +25,7 @@ _ROBOT = (
 class PrivilegedObservation:
     """State of the R robots and all other moving bodies, anchors, physics parameters, gait phases, contact forces.
 
+    Entries of robots that take no part are 0.
     Physics parameters are included even if not randomised. `clock_size` is the length of the clock of a robot's
     skill; `contact_forces` adds those on trunks and feet, which requires the scene's foot sensors.
     """
@@ -73,19 +74,20 @@ class PrivilegedObservation:
             ],
             axis=-1,
         )
+        count = robot_state.count
         parts = [
-            robots,
+            count(robots),
             data.qpos[self._qpos],
             data.qvel[self._qvel],
             state.anchors,
-            randomized.friction,
-            randomized.payload,
-            randomized.center_of_mass,
-            randomized.motor_strength,
+            count(randomized.friction),
+            count(randomized.payload),
+            count(randomized.center_of_mass),
+            count(randomized.motor_strength),
             randomized.action_lag.astype(jnp.float32),
-            clock,
+            count(clock),
         ]
         if self._foot_force is not None:
             feet = jnp.linalg.norm(data.sensordata[self._foot_force], axis=-1)
-            parts.append(jnp.concatenate([robot_state.trunk_force[:, None], feet], axis=-1))
+            parts.append(count(jnp.concatenate([robot_state.trunk_force[:, None], feet], axis=-1)))
         return jnp.concatenate([part.ravel() for part in parts])

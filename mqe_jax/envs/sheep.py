@@ -1,5 +1,7 @@
 """go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: robots, by default two, herd sheep through a gate."""
 
+import dataclasses
+import functools
 import math
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,7 @@ from mqe_jax.core.settings import fail, record
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, ObservationLayout, entities, for_all, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams, check_gap
+from mqe_jax.envs.sizes import Herd
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.npc import flock
 from mqe_jax.physics import objects
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 _ROOM = 0.5  # m, from the flock at the start to the walls; as much again to the robots
+_FAR = 1e3  # m, of robots that take no part
 _CLEAR = 0.05  # m, between the sheep of a flock that could not be closer
 _CONTACTS = 2  # of each sheep beyond those of the task's own flock
 
@@ -70,6 +74,8 @@ class SheepEasyParams(TaskParams):
     """Number of sheep along x and along y."""
     num_sheep: FlockSize | None = None
     """Number of sheep, in about as many rows as columns; that of `flock` if none."""
+    fewest_sheep: FlockSize | None = None
+    """Fewest sheep of an episode, whose number is drawn at reset, up to all; the others are parked. None: all."""
     flock_center: tuple[Coordinate, Coordinate] = (3.0, 0.0)
     """Centre of the flock at reset, m."""
     flock_spacing: Distance = 1.5
@@ -90,6 +96,8 @@ class SheepEasyParams(TaskParams):
         most = math.prod(self._most)
         if self.num_sheep is not None and self.num_sheep > most:
             fail("num_sheep", self.num_sheep, f"at most {most}, for which there is room before the gate")
+        if self.fewest_sheep is not None and self.fewest_sheep > self.flock_size:
+            fail("fewest_sheep", self.fewest_sheep, f"at most {self.flock_size}, the number of sheep")
 
     @property
     def _room(self) -> np.ndarray:
@@ -200,9 +208,28 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Samples the sheep's initial positions."""
-        start, spread = self.params.flock_grid()
+        params, (start, spread) = self.params, self.params.flock_grid()
+        if params.fewest_sheep is not None:
+            sizes = range(params.fewest_sheep, self.num_sheep + 1)
+            grids = [dataclasses.replace(params, num_sheep=size, fewest_sheep=None).flock_grid() for size in sizes]
+            start, spread = self.herd.start(jax.random.fold_in(key, 1), grids, assistance * params.growing)
         noise = jax.random.uniform(key, start.shape, minval=-spread, maxval=spread)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
+
+    @functools.cached_property
+    def herd(self) -> Herd:
+        """The sheep, of which some may take no part."""
+        return Herd(self.compiled, [f"sheep{number}" for number in range(self.num_sheep)])
+
+    @property
+    def varies(self) -> bool:
+        return super().varies or self.params.fewest_sheep is not None
+
+    def there(self, state: State) -> dict[str, jax.Array]:
+        return {**super().there(state), "sheep": for_all(self.herd.there(state.data), self.num_agents)}
+
+    def fields(self, state: State) -> dict[str, jax.Array]:
+        return {} if self.params.fewest_sheep is None else self.herd.fields(state.data)
 
     def step_npcs(self, data: "mjx.Data", robot_state: RobotState, key: jax.Array) -> "mjx.Data":
         """Sets the sheep's velocities by `flock`."""
@@ -211,10 +238,11 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
             key,
             self.sheep(data),
             data.qvel[index],
-            robot_state.position_w[:, :2],
+            jnp.where(robot_state.active[:, None], robot_state.position_w[:, :2], _FAR),
             step=self.dt,
             restlessness=self.params.restlessness,
             friction=self.params.sheep_friction,
+            there=self.herd.there(data),
         )
         return data.replace(qvel=data.qvel.at[index].set(velocity))
 
@@ -236,8 +264,9 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return {**observe_team(robot_state.base_info), "gate": gate, "sheep": sheep}
 
     def through(self, state: State) -> jax.Array:
-        """Returns which sheep are past the gate (S,) bool."""
-        return self.sheep(state.data)[:, 0] > state.anchors[0, 0] + self.params.past_gate
+        """Returns which sheep are past the gate and take part (S,) bool."""
+        past = self.sheep(state.data)[:, 0] > state.anchors[0, 0] + self.params.past_gate
+        return past & self.herd.there(state.data)
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         (through_before, way_before), (through, way) = self._flock(before.state), self._flock(after.state)
@@ -245,7 +274,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return {
             "success": passed,
             "progress": jnp.sum(self.sheep(after.state.data)[:, 0] - self.sheep(before.state.data)[:, 0]),
-            "nearness": jnp.sum(jnp.where(through, 0.0, jnp.exp(-way / 2.0))),
+            "nearness": jnp.sum(jnp.where(through | ~self.herd.there(after.state.data), 0.0, jnp.exp(-way / 2.0))),
             "crossing": passed - jnp.sum(through_before).astype(jnp.float32),
             "gathering": jnp.sum(way_before) - jnp.sum(way),
             "failure": collision | jnp.any(self.fallen(after.robots)),
@@ -253,15 +282,17 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
 
     def _flock(self, state: State) -> tuple[jax.Array, jax.Array]:
         """Returns which sheep are past the gate (S,) bool and the others' distances to its centre (S,), m, else 0."""
-        through = self.through(state)
-        return through, jnp.where(through, 0.0, jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1))
+        through, there = self.through(state), self.herd.there(state.data)
+        return through, jnp.where(
+            through | ~there, 0.0, jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1)
+        )
 
     def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
         """Success: the share of the sheep that are past the gate, 0 after a fall or a collision.
 
         `through`: the share that are, however the episode ended.
         """
-        through = jnp.mean(self.through(state))
+        through = jnp.sum(self.through(state)) / jnp.sum(self.herd.there(state.data))
         return {"success": jnp.where(failed, 0.0, through), "through": through}
 
 

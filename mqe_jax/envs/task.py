@@ -16,6 +16,7 @@ from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout, box
 from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.reward import fade, weigh
 from mqe_jax.envs.sensing import Sensing
+from mqe_jax.envs.sizes import ENTITIES, entity_layout, observe_entities, robots_there
 from mqe_jax.envs.state import Moment, S, State
 from mqe_jax.physics.robots.index import RobotIndex, RobotState
 from mqe_jax.physics.robots.robot import Robot
@@ -144,6 +145,15 @@ class Task(Sensing, Generic[S, P]):
         return self.observation_layout.size
 
     @property
+    def varies(self) -> bool:
+        """Whether the number of robots, or of other entities, differs between episodes."""
+        return self.params.fewest_agents is not None
+
+    def there(self, state: State[S]) -> dict[str, jax.Array]:
+        """Returns which entities of a block take part (A, count) bool, by the block's name; of other blocks all do."""
+        return robots_there(self.teams, state.active)
+
+    @property
     def action_space(self) -> Box:
         """All agents' actions (A, action_size), within `action_limit`."""
         return box(self.action_limit, (self.num_agents, self.action_size))
@@ -161,7 +171,8 @@ class Task(Sensing, Generic[S, P]):
     def groups(self) -> Mapping[str, ObservationLayout]:
         """Layouts of further groups of observations by name, which are computed if a policy or a critic names them."""
         sensed = {ONBOARD: ObservationLayout(self.suite.blocks)} if self.params.senses else {}
-        return {"proprioception": PROPRIOCEPTION, **sensed}
+        sized = {ENTITIES: entity_layout(self.observation_layout)} if self.variable_num_agents else {}
+        return {"proprioception": PROPRIOCEPTION, **sensed, **sized}
 
     @property
     def group_sizes(self) -> dict[str, int]:
@@ -178,6 +189,9 @@ class Task(Sensing, Generic[S, P]):
 
     def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of one of `groups` by name (A, width)."""
+        if name == ENTITIES:
+            blocks, there = self.observe(state, robot_state), self.there(state) if self.varies else {}
+            return observe_entities(self.observation_layout, blocks, there, self.teams, state.active)
         sensed = jax.tree.map(lambda x: x[: self.num_agents], robot_state.proprioception)
         joints = sensed.joint_position - self.robot.default_joints
         return {"gravity": sensed.gravity_b, "joint_position": joints, "joint_velocity": sensed.joint_velocity}
@@ -214,6 +228,10 @@ class Task(Sensing, Generic[S, P]):
         `failed` () says whether a fall, a collision or diverged physics ends it.
         """
         return {"success": jnp.zeros(())}
+
+    def fields(self, state: State[S]) -> dict[str, jax.Array]:
+        """Returns further model fields that differ between environments, by their `mjModel` names."""
+        return {}
 
     def external_forces(self, state: State[S]) -> jax.Array | None:
         """Returns forces and torques on all bodies (nbody, 6), N and N m, world frame, or None."""

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.envs.base import finite
+from mqe_jax.envs.observation import finite
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, skill_of
 from mqe_jax.export.translate import Function

@@ -92,6 +92,10 @@ class Mixture:
         """Returns the mixture whose members act with their mean actions, or sample them."""
         return dataclasses.replace(self, members=tuple(member.acting(deterministic) for member in self.members))
 
+    def at_size(self, env: Any) -> Self:
+        """Returns the mixture whose members act in an environment; see `TrainedPolicy`."""
+        return dataclasses.replace(self, members=tuple(member.at_size(env) for member in self.members))
+
     @property
     def task(self) -> str:
         """Id of the task."""

@@ -75,6 +75,7 @@ def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
     Raises:
         InputError: if the policy does not fit the task.
     """
+    policy = policy.at_size(env)
     needs = policy.needs
     if (numbers := sum(sensor.action_size for sensor in env.params.senses)) and not needs.senses:
         view = _changed(env, params=dataclasses.replace(env.params, senses=()))

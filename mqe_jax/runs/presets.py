@@ -28,12 +28,15 @@ def preset(algorithm: str) -> dict[str, Any]:
 
 
 def named_config(name: str, task: str) -> TrainConfig:
-    """Returns the settings of a file, or of a shipped name; `league` has changes of some tasks."""
-    shipped = ["demo", "league"]
+    """Returns the settings of a file, or of a shipped name; `league` and `sizes` have changes of some tasks."""
+    shipped = ["demo", "league", "sizes"]
     shipped += [f"{file}/{part}" for file in ("paper", "tuned") for part in sorted(_parts(file)) if part != "common"]
     path, allowed = Path(check("config", name, PathText)), f"a YAML file, or one of {', '.join(shipped)}"
     if name == "demo":
         path = CONFIG_FOLDER / "demo.yaml"
+    elif name == "sizes":
+        usual = override(named_config(default_name(task), task), _parts(name)["common"])
+        return override(usual, _parts(name).get(task, {}))
     elif name in shipped:
         file, _, part = name.partition("/")
         common = override(TrainConfig(), _parts(file)["common"])
@@ -58,10 +61,15 @@ def base_config(
     if name is None and algorithm is not None:
         name = f"paper/{algorithm}"
     elif name is None:
-        name = f"tuned/{task}" if task in _parts("tuned") else "league" if _is_match(task) else "paper/mappo"
+        name = default_name(task)
     config = override(named_config(name, task), changes)
     sensing = env.get("senses", "full") not in ("full", (), [])
     return override(config, _parts("onboard")) if sensing and config.group == "policy" else config
+
+
+def default_name(task: str) -> str:
+    """Returns the name of the settings with which a task is trained by default."""
+    return f"tuned/{task}" if task in _parts("tuned") else "league" if _is_match(task) else "paper/mappo"
 
 
 def _is_match(task: str) -> bool:

@@ -1,8 +1,10 @@
 """What a policy needs of its environment: its file holds it, and `mqe_jax.train.policy.check_policy` compares it."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from mqe_jax.core.blocks import Block, entities
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.settings import FrozenMapping, Parameters, Range, check_arguments, fail, leaves, record
 from mqe_jax.core.types import AnyEnvironment, teams_of
@@ -57,11 +59,24 @@ class Needs:
         needs |= {"layout": self.layout} | {name: form for name, form in forms.items() if form}
         return needs | {"observation": self.dims.observation, "action": self.dims.action}
 
+    def at_size(self, found: "Needs") -> "Needs":
+        """Returns these needs with the numbers of agents and entities in others, if blocks differ in nothing else."""
+        own, other = ([_one(block) for block in needs.dims.blocks] for needs in (self, found))
+        if not own or own != other:
+            return self
+        return dataclasses.replace(self, dims=found.dims._replace(action=self.dims.action), layout=found.layout)
+
     def mismatches(self, found: "Needs") -> dict[str, tuple[Any, Any]]:
         """Returns what these needs and those of an environment differ in: the values of both by name."""
         own, other = self.by_name(), found.by_name()
         known = [x for x in dict.fromkeys((*own, *other)) if self.dims.blocks or not x.startswith("layout.")]
         return {x: (own.get(x), other.get(x)) for x in known if own.get(x) != other.get(x)}
+
+
+def _one(block: Block) -> Block:
+    """Returns a block with one of its entities."""
+    of = block.entities
+    return block if of is None else entities(block.name, of.kind, 1, of.width, masked=of.masked)
 
 
 @check_arguments(env=AnyEnvironment, config=TrainConfig)

@@ -97,6 +97,11 @@ class NetworkSettings:
         """The observations on which `Network.value` depends; others may be missing at the end of a step."""
         return "obs", "privileged_obs"
 
+    @property
+    def any_size(self) -> bool:
+        """Whether what a policy holds does not depend on the numbers of agents and of entities in a block."""
+        return False
+
     def features(self, dims: EnvDims) -> Features | None:
         """Returns which statistics normalise the entries of an observation; None: each entry has its own."""
         return None
@@ -232,6 +237,10 @@ class Blocks(ActorCritic):
     """Channels of the convolutions of images, each of which halves height and width."""
     image_size: Width = 64
     """Width of the layer after the convolutions."""
+
+    @property
+    def any_size(self) -> bool:
+        return self.share_policy
 
     def features(self, dims: EnvDims) -> Features:
         from mqe_jax.train.normalize import features_of

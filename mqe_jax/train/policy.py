@@ -164,6 +164,13 @@ class TrainedPolicy:
         """Returns the policy that acts with its mean actions, or samples them."""
         return dataclasses.replace(self, deterministic=deterministic)
 
+    def at_size(self, env: Any) -> Self:
+        """Returns the policy for the numbers of agents and entities in an environment; itself if it has its own."""
+        if not self.config.network.any_size or self.needs.group not in getattr(env, "group_sizes", {}):
+            return self
+        needs = self.needs.at_size(needs_of(env, self.config))
+        return self if needs == self.needs else dataclasses.replace(self, needs=needs)
+
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the initial recurrent state: leading axis N, or none for a single environment."""
         num_envs = check("num_envs", num_envs, PositiveInt | None)

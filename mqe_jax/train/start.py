@@ -114,7 +114,7 @@ def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> Trai
     if start not in NAMED and not Path(start).exists():
         shipped = f"one of {', '.join(NAMED)}" if NAMED else "a shipped one's task, after `import mqe_jax.policies.zoo`"
         fail("start", start, f"a run folder, a policy file, or {shipped}")
-    policy = NAMED[start]() if start in NAMED else read_policy(start)
+    policy = (NAMED[start]() if start in NAMED else read_policy(start)).at_size(env)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     check_policy(policy, env, start, "start")
     if shapes != jax.tree.map(jnp.shape, policy.params):

@@ -125,8 +125,9 @@ class RobotState:
     active: jax.Array  # robots that take part (R,) bool; the others count nowhere
 
     def count(self, values: jax.Array) -> jax.Array:
-        """Returns values (R',) of the first R' robots, 0 for those that take no part."""
-        return jnp.where(self.active[: len(values)], values, jnp.zeros_like(values))
+        """Returns values (R', ...) of the first R' robots, 0 for those that take no part."""
+        active = self.active[: len(values)].reshape(-1, *(1,) * (values.ndim - 1))
+        return jnp.where(active, values, jnp.zeros_like(values))
 
     @property
     def euler(self) -> jax.Array:

@@ -1,19 +1,23 @@
 """Scripted policies (`--policy scripted`), one per task, acting like learned ones, and their steering."""
 
+import functools
 from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs.base import QuadrupedEnv
+from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.registry import NAMED_PLANNERS, PLANNERS, Planner, load
 
 # The blocks (A, width) of one environment's observations by name.
 Observation = Mapping[str, jax.Array]
 
+_FAR = 1e3  # m, x and y of who takes no part
 GAIN = 1.5  # 1/s, commanded speed per distance from the goal
 
 
@@ -46,7 +50,29 @@ def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.
         InputError: if the task has none of this name.
     """
     plan, layout = planner_of(env.name, name), env.observation_layout
+    if env.varies:
+        return functools.partial(_plan_with_absent, plan, layout)
     return lambda obs: plan(layout.split(obs))
+
+
+def _plan_with_absent(plan: Planner, layout: ObservationLayout, obs: jax.Array) -> jax.Array:
+    """Returns the actions (A, 3) of a policy that finds robots and other entities that take no part far away.
+
+    They are those whose entries are 0. The block `active` says which agents take part (A,); the others' actions are 0.
+    """
+    blocks = layout.split(obs)
+    active = jnp.any(obs != 0, axis=-1)
+    for block in layout.blocks:
+        if block.name == "base":
+            rows, there, away = blocks["base"], active[:, None], _FAR * (1.0 + np.arange(len(obs))[:, None])
+        elif block.entities is not None:
+            rows = blocks[block.name].reshape(len(obs), block.entities.count, -1)
+            there, away = jnp.any(rows != 0, axis=-1, keepdims=True), _FAR
+        else:
+            continue
+        far = rows.at[..., :2].set(away)
+        blocks[block.name] = jnp.where(there, rows, far).reshape(len(obs), -1)
+    return jnp.where(active[:, None], plan({**blocks, "active": active}), 0.0)
 
 
 def pose(base: jax.Array) -> tuple[jax.Array, jax.Array]:

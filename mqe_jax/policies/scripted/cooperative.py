@@ -73,10 +73,14 @@ _BESIDE = 0.7  # m, between robots that walk behind one sheep
 _FREE = 1.2  # m, between robots below which those of a larger team keep apart
 
 
-def _sides(agents: int) -> np.ndarray:
+def _sides(obs: Observation) -> np.ndarray | jax.Array:
     """Returns on which side of the sheep's path each robot walks (A, 1), from -1, the right, to 1."""
-    place = np.arange(agents) - (agents - 1) / 2
-    return (2 * place / max(agents - 1, 1)).astype(np.float32)[:, None]
+    agents = len(obs["base"])
+    if "active" not in obs:
+        place = np.arange(agents) - (agents - 1) / 2
+        return (2 * place / max(agents - 1, 1)).astype(np.float32)[:, None]
+    last = jnp.sum(obs["active"]) - 1
+    return ((2.0 * np.arange(agents) - last) / jnp.maximum(last, 1))[:, None]
 
 
 def _apart(position: jax.Array, goal: jax.Array) -> jax.Array:
@@ -100,7 +104,7 @@ def plan_sheep_easy(obs: Observation) -> jax.Array:
     way = gate + jnp.array([0.6, 0.0]) - sheep
     way = way / jnp.maximum(jnp.linalg.norm(way), 1e-3)
     across = jnp.array([-way[1], way[0]])
-    goal = sheep - 0.8 * way + _BESIDE * (len(position) - 1) / 2 * _sides(len(position)) * across
+    goal = sheep - 0.8 * way + _BESIDE * (len(position) - 1) / 2 * _sides(obs) * across
     return jnp.where(jnp.sum(left) > 0, go_to(position, yaw, _apart(position, goal)), 0.0)
 
 
@@ -111,7 +115,7 @@ def plan_sheep_hard(obs: Observation) -> jax.Array:
     the robot's side and close to it. Stragglers are thus driven back to the flock, whose cohesion keeps it together.
     Of more than two robots those in the middle prefer no side, and robots keep apart.
     """
-    side = _sides(len(obs["base"]))
+    side = _sides(obs)
     (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
     through = sheep[:, 0] > gate[0]
     way = sheep - gate - jnp.array([0.8, 0.0])
@@ -154,7 +158,7 @@ def plan_pushbox(obs: Observation) -> jax.Array:
     apart = position - box
     behind = apart @ along < -0.55
     lined_up = behind & (jnp.abs(apart @ across - lateral) < 0.15)
-    ready = jnp.all(lined_up)
+    ready = jnp.all(lined_up | ~obs.get("active", np.ones(len(position), bool)))
     # The robot on the side to which the box should turn pushes less.
     heading = jnp.clip(1.2 * offset, -0.35, 0.35)
     lead = jnp.clip(4.0 * (heading - turned), -0.7, 0.7) * -2.0 * column / max(columns - 1, 1)

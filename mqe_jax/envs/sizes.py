@@ -1,0 +1,234 @@
+"""Episodes with fewer robots than the scene has: which take part, where the others are parked, what all observe.
+
+A parked robot is high above the scene, where it touches nothing. Every step begins with it at rest there and with
+neutral targets, so that nothing in the step depends on its earlier state or its actions. Objects are parked likewise.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mqe_jax.core.settings import fail
+from mqe_jax.envs.observation import Block, ObservationLayout, by_entity, entities
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+    from mqe_jax.physics.scene import CompiledScene
+
+ENTITIES = "entities"
+"""Group of observations of teams of any size: their blocks differ between sizes in the number of entities only."""
+
+_HEIGHT, _ABOVE = 200.0, 1.0  # m, of the first parked robot, and of each further one above it
+_OUTSIDE, _RAISED = 2.0, 20.0  # m, of parked objects from the end of the track, and of the body of the first of them
+_PLACE = Block("place", 1, "the agent's place in its team: -1 the first, 1 the last, 0 if alone", categorical=True)
+_NEAR = 2  # entries that `observe_entities` adds to each entity
+
+
+def draw(key: jax.Array, fewest: int, most: int, level: jax.Array | float = 0.0) -> jax.Array:
+    """Returns a number () int32 from `fewest` to `most`, all alike; at a curriculum level () above 0, to fewer."""
+    beyond = jnp.round(level * (most - fewest)).astype(jnp.int32)
+    return jax.random.randint(key, (), fewest, most + 1 - beyond)
+
+
+def check_sizes(env: Any) -> None:
+    """Raises an InputError naming the parameter of an environment whose numbers of robots do not fit the task."""
+    params, expected, fewest = env.params, env.Params().num_agents, env.params.fewest_agents
+    if not env.variable_num_agents:
+        for name in ("num_agents", "fewest_agents"):
+            if getattr(params, name) not in (expected, None):
+                fail(name, getattr(params, name), f"{expected}, the size of {env.name}")
+    if fewest is not None and (fewest > params.num_agents or fewest % len(env.teams)):
+        even = ", and even, for two equal teams" if len(env.teams) > 1 else ""
+        fail("fewest_agents", fewest, f"at most num_agents, {params.num_agents}{even}")
+    if env.varies and params.senses:
+        fail("senses", [sensor.name for sensor in params.senses], "empty where teams or flocks vary in size")
+
+
+class Sizes:
+    """The numbers of robots that may take part in an episode of an environment; of teams, equally many of each."""
+
+    def __init__(self, env: Any) -> None:
+        params, teams, index = env.params, env.teams, env.index
+        fewest = env.num_agents if params.fewest_agents is None else params.fewest_agents
+        self.growing, self._count = params.growing, len(teams)
+        self._fewest, self._most = fewest // len(teams), env.num_agents // len(teams)
+        self.varies = self._fewest < self._most
+        if not self.varies:
+            return
+        place = np.concatenate([np.arange(len(team)) for team in teams])
+        sizes = np.arange(self._fewest, self._most + 1)
+        self._active = place < sizes[:, None]  # (K, A), of each number of robots in a team
+        full = np.array(env.spawn_poses())
+        self._shift = np.zeros((len(sizes), *full.shape), np.float32)  # of spawn poses (K, R, 3)
+        for row, size in enumerate(sizes.tolist()):
+            agents = np.flatnonzero(self._active[row])
+            self._shift[row, agents] = _poses(env, size * len(teams)) - full[agents]
+        self._neutral = env.controller.neutral
+        qpos = np.concatenate([index.base_qpos, index.joint_qpos], axis=1)[: env.num_agents]
+        qvel = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)[: env.num_agents]
+        agents = np.arange(env.num_agents)[:, None]
+        middle = env.compiled.scene.track.start + env.compiled.scene.track.length / 2
+        self._of_qpos, self._of_qvel = np.full(env.compiled.model.nq, -1), np.full(env.compiled.model.nv, -1)
+        self._of_qpos[qpos], self._of_qvel[qvel] = agents, agents  # the agent of each coordinate, -1 of others
+        self._parked = np.zeros(env.compiled.model.nq, np.float32)
+        upright = np.tile([middle, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *env.robot.default_joints], (env.num_agents, 1))
+        upright[:, 2] = _HEIGHT + _ABOVE * agents[:, 0]
+        self._parked[qpos] = upright
+
+    def draw(self, key: jax.Array, level: jax.Array) -> jax.Array:
+        """Returns which agents take part (A,) bool, the first ones of each team."""
+        if not self.varies:
+            return jnp.ones(self._most * self._count, bool)
+        size = draw(key, self._fewest, self._most, level * self.growing)
+        return jnp.asarray(self._active)[size - self._fewest]
+
+    def line_up(self, pose: jax.Array, active: jax.Array) -> jax.Array:
+        """Moves spawn poses x, y, z, yaw of all robots (R, 4) to those of a team of the active ones (A,)."""
+        if not self.varies:
+            return pose
+        number = jnp.sum(active) // self._count - self._fewest
+        return pose.at[:, np.array([0, 1, 3])].add(jnp.asarray(self._shift)[number])
+
+    def park(self, data: mjx.Data, active: jax.Array) -> mjx.Data:
+        """Returns data in which the robots that are not active (A,) are parked."""
+        if not self.varies:
+            return data
+        absent = jnp.append(~active, False)  # the last: of coordinates that are no agent's
+        moved, still = absent[self._of_qpos], absent[self._of_qvel]
+        return data.replace(
+            qpos=jnp.where(moved, self._parked, data.qpos),
+            qvel=jnp.where(still, 0.0, data.qvel),
+            qacc_warmstart=jnp.where(still, 0.0, data.qacc_warmstart),
+        )
+
+    def hold(self, target: jax.Array, active: jax.Array) -> jax.Array:
+        """Returns actuator targets (R, 12), neutral for the agents that are not active (A,)."""
+        if not self.varies:
+            return target
+        agents = len(active)
+        held = jnp.where(active[:, None], target[:agents], self._neutral[:agents])
+        return jnp.concatenate([held, target[agents:]])
+
+
+class Herd:
+    """Objects that slide along x and y, of which the first ones take part in an episode.
+
+    The coordinates of the others are beyond the end of the track. Their bodies are above it, inside of its walls, which
+    have no ends.
+    """
+
+    def __init__(self, compiled: CompiledScene, names: Sequence[str]) -> None:
+        end, number = compiled.scene.track.start + compiled.scene.track.length, np.arange(len(names))
+        objects = [compiled.objects[name] for name in names]
+        self._outside, self._rest = end + _OUTSIDE, np.asarray(compiled.model.body_pos, np.float32)
+        self._bodies, self._x = np.array([each.body for each in objects]), np.array([each.qpos[0] for each in objects])
+        self._raised = np.stack([0 * number - 2 * _OUTSIDE, 0 * number, number + _RAISED], axis=1).astype(np.float32)
+
+    def start(
+        self, key: jax.Array, grids: Sequence[tuple[np.ndarray, float]], level: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Returns positions (S, 2), m, and half the width of their noise (S, 1), m, of a number of objects, drawn.
+
+        `grids` are both for each number, up to all; the level is that of `draw`.
+        """
+        most = len(grids[-1][0])
+        start, spread = np.zeros((len(grids), most, 2), np.float32), np.zeros((len(grids), most, 1), np.float32)
+        start[..., 0] = self._outside
+        for row, (grid, noise) in enumerate(grids):
+            start[row, : len(grid)], spread[row, : len(grid)] = grid, noise
+        row = draw(key, 0, len(grids) - 1, level)
+        return jnp.asarray(start)[row], jnp.asarray(spread)[row]
+
+    def there(self, data: mjx.Data) -> jax.Array:
+        """Returns which objects take part (S,) bool."""
+        return data.qpos[self._x] < self._outside - _OUTSIDE / 2
+
+    def fields(self, data: mjx.Data) -> dict[str, jax.Array]:
+        """Returns the model field that raises the bodies of the others."""
+        raised = jnp.where(self.there(data)[:, None], 0.0, self._raised)
+        return {"body_pos": jnp.asarray(self._rest).at[self._bodies].add(raised)}
+
+
+def _poses(env: Any, agents: int) -> np.ndarray:
+    """Returns the spawn poses x, y, yaw (A', 3) of a number of agents in the scene of that size."""
+    other = copy.copy(env)
+    other.params = dataclasses.replace(env.params, num_agents=agents, fewest_agents=None)
+    other.num_agents = agents
+    other.compiled = dataclasses.replace(env.compiled, layout=other.scene().track.layout())
+    return np.array(other.spawn_poses())[:agents]
+
+
+def robots_there(teams: Sequence[Sequence[int]], active: jax.Array) -> dict[str, jax.Array]:
+    """Returns who is there of the blocks of each agent's teammates and opponents (A, count) bool, in their order."""
+    mates = [[other for other in team if other != agent] for team in teams for agent in team]
+    rivals = [[other for rival in teams if rival is not team for other in rival] for team in teams for _ in team]
+    return {"teammate": active[np.array(mates, int)], "opponents": active[np.array(rivals, int)]}
+
+
+def hide(layout: ObservationLayout, obs: jax.Array, there: Mapping[str, jax.Array]) -> jax.Array:
+    """Returns observations (A, O) in which the entries of entities that are not there (A, count) are 0."""
+    parts = []
+    for block in layout.blocks:
+        shown = there.get(block.name)
+        if block.entities is None or shown is None:
+            parts.append(jnp.ones((len(obs), block.width), bool))
+        else:
+            parts.append(jnp.repeat(shown, block.width // block.entities.count, axis=1))
+    return jnp.where(jnp.concatenate(parts, axis=1), obs, 0.0)
+
+
+def entity_layout(layout: ObservationLayout) -> ObservationLayout:
+    """Returns the blocks of the group `entities` of a task, from those of its group `policy`.
+
+    Each entity has its entries there, whose first two are its x and y, m, then those relative to the agent. There is a
+    block of teammates, empty, also in a team of one. The one-hot is replaced by the agent's place in its team.
+    """
+    blocks = [_PLACE]
+    mates = entities("teammate", "robot", 1, 6)
+    for block in layout.blocks:
+        if (of := block.entities) is not None:
+            meaning = f"{block.meaning}; x, y from the agent, m"
+            blocks.append(entities(block.name, of.kind, of.count, of.width + _NEAR, meaning, masked=True))
+        elif not block.categorical:
+            blocks.append(block)
+        if block.name == "base" and "teammate" not in layout.names:
+            blocks.append(entities("teammate", "robot", 1, 6 + _NEAR, mates.meaning, masked=True))
+    return ObservationLayout(tuple(blocks))
+
+
+def observe_entities(
+    layout: ObservationLayout,
+    blocks: Mapping[str, jax.Array],
+    there: Mapping[str, jax.Array],
+    teams: Sequence[Sequence[int]],
+    active: jax.Array,
+) -> dict[str, jax.Array]:
+    """Returns the blocks (A, width) of `entity_layout(layout)` from those of the layout.
+
+    `there` says by block which entities are there (A, count) bool, by default all; a mask of the layout counts too.
+    """
+    agents = len(active)
+    place = np.concatenate([np.arange(len(team)) for team in teams])
+    last = jnp.concatenate([jnp.full(len(team), jnp.sum(active[np.array(team)]) - 1) for team in teams])
+    own = jnp.where(last > 0, 2.0 * place / jnp.maximum(last, 1) - 1.0, 0.0)
+    found = {_PLACE.name: own[:, None]}
+    for block in layout.blocks:
+        if (of := block.entities) is not None:
+            rows = blocks[block.name].reshape(agents, of.count, -1)
+            shown = there.get(block.name, jnp.ones(rows.shape[:2], bool))
+            shown = shown & (rows[..., -1] > 0.5) if of.masked else shown
+            near = rows[..., :_NEAR] - blocks["base"][:, None, :_NEAR]
+            found[block.name] = by_entity(jnp.concatenate([rows[..., : of.width], near], axis=-1), shown)
+        elif not block.categorical:
+            found[block.name] = blocks[block.name]
+    if "teammate" not in layout.names:
+        found["teammate"] = jnp.zeros((agents, 6 + _NEAR + 1))
+    return found

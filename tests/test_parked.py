@@ -1,0 +1,209 @@
+"""Episodes in which some robots and sheep take no part, and policies of any size."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mqe_jax.core.settings import build
+from mqe_jax.envs import make
+from mqe_jax.envs.sizes import ENTITIES
+from mqe_jax.policies import load_policy
+from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.runs.presets import base_config
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.needs import needs_of
+from mqe_jax.train.normalize import running_init
+from mqe_jax.train.policy import TrainedPolicy, save_policy
+from tests.inputs import refuses
+from tests.training import random_params
+
+BALL, SHEEP = "go1football-1vs1", "go1sheep-hard"
+LARGE: dict[str, dict[str, Any]] = {
+    BALL: {"num_agents": 6, "fewest_agents": 2},
+    SHEEP: {"num_agents": 4, "fewest_agents": 2, "num_sheep": 5, "fewest_sheep": 3, "restlessness": 0.0},
+}
+SMALL: dict[str, dict[str, Any]] = {
+    BALL: {"num_agents": 4},
+    SHEEP: {"num_agents": 3, "num_sheep": 4, "restlessness": 0.0},
+}
+PLACES = {BALL: [0, 1, 3, 4], SHEEP: [0, 1, 2]}  # of the small scene's robots in the large one
+NETWORK = {"name": "blocks", "recurrent": False, "hidden_sizes": (8,), "entity_sizes": (6, 5), "critic_input": "own"}
+
+
+@functools.cache
+def sized(task: str, large: bool) -> Any:
+    return make(task, impl="c", control="position", num_envs=1, **(LARGE if large else SMALL)[task])
+
+
+@functools.cache
+def program(env: Any) -> Callable[..., Any]:
+    """Compiled: the next state with the group of entities, and the scripted policy's actions in it."""
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, list[jax.Array]]:
+        after = env.with_observations(env.advance(state, action), [ENTITIES])
+        return after, [scripted_policy(env)(after.obs[np.array(team)]) for team in env.teams]
+
+    return jax.jit(step)
+
+
+@functools.cache
+def resets(env: Any) -> Any:
+    """Compiled resets of keys at levels of assistance."""
+    return jax.jit(jax.vmap(env.reset))
+
+
+@functools.cache
+def begun(task: str) -> Any:
+    """A state of the large scene in which the robots of the small one take part, and fewer sheep than there are."""
+    env = sized(task, True)
+    states = resets(env)(jax.random.split(jax.random.PRNGKey(0), 40), jnp.zeros(40))
+    count = np.asarray(states.active).sum(axis=1)
+    if task == SHEEP:
+        sheep = np.asarray(jax.vmap(env.herd.there)(states.data)).sum(axis=1)
+        count = np.where(sheep == SMALL[task]["num_sheep"], count, 0)
+    row = int(np.flatnonzero(count == SMALL[task]["num_agents"])[0])
+    return jax.tree.map(lambda x: x[row] if np.shape(x)[:1] == (40,) else x, states)
+
+
+@pytest.mark.parametrize("task", [BALL, SHEEP])
+def test_nothing_that_a_parked_robot_is_or_does_changes_anything_for_the_others(task: str) -> None:
+    env, start = sized(task, True), begun(task)
+    index, random, absent = env.index, np.random.default_rng(0), np.flatnonzero(~np.asarray(start.active))
+    rows = np.concatenate([index.base_qpos, index.joint_qpos], axis=1)[absent]
+    speeds = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)[absent]
+    assert np.asarray(start.data.qpos)[index.base_qpos[absent, 2]].min() > 100
+
+    def forge(state: Any) -> Any:
+        fields = {name: np.array(getattr(state.data, name)) for name in ("qpos", "qvel", "qacc_warmstart")}
+        fields["qpos"][rows] += random.uniform(-9, 9, rows.shape)
+        for name in ("qvel", "qacc_warmstart"):
+            fields[name][speeds] = random.uniform(-9, 9, speeds.shape)
+        return dataclasses.replace(state, data=state.data.replace(**fields))
+
+    state = other = start
+    actions = random.uniform(-1, 1, (3, env.num_agents, 12)).astype(np.float32)
+    acts: Any = None
+    for action in actions:
+        forged = action.copy()
+        forged[absent] = np.nan
+        (state, acts), (other, others) = program(env)(state, action), program(env)(forge(other), forged)
+        jax.tree.map(np.testing.assert_array_equal, (state, acts), (other, others))
+    assert not state.terminated and np.isfinite(np.concatenate(acts)).all()
+    assert not state.obs[absent].any() and not state.groups[ENTITIES][absent].any()
+    assert not np.asarray(state.reward)[absent].any() and np.asarray(state.reward).any()
+    assert np.any(np.asarray(program(env)(state, actions[0])[0].obs != program(env)(state, actions[1])[0].obs))
+
+
+def policy(task: str, env: Any, **settings: Any) -> TrainedPolicy:
+    """A policy with random weights that sees entities."""
+    settings = {"task": task, "env": {"control": "position"}, "group": ENTITIES, "network": NETWORK, **settings}
+    config = build(TrainConfig, settings)
+    needs = needs_of(env, config)
+    network = config.network.build(needs.dims)
+    statistics = running_init(needs.dims.observation, config.network.features(needs.dims))
+    return TrainedPolicy(network.policy_params(random_params(network)), statistics, needs, config, {})
+
+
+@pytest.mark.parametrize("task", [BALL, SHEEP])
+def test_fewer_robots_do_what_they_do_in_a_scene_of_their_number(task: str, tmp_path: Path) -> None:
+    """So do the sheep, the scripted policy, and a policy of any size, whose file was written at the other size."""
+    large, small, places = sized(task, True), sized(task, False), PLACES[task]
+    save_policy(tmp_path, policy(task, small))
+    one, many = (load_policy(tmp_path, env) for env in (small, large))
+    assert (one.agents, many.agents) == (len(small.teams[0]), len(large.teams[0]))
+    few, full = jax.tree.map(lambda x: x[0], resets(small)(jax.random.PRNGKey(2)[None], jnp.zeros(1))), begun(task)
+    fields = {name: np.array(getattr(full.data, name)) for name in ("qpos", "qvel")}
+    for name, field in fields.items():
+        own = np.asarray(getattr(few.data, name))
+        for kind in (f"base_{name}", f"joint_{name}"):
+            field[getattr(large.index, kind)[places]] = own[getattr(small.index, kind)]
+        for thing, found in small.objects.items():
+            field[getattr(large.objects[thing], name)] = own[getattr(found, name)]
+    data = full.data.replace(**fields, mocap_pos=few.data.mocap_pos)
+    full = dataclasses.replace(full, data=data, anchors=few.anchors, frozen_steps=full.frozen_steps * 0)
+    few = dataclasses.replace(few, frozen_steps=few.frozen_steps * 0)
+    few_acts: Any = None
+    full_acts: Any = None
+    for action in np.random.default_rng(0).uniform(-1, 1, (3, small.num_agents, 12)).astype(np.float32):
+        every = np.zeros((large.num_agents, 12), np.float32)
+        every[places] = action
+        (few, few_acts), (full, full_acts) = program(small)(few, action), program(large)(full, every)
+    close = functools.partial(np.testing.assert_allclose, atol=2e-4)
+    close(full.data.qpos[large.index.base_qpos[places]], few.data.qpos[small.index.base_qpos])
+    for thing, found in small.objects.items():
+        close(full.data.qpos[large.objects[thing].qpos], few.data.qpos[found.qpos])
+    close(full.reward[np.array(places)], few.reward)
+    close(np.concatenate(full_acts)[places], np.concatenate(few_acts))
+    mine, theirs = np.array(small.teams[0]), np.array(large.teams[0])
+    acted = many.act(full.groups[ENTITIES][theirs], many.initial_memory(None), None)[0]
+    close(acted[: len(mine)], one.act(few.groups[ENTITIES][mine], one.initial_memory(None), None)[0])
+
+
+@pytest.mark.parametrize("task", [BALL, SHEEP])
+def test_sizes_are_drawn_evenly_and_start_where_teams_of_that_size_do(task: str) -> None:
+    env = sized(task, True)
+    states = resets(env)(jax.random.split(jax.random.PRNGKey(0), 40), jnp.zeros(40))
+    active, teams = np.asarray(states.active), len(env.teams)
+    counts = active.sum(axis=1)
+    assert {*counts.tolist()} == {*range(LARGE[task]["fewest_agents"], env.num_agents + 1, teams)}
+    for team in env.teams:  # the first ones, equally many of each
+        np.testing.assert_array_equal(active[:, team], np.arange(len(team)) < counts[:, None] / teams)
+    places, own = np.asarray(states.data.qpos)[:, env.index.base_qpos[:, :2]], sized(task, False)
+    few = counts == own.num_agents
+    off = places[few][:, PLACES[task]] - np.array(own.spawn_poses())[:, :2]
+    assert 0.02 < np.abs(off).max() <= env.params.spawn_noise + 1e-5
+    if task == SHEEP:
+        sheep = np.asarray(jax.vmap(env.herd.there)(states.data))
+        assert {*sheep.sum(axis=1).tolist()} == {3, 4, 5}
+        np.testing.assert_array_equal(sheep, np.arange(5) < sheep.sum(axis=1, keepdims=True))
+        start, noise = own.params.flock_grid()
+        found = np.asarray(jax.vmap(env.sheep)(states.data))[sheep.sum(axis=1) == 4, :4] - start
+        assert 0.1 < np.abs(found).max() <= noise + 1e-5
+
+
+def test_with_assistance_teams_are_small_if_they_grow() -> None:
+    env: Any = make(SHEEP, impl="c", control="position", num_envs=1, **LARGE[SHEEP], growing=True)
+    levels = jnp.repeat(jnp.array([0.0, 0.5, 1.0]), 30)
+    states = resets(env)(jax.random.split(jax.random.PRNGKey(0), 90), levels)
+    robots = np.asarray(states.active).sum(axis=1).reshape(3, 30)
+    sheep = np.asarray(jax.vmap(env.herd.there)(states.data)).sum(axis=1).reshape(3, 30)
+    assert [{*row.tolist()} for row in robots] == [{2, 3, 4}, {2, 3}, {2}]
+    assert [{*row.tolist()} for row in sheep] == [{3, 4, 5}, {3, 4}, {3}]
+
+
+REFUSED = [
+    ("go1tug", {"fewest_agents": 1}, "fewest_agents: 1 .* must be 2, the size of go1tug"),
+    (BALL, {"num_agents": 6, "fewest_agents": 3}, "fewest_agents: 3 .* at most num_agents, 6, and even"),
+    ("go1gate", {"fewest_agents": 3}, "fewest_agents: 3 .* at most num_agents, 2"),
+    (SHEEP, {"fewest_sheep": 10}, "fewest_sheep: 10 .* at most 9, the number of sheep"),
+    (SHEEP, {"fewest_sheep": 5, "senses": "onboard"}, "senses: .* empty where teams or flocks vary"),
+]
+
+
+@pytest.mark.parametrize(("task", "settings", "said"), REFUSED, ids=str)
+def test_a_range_of_sizes_that_does_not_fit_is_refused_by_name(task: str, settings: dict[str, Any], said: str) -> None:
+    refuses(said, make, task, impl="c", **settings)
+
+
+def test_a_policy_with_a_size_is_refused_at_another_one(tmp_path: Path) -> None:
+    small, large = sized(BALL, False), sized(BALL, True)
+    for number, settings in enumerate([{"group": "policy"}, {"network": {**NETWORK, "share_policy": False}}]):
+        save_policy(tmp_path / str(number), policy(BALL, small, **settings))
+        refuses("policy: .* needs agents 2; the environment has 3", load_policy, tmp_path / str(number), large)
+
+
+@pytest.mark.parametrize("task", [BALL, SHEEP])
+def test_shipped_settings_train_a_range_of_sizes(task: str) -> None:
+    config: Any = base_config(task, "sizes")
+    usual: Any = base_config(task, None)
+    assert (config.group, config.network.name) == (ENTITIES, "blocks")
+    assert config.training_env["fewest_agents"] < config.env["num_agents"] and "fewest_agents" not in config.env
+    assert config.imitation == usual.imitation and config.network.hidden_sizes == usual.network.hidden_sizes
+    assert config.train_env.items() >= usual.train_env.items()
