@@ -268,6 +268,14 @@ def test_self_play_trains_against_a_snapshot_and_a_scripted_opponent() -> None:
     assert results.shape == (2, 3) and results.sum(axis=1).tolist() == [2, 2]
 
 
+@pytest.mark.soak
+@pytest.mark.usefixtures("small")
+def test_a_team_of_four_learns_football(capsys: pytest.CaptureFixture[str]) -> None:
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "large_teams.py"), run_name="__main__")
+    assert example["run"].policy.agents == 4 and len(example["run"].metrics["updates"]) == 2
+    assert "\nwin " in capsys.readouterr().out
+
+
 NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
 CLIPS = {"quickstart": 1, "tour": 2, "design_a_task": 1, "compare_algorithms": 0}
 
