@@ -157,7 +157,7 @@ def test_ranges_beyond_training_warn() -> None:
         ({"gait": "pace"}, "gait 'trot'; .* has 'pace'"),
         ({"needs.task": "go1tug"}, "task 'go1tug'; .* has 'go1football-1vs1'"),
         ({"needs.version": 7}, "version 7; .* has 1"),
-        ({"needs.group": "camera"}, "group 'camera'; .* has 'policy, proprioception'"),
+        ({"needs.group": "camera"}, "group 'camera'; .* has 'entities, policy, proprioception'"),
         ({"needs.layout": "base 19 = 19"}, "layout 'base 19 = 19'; .* has 'one_hot 1 "),
         ({"needs.dims": EnvDims(2, 19, 108, 3, 1)}, "agents 2; .* has 1"),
         ({"needs.dims": EnvDims(1, 18, 108, 3, 1)}, "observation 18; .* has 19"),
