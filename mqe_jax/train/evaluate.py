@@ -166,14 +166,14 @@ class Result:
 
     def __repr__(self) -> str:
         about = {name: str(self.about[name]) for name in ("policy", "opponent") if name in self.about}
-        if "actions" in self.about:
+        if {"policy", "actions"} <= self.about.keys():
             about["policy"] += f", {self.about['actions']} actions"
         sides = ", on both sides" if self.about.get("sides") == "both" else ""
         who = {"task": self.task, **about, "episodes": f"{self.episodes}{sides}"}
         hidden = {f"ending/{name}" for name, share in self.endings.items() if share == 0}
         rates = {name: rate for name, rate in self.rates.items() if name not in hidden}
         if self.match:
-            del rates["success_rate"]  # that of `win`
+            rates.pop("success_rate", None)  # that of `win`
         rates = {_plain_words(name): rate for name, rate in rates.items()}
         outcomes = {_plain_words(name): mean for name, mean in self.outcomes.items()}
         means = {"steps per episode": self.episode_length, "return": self.episode_return, **outcomes}
