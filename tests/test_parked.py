@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 
 from mqe_jax.core.settings import build
-from mqe_jax.envs import make
+from mqe_jax.envs import Moment, make
 from mqe_jax.envs.sizes import ENTITIES
+from mqe_jax.npc import flock
 from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.policies.scripted.cooperative import _sides
+from mqe_jax.runs.build import make_learner
 from mqe_jax.runs.presets import base_config
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
@@ -25,13 +28,14 @@ from tests.inputs import refuses
 from tests.training import random_params
 
 BALL, SHEEP = "go1football-1vs1", "go1sheep-hard"
+LOW = {"spawn_height": 0.3, "randomization": {"motor_offset": 0.05}}  # m, so that robots stand at once; rad
 LARGE: dict[str, dict[str, Any]] = {
-    BALL: {"num_agents": 6, "fewest_agents": 2},
-    SHEEP: {"num_agents": 4, "fewest_agents": 2, "num_sheep": 5, "fewest_sheep": 3, "restlessness": 0.0},
+    BALL: {"num_agents": 6, "fewest_agents": 2, **LOW},
+    SHEEP: {"num_agents": 4, "fewest_agents": 2, "num_sheep": 5, "fewest_sheep": 3, "restlessness": 0.0, **LOW},
 }
 SMALL: dict[str, dict[str, Any]] = {
-    BALL: {"num_agents": 4},
-    SHEEP: {"num_agents": 3, "num_sheep": 4, "restlessness": 0.0},
+    BALL: {"num_agents": 4, **LOW},
+    SHEEP: {"num_agents": 3, "num_sheep": 4, "restlessness": 0.0, **LOW},
 }
 PLACES = {BALL: [0, 1, 3, 4], SHEEP: [0, 1, 2]}  # of the small scene's robots in the large one
 NETWORK = {"name": "blocks", "recurrent": False, "hidden_sizes": (8,), "entity_sizes": (6, 5), "critic_input": "own"}
@@ -72,33 +76,50 @@ def begun(task: str) -> Any:
     return jax.tree.map(lambda x: x[row] if np.shape(x)[:1] == (40,) else x, states)
 
 
+def forged(env: Any, state: Any) -> Any:
+    """A state, or a batch of states, whose parked robots are elsewhere and move."""
+    index, random, absent = env.index, np.random.default_rng(1), ~np.asarray(state.active)
+    kinds = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "qvel"}
+    fields = {name: np.array(getattr(state.data, name)) for name in kinds}
+    for values, kind in zip(fields.values(), kinds.values(), strict=True):
+        rows = np.concatenate([getattr(index, f"base_{kind}"), getattr(index, f"joint_{kind}")], axis=1)
+        values[..., rows] += absent[..., None] * random.uniform(-9, 9, rows.shape)
+    return dataclasses.replace(state, data=state.data.replace(**fields))
+
+
 @pytest.mark.parametrize("task", [BALL, SHEEP])
 def test_nothing_that_a_parked_robot_is_or_does_changes_anything_for_the_others(task: str) -> None:
     env, start = sized(task, True), begun(task)
-    index, random, absent = env.index, np.random.default_rng(0), np.flatnonzero(~np.asarray(start.active))
-    rows = np.concatenate([index.base_qpos, index.joint_qpos], axis=1)[absent]
-    speeds = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)[absent]
-    assert np.asarray(start.data.qpos)[index.base_qpos[absent, 2]].min() > 100
-
-    def forge(state: Any) -> Any:
-        fields = {name: np.array(getattr(state.data, name)) for name in ("qpos", "qvel", "qacc_warmstart")}
-        fields["qpos"][rows] += random.uniform(-9, 9, rows.shape)
-        for name in ("qvel", "qacc_warmstart"):
-            fields[name][speeds] = random.uniform(-9, 9, speeds.shape)
-        return dataclasses.replace(state, data=state.data.replace(**fields))
-
+    random, absent = np.random.default_rng(0), np.flatnonzero(~np.asarray(start.active))
+    assert np.asarray(start.data.qpos)[env.index.base_qpos[absent, 2]].min() > 100
     state = other = start
     actions = random.uniform(-1, 1, (3, env.num_agents, 12)).astype(np.float32)
     acts: Any = None
     for action in actions:
-        forged = action.copy()
-        forged[absent] = np.nan
-        (state, acts), (other, others) = program(env)(state, action), program(env)(forge(other), forged)
+        bad = action.copy()
+        bad[absent] = np.nan
+        (state, acts), (other, others) = program(env)(state, action), program(env)(forged(env, other), bad)
         jax.tree.map(np.testing.assert_array_equal, (state, acts), (other, others))
     assert not state.terminated and np.isfinite(np.concatenate(acts)).all()
     assert not state.obs[absent].any() and not state.groups[ENTITIES][absent].any()
     assert not np.asarray(state.reward)[absent].any() and np.asarray(state.reward).any()
+    seen = env.privileged_layout.split(state.privileged_obs)
+    assert [bool(seen[f"robot{robot}/quaternion"].any()) for robot in range(len(start.active))] == start.active.tolist()
+    np.testing.assert_array_equal(state.data.ctrl[env.index.actuator[absent]], env.controller.neutral[absent])
     assert np.any(np.asarray(program(env)(state, actions[0])[0].obs != program(env)(state, actions[1])[0].obs))
+
+
+@pytest.mark.soak
+def test_an_update_is_the_same_whatever_parked_robots_are() -> None:
+    settings = {"num_envs": 4, "rollout_steps": 4, "ppo.minibatches": 1, "ppo.epochs": 2, "time_limit_ends": False}
+    settings |= {"group": ENTITIES, "network": {**NETWORK, "critic_input": "privileged"}, "imitation.teacher": None}
+    init, update = make_learner(SHEEP, settings, env={**LARGE[SHEEP], "control": "position"}, impl="c")
+    state, update = jax.jit(init)(jax.random.PRNGKey(0)), jax.jit(update)
+    assert not np.all(state.rollout.env_state.active)
+    other = forged(sized(SHEEP, True), state.rollout.env_state)
+    other = dataclasses.replace(state, rollout=state.rollout._replace(env_state=other))
+    assert np.any(np.asarray(other.rollout.env_state.data.qpos != state.rollout.env_state.data.qpos))
+    jax.tree.map(np.testing.assert_array_equal, update(other), update(state))
 
 
 def policy(task: str, env: Any, **settings: Any) -> TrainedPolicy:
@@ -127,8 +148,15 @@ def test_fewer_robots_do_what_they_do_in_a_scene_of_their_number(task: str, tmp_
         for thing, found in small.objects.items():
             field[getattr(large.objects[thing], name)] = own[getattr(found, name)]
     data = full.data.replace(**fields, mocap_pos=few.data.mocap_pos)
-    full = dataclasses.replace(full, data=data, anchors=few.anchors, frozen_steps=full.frozen_steps * 0)
-    few = dataclasses.replace(few, frozen_steps=few.frozen_steps * 0)
+    full = dataclasses.replace(full, data=data, anchors=few.anchors)
+    few, full = (
+        dataclasses.replace(
+            state,
+            frozen_steps=state.frozen_steps * 0,
+            randomized=dataclasses.replace(state.randomized, motor_offset=state.randomized.motor_offset * 0),
+        )
+        for state in (few, full)
+    )
     few_acts: Any = None
     full_acts: Any = None
     for action in np.random.default_rng(0).uniform(-1, 1, (3, small.num_agents, 12)).astype(np.float32):
@@ -144,6 +172,28 @@ def test_fewer_robots_do_what_they_do_in_a_scene_of_their_number(task: str, tmp_
     mine, theirs = np.array(small.teams[0]), np.array(large.teams[0])
     acted = many.act(full.groups[ENTITIES][theirs], many.initial_memory(None), None)[0]
     close(acted[: len(mine)], one.act(few.groups[ENTITIES][mine], one.initial_memory(None), None)[0])
+
+
+def test_sheep_that_take_no_part_do_not_belong_to_the_flock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.zeros(shape))
+    random, there = np.random.default_rng(0), jnp.arange(6) < 4
+    position, velocity, robots = (jnp.asarray(random.normal(size=(n, 2)), jnp.float32) for n in (6, 6, 2))
+    step = functools.partial(flock, jax.random.PRNGKey(0), restlessness=0.3, step=0.02)
+    some, four = step(position, velocity, robots, there=there), step(position[:4], velocity[:4], robots)
+    np.testing.assert_allclose(some, np.concatenate([four, np.zeros((2, 2))]), atol=1e-6)
+    four_robots, three_robots = ({"base": jnp.zeros((n, 6))} for n in (4, 3))
+    np.testing.assert_allclose(_sides({**four_robots, "active": jnp.arange(4) < 3})[:3], _sides(three_robots))
+
+
+def test_a_parked_robot_does_not_touch_the_ball_below_it() -> None:
+    env, start = sized(BALL, True), begun(BALL)
+    beside = np.array(start.data.qpos)
+    beside[env.index.base_qpos[1, :2]] = env.ball_spot[0] + 0.55, env.ball_spot[1]  # further than the parked ones
+    moved = np.array(start.data.qvel)
+    moved[env.objects["ball"].qvel[0]] = 1.0
+    states = [start, dataclasses.replace(start, data=start.data.replace(qpos=beside, qvel=moved))]
+    before, after = (Moment(state, env.read(state.data, state.active)) for state in states)
+    assert env.touches(before, after).tolist() == [False, True, False, False, False, False]
 
 
 @pytest.mark.parametrize("task", [BALL, SHEEP])

@@ -30,10 +30,11 @@ _HEIGHT, _ABOVE = 200.0, 1.0  # m, of the first parked robot, and of each furthe
 _OUTSIDE, _RAISED = 2.0, 20.0  # m, of parked objects from the end of the track, and of the body of the first of them
 _PLACE = Block("place", 1, "the agent's place in its team: -1 the first, 1 the last, 0 if alone", categorical=True)
 _NEAR = 2  # entries that `observe_entities` adds to each entity
+_NO_MATES = entities("teammate", "robot", 1, 6 + _NEAR, "none in a team of one", masked=True)
 
 
 def draw(key: jax.Array, fewest: int, most: int, level: jax.Array | float = 0.0) -> jax.Array:
-    """Returns a number () int32 from `fewest` to `most`, all alike; at a curriculum level () above 0, to fewer."""
+    """Returns a number () int32 from `fewest` to `most`, all alike; at a curriculum level () of 1 only the fewest."""
     beyond = jnp.round(level * (most - fewest)).astype(jnp.int32)
     return jax.random.randint(key, (), fewest, most + 1 - beyond)
 
@@ -58,10 +59,10 @@ class Sizes:
     def __init__(self, env: Any) -> None:
         params, teams, index = env.params, env.teams, env.index
         fewest = env.num_agents if params.fewest_agents is None else params.fewest_agents
-        self.growing, self._count = params.growing, len(teams)
+        self._growing, self._count = params.growing, len(teams)
         self._fewest, self._most = fewest // len(teams), env.num_agents // len(teams)
-        self.varies = self._fewest < self._most
-        if not self.varies:
+        self._vary = self._fewest < self._most
+        if not self._vary:
             return
         place = np.concatenate([np.arange(len(team)) for team in teams])
         sizes = np.arange(self._fewest, self._most + 1)
@@ -85,21 +86,21 @@ class Sizes:
 
     def draw(self, key: jax.Array, level: jax.Array) -> jax.Array:
         """Returns which agents take part (A,) bool, the first ones of each team."""
-        if not self.varies:
+        if not self._vary:
             return jnp.ones(self._most * self._count, bool)
-        size = draw(key, self._fewest, self._most, level * self.growing)
+        size = draw(key, self._fewest, self._most, level * self._growing)
         return jnp.asarray(self._active)[size - self._fewest]
 
     def line_up(self, pose: jax.Array, active: jax.Array) -> jax.Array:
         """Moves spawn poses x, y, z, yaw of all robots (R, 4) to those of a team of the active ones (A,)."""
-        if not self.varies:
+        if not self._vary:
             return pose
         number = jnp.sum(active) // self._count - self._fewest
         return pose.at[:, np.array([0, 1, 3])].add(jnp.asarray(self._shift)[number])
 
     def park(self, data: mjx.Data, active: jax.Array) -> mjx.Data:
         """Returns data in which the robots that are not active (A,) are parked."""
-        if not self.varies:
+        if not self._vary:
             return data
         absent = jnp.append(~active, False)  # the last: of coordinates that are no agent's
         moved, still = absent[self._of_qpos], absent[self._of_qvel]
@@ -111,7 +112,7 @@ class Sizes:
 
     def hold(self, target: jax.Array, active: jax.Array) -> jax.Array:
         """Returns actuator targets (R, 12), neutral for the agents that are not active (A,)."""
-        if not self.varies:
+        if not self._vary:
             return target
         agents = len(active)
         held = jnp.where(active[:, None], target[:agents], self._neutral[:agents])
@@ -192,7 +193,6 @@ def entity_layout(layout: ObservationLayout) -> ObservationLayout:
     block of teammates, empty, also in a team of one. The one-hot is replaced by the agent's place in its team.
     """
     blocks = [_PLACE]
-    mates = entities("teammate", "robot", 1, 6)
     for block in layout.blocks:
         if (of := block.entities) is not None:
             meaning = f"{block.meaning}; x, y from the agent, m"
@@ -200,7 +200,7 @@ def entity_layout(layout: ObservationLayout) -> ObservationLayout:
         elif not block.categorical:
             blocks.append(block)
         if block.name == "base" and "teammate" not in layout.names:
-            blocks.append(entities("teammate", "robot", 1, 6 + _NEAR, mates.meaning, masked=True))
+            blocks.append(_NO_MATES)
     return ObservationLayout(tuple(blocks))
 
 
@@ -230,5 +230,5 @@ def observe_entities(
         elif not block.categorical:
             found[block.name] = blocks[block.name]
     if "teammate" not in layout.names:
-        found["teammate"] = jnp.zeros((agents, 6 + _NEAR + 1))
+        found["teammate"] = jnp.zeros((agents, _NO_MATES.width))
     return found
