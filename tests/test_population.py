@@ -127,11 +127,14 @@ def test_an_evaluation_has_the_mean_and_the_worst_case(fake: Path, monkeypatch: 
     assert (result.episodes, result.diverged, result.about["opponent"]) == (8, 2, "population/1")
     assert result.about["sides"] == "both" and result.terms == {"win": 1.25}
     shown, rows = result.to_dict(), result.rows()
-    assert {name: shown[name] for name in shown if "win_rate" in name} == {
+    assert {name: shown[name] for name in shown if name.split("/")[0].endswith(("win_rate", "loss_rate"))} == {
         "win_rate": 0.625,
+        "loss_rate": 0.0,
         "worst_win_rate": 0.5,
         "win_rate/population/1/idle": 0.5,
         "win_rate/population/1/early": 0.75,
+        "loss_rate/population/1/idle": 0.0,
+        "loss_rate/population/1/early": 0.0,
     }
     assert (rows["win_rate"], rows["worst_win_rate"]) == (repr(Rate.of(0.625, 8)), repr(Rate.of(0.5, 4)))
     assert json.dumps(shown)

@@ -25,17 +25,8 @@ ROOT = Path(__file__).parents[1]
 DATA, PAGE = ROOT / "results" / "strength", ROOT / "docs" / "results" / "strength.md"
 COOPERATIVE = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender")
 MATCHES = ("go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
-PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
+PARTS = ("cooperative", "matches", "population")
 EPISODES = 512
-CONDITIONS = {
-    "usual": "usual",
-    "slippery": "friction 0.5",
-    "payload": "3 kg more",
-    "weak-motors": "motors 80%",
-    "delay": "delay 40 ms",
-    "noise": "noise 0.05",
-    "go2": "Go2",
-}
 INK, BLUE, RED, PALE = "#23252b", "#4f86e0", "#b5316f", "#b9bdc6"
 
 Rates = dict[tuple[str, str, str], Rate]
@@ -105,7 +96,7 @@ def population(found: Rates) -> str:
     for task in MATCHES:
         every = members(found, task)
         worst = min(every, key=lambda name: every[name].value)
-        mean = found[task, "default", "win_rate"]
+        mean = found[task, "plain", "win_rate"]
         body.append([f"`{task}`", mean.percent, every[worst].percent, worst])
     return table(("match", "mean wins", "fewest wins", "against"), body)
 
@@ -123,22 +114,6 @@ def exploitability() -> str:
         largest = [f"{100 * float(best[name]):.1f}" for name in ("value", "low", "high")]
         body.append([f"`{task}`", *cells.values(), "{} ({} to {})".format(*largest)])
     return table(("match", "from scratch", "from the team", "exploitability at least"), body)
-
-
-def robustness(found: Rates) -> str:
-    """Returns the table of the usual rate and of the worst condition."""
-    body = []
-    for task in (*COOPERATIVE, *MATCHES):
-        every = {name: robust(found, task, name) for name in CONDITIONS if name not in ("usual", "go2")}
-        worst = min(every, key=lambda name: every[name].value)
-        usual, other = robust(found, task, "usual"), robust(found, task, "go2")
-        body.append([f"`{task}`", usual.percent, every[worst].percent, CONDITIONS[worst], other.percent])
-    return table(("task", "usual", "worst condition", "which", "Go2"), body)
-
-
-def robust(found: Rates, task: str, condition: str) -> Rate:
-    """Returns success, of a match wins, under a condition."""
-    return found[task, condition, "win_rate" if task in MATCHES else "success_rate"]
 
 
 def mates(task: str) -> dict[str, Rate]:
@@ -194,29 +169,9 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
     return drawn(figure)
 
 
-def draw_heat(found: Rates) -> bytes:
-    """Returns a picture of success or wins of each task under each condition."""
-    every = (*COOPERATIVE, *MATCHES)
-    values = [[100 * robust(found, task, name).value for name in CONDITIONS] for task in every]
-    figure = Figure((7.6, 4.2), dpi=105, layout="constrained")
-    axes = figure.subplots()
-    axes.imshow(values, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.75)
-    for i, line in enumerate(values):
-        for j, value in enumerate(line):
-            axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=8, color=INK)
-    axes.set_xticks(range(len(CONDITIONS)), list(CONDITIONS.values()), fontsize=8)
-    axes.set_yticks(range(len(every)), every, fontsize=8)
-    axes.xaxis.tick_top()
-    axes.tick_params(length=0)
-    axes.axhline(len(COOPERATIVE) - 0.5, color="white", lw=3)
-    axes.spines[:].set_visible(False)
-    return drawn(figure)
-
-
 def update() -> None:
     """Writes the pictures and fills the page."""
     found = {part: rates(part) for part in PARTS}
-    robust_rates = found["robustness"] | found["robustness-matches"]
     learned = {
         task: {each: found["cooperative"][task, each, "success_rate"] for each in ("sampled", "mean", "scripted")}
         for task in COOPERATIVE
@@ -231,7 +186,6 @@ def update() -> None:
         "population.png": draw_intervals({t: members(found["population"], t) for t in MATCHES}, "wins, %"),
         "mates.png": draw_intervals({task: mates(task) for task in COOPERATIVE}, "success, %"),
         "exploitability.png": draw_leads(rows("exploitability")),
-        "robustness.png": draw_heat(robust_rates),
     }
     for name, content in pictures.items():
         write_atomically(PAGE.parent / name, content)
@@ -240,7 +194,6 @@ def update() -> None:
         "matches": matches(found["matches"]),
         "population": population(found["population"]),
         "exploitability": exploitability(),
-        "robustness": robustness(robust_rates),
     }
     write_atomically(PAGE, filled(PAGE.read_text("utf-8"), tables).encode())
 

@@ -131,8 +131,9 @@ class Result:
         own |= {f"ending/{name}": share for name, share in self.endings.items()}
         bounded = {name: min(max(value, 0.0), 1.0) for name, value in own.items() if not math.isnan(value)}  # rounding
         found = {name: Rate.of(value, self.episodes) for name, value in bounded.items()}
-        members = {f"win_rate/{name}": result.rates["win_rate"] for name, result in self.by_opponent.items()}
-        return found | members | ({"worst_win_rate": min(members.values())} if members else {})
+        every = {name: result.rates for name, result in self.by_opponent.items()}
+        members = {f"{rate}/{name}": each[rate] for rate in ("win_rate", "loss_rate") for name, each in every.items()}
+        return found | members | ({"worst_win_rate": min(each["win_rate"] for each in every.values())} if every else {})
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values for JSON; the entries of all mappings but `terms` become top-level keys.
@@ -144,7 +145,7 @@ class Result:
         named = {"ending": self.endings, "success": self.outcomes}
         flat = {f"{kind}/{name}": value for kind, values in named.items() for name, value in values.items()}
         rates = self.rates
-        flat |= {name: rate.value for name, rate in rates.items() if "win_rate" in name}
+        flat |= {name: rate.value for name, rate in rates.items() if "/" in name or name == "worst_win_rate"}
         intervals = {name: [rate.low, rate.high] for name, rate in rates.items()}
         return {"task": self.task, **self.about, **values, **self.match, **flat, "intervals": intervals}
 
