@@ -66,10 +66,10 @@ def cooperative(found: Rates) -> str:
     body = []
     for task in COOPERATIVE:
         mode = zoo.card(task).mode
-        variant = "mean" if mode == "deterministic" else "default"
-        early = sum(found.get((task, variant, f"ending/{name}"), Rate(0, 0, 0)).value for name in ("fall", "collision"))
+        acts = "mean" if mode == "deterministic" else "sampled"
+        early = sum(found[task, acts, f"ending/{name}"].value for name in ("fall", "collision"))
         shown = [found[task, each, "success_rate"].percent for each in ("sampled", "mean", "scripted")]
-        body.append([f"`{task}`", "mean" if variant == "mean" else "sampled", *shown, Rate.of(early, EPISODES).percent])
+        body.append([f"`{task}`", acts, *shown, Rate.of(early, EPISODES).percent])
     return table(("task", "acts with", "sampled", "mean", "scripted", "falls and collisions"), body)
 
 
@@ -164,7 +164,7 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
     axes.set_xlabel("wins minus losses of the best response, points", fontsize=9, color=INK)
     for color, text in ((BLUE, "trained from scratch"), (RED, "trained from the team itself")):
         axes.plot([], [], "o-", color=color, label=text)
-    axes.legend(fontsize=8, frameon=False, loc="lower left")
+    axes.legend(fontsize=8, frameon=False, loc="lower right")
     axes.spines[["top", "right"]].set_visible(False)
     return drawn(figure)
 
