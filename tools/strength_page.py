@@ -113,7 +113,8 @@ def exploitability() -> str:
         best = max(own, key=lambda row: float(row["value"]))
         largest = [f"{100 * float(best[name]):.1f}" for name in ("value", "low", "high")]
         body.append([f"`{task}`", *cells.values(), "{} ({} to {})".format(*largest)])
-    return table(("match", "from scratch", "from the team", "exploitability at least"), body)
+    head = ("match", "response from scratch", "response that starts from the team", "exploitability at least")
+    return table(head, body)
 
 
 def mates(task: str) -> dict[str, Rate]:
