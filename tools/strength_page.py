@@ -25,8 +25,17 @@ ROOT = Path(__file__).parents[1]
 DATA, PAGE = ROOT / "results" / "strength", ROOT / "docs" / "results" / "strength.md"
 COOPERATIVE = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender")
 MATCHES = ("go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
-PARTS = ("cooperative", "matches", "population")
+PARTS = ("cooperative", "matches", "population", "robustness")
 EPISODES = 512
+CONDITIONS = {
+    "usual": "usual",
+    "slippery": "friction 0.5",
+    "payload": "3 kg more",
+    "weak-motors": "motors 80%",
+    "delay": "delay 40 ms",
+    "noise": "noise 0.05",
+    "go2": "Go2",
+}
 INK, BLUE, RED, PALE = "#23252b", "#4f86e0", "#b5316f", "#b9bdc6"
 
 Rates = dict[tuple[str, str, str], Rate]
@@ -117,6 +126,22 @@ def exploitability() -> str:
     return table(head, body)
 
 
+def robustness(found: Rates) -> str:
+    """Returns the table of the usual rate and of the worst condition."""
+    body = []
+    for task in COOPERATIVE:
+        every = {name: robust(found, task, name) for name in CONDITIONS if name not in ("usual", "go2")}
+        worst = min(every, key=lambda name: every[name].value)
+        usual, other = robust(found, task, "usual"), robust(found, task, "go2")
+        body.append([f"`{task}`", usual.percent, every[worst].percent, CONDITIONS[worst], other.percent])
+    return table(("task", "usual", "worst condition", "which", "Go2"), body)
+
+
+def robust(found: Rates, task: str, condition: str) -> Rate:
+    """Returns success under a condition."""
+    return found[task, condition, "success_rate"]
+
+
 def mates(task: str) -> dict[str, Rate]:
     """Returns the success of teams of one seed and of two, and with a scripted or idle robot, there with its range."""
     data = json.loads((DATA / f"crossplay_{task}.json").read_text("utf-8"))
@@ -170,6 +195,23 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
     return drawn(figure)
 
 
+def draw_heat(found: Rates) -> bytes:
+    """Returns a picture of success in each task under each condition."""
+    values = [[100 * robust(found, task, name).value for name in CONDITIONS] for task in COOPERATIVE]
+    figure = Figure((7.6, 2.5), dpi=105, layout="constrained")
+    axes = figure.subplots()
+    axes.imshow(values, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.75)
+    for i, line in enumerate(values):
+        for j, value in enumerate(line):
+            axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=8, color=INK)
+    axes.set_xticks(range(len(CONDITIONS)), list(CONDITIONS.values()), fontsize=8)
+    axes.set_yticks(range(len(COOPERATIVE)), COOPERATIVE, fontsize=8)
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    return drawn(figure)
+
+
 def update() -> None:
     """Writes the pictures and fills the page."""
     found = {part: rates(part) for part in PARTS}
@@ -186,6 +228,7 @@ def update() -> None:
         "wins.png": draw_intervals(against, "wins, %"),
         "population.png": draw_intervals({t: members(found["population"], t) for t in MATCHES}, "wins, %"),
         "mates.png": draw_intervals({task: mates(task) for task in COOPERATIVE}, "success, %"),
+        "robustness.png": draw_heat(found["robustness"]),
         "exploitability.png": draw_leads(rows("exploitability")),
     }
     for name, content in pictures.items():
@@ -195,6 +238,7 @@ def update() -> None:
         "matches": matches(found["matches"]),
         "population": population(found["population"]),
         "exploitability": exploitability(),
+        "robustness": robustness(found["robustness"]),
     }
     write_atomically(PAGE, filled(PAGE.read_text("utf-8"), tables).encode())
 
