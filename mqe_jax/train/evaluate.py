@@ -195,7 +195,7 @@ class Result:
 def _plain_words(name: str) -> str:
     """Returns the name of a result as its table shows it; a population's members keep theirs."""
     short = re.sub("_rate$|_rate(?=/)", "", name).replace("ending/", "ends by ")
-    return short if short.startswith("win/") else short.replace("_", " ")
+    return short if short.startswith(("win/", "loss/")) else short.replace("_", " ")
 
 
 def pool(results: Mapping[str, Result], opponent: str) -> Result:
