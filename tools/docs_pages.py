@@ -126,7 +126,7 @@ def pages() -> dict[str, str]:
 def front(readme: str) -> str:
     """Returns the README as the site's first page: its links as from docs/, tasks linked to their pages."""
     page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
-    return re.sub(r"^(\| .*) `(go1[\w-]+)`:", r"\1 [`\2`](tasks/\2.md):", page, flags=re.MULTILINE)
+    return re.sub(r"^(\| .*) `(go1[\w-]+)` \|", r"\1 [`\2`](tasks/\2.md) |", page, flags=re.MULTILINE)
 
 
 def overview(tasks: Mapping[str, Any]) -> str:

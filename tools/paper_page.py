@@ -1,4 +1,4 @@
-"""Draws the figure and fills the tables of docs/results/paper.md from published runs; called by tools/publish.py.
+"""Draws the figure and fills the table of docs/results/paper.md from published runs; called by tools/publish.py.
 
 The text between `<!-- begin NAME -->` and `<!-- end NAME -->` is replaced; NAME is one of those in `sections`.
 """
@@ -17,12 +17,11 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
 from mqe_jax.study.estimates import Cells, Rows, aggregate_tables, estimate, final_rows, group
 from mqe_jax.study.figures import draw_curves
-from mqe_jax.study.report import markdown
 from mqe_jax.study.runs import Reference, Run, load_reference, table
 from mqe_jax.study.statistics import interquartile_mean
 
-PAPER, SCRATCH = "hierarchical", "scratch"
-"""Variants: the paper's settings with the walk policy, and the same from scratch."""
+PAPER = "hierarchical"
+"""Variant: the paper's settings with the walk policy."""
 MIN_SEEDS = 3
 """Seeds that a verdict requires: the interval of a single seed is a point."""
 
@@ -79,36 +78,24 @@ def estimated(cells: Cells, reference: Reference) -> Rows:
 
 
 def sections(estimates: Rows) -> dict[str, str]:
-    """Returns the generated sections of the page by name: Markdown tables."""
-    rewards, scratch = ([row for row in estimates if row["variant"] == name] for name in (PAPER, SCRATCH))
-    solved = {row["task"] for row in rewards if row["mean_high"] > 0}
-    names = {"task": "task", "algorithm": "algorithm", "training": "average step reward", "reference": "paper"}
-    return {
-        PAPER: pivot(rewards, {"training": "{}", "reference": "{}, paper"}),
-        SCRATCH: markdown(scratch, names | {"ours": "ours is"}),
-        "success": pivot([row for row in rewards if row["task"] in solved], {"success": "{}", "mean": "{}, mean"}),
-    }
+    """Returns the generated section of the page by name: a Markdown table of rewards, a line per task.
 
-
-def pivot(rows: Rows, columns: Mapping[str, str]) -> str:
-    """Returns a Markdown table with a line per task and `columns` of each algorithm: their headings, by its name."""
-    heads = [
-        head.format(name.upper())
-        for name in dict.fromkeys(row["algorithm"] for row in rows)
-        for head in columns.values()
-    ]
-    lines = [["task", *heads], ["---"] * (1 + len(heads))]
+    Two columns per algorithm: ours with its interval, bold if it lies above the paper's value, and the paper's.
+    """
+    rows = [row for row in estimates if row["variant"] == PAPER]
+    names = [name.upper() for name in dict.fromkeys(row["algorithm"] for row in rows)]
+    heads = ["task", *(head for name in names for head in (name, f"{name}, paper"))]
+    lines = [heads, ["---"] * len(heads)]
     for task in dict.fromkeys(row["task"] for row in rows):
-        lines.append([task, *(cell(row, name) for row in rows if row["task"] == task for name in columns)])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        cells = [(ours(row), f"{row['reference']:.3g}") for row in rows if row["task"] == task]
+        lines.append([task, *(text for pair in cells for text in pair)])
+    return {PAPER: "\n".join("| " + " | ".join(line) + " |" for line in lines)}
 
 
-def cell(row: Mapping[str, Any], name: str) -> str:
-    """Returns a value with its interval, success in %; bold is a reward whose interval is above the paper's value."""
-    form = "{:.3g}" if name in ("training", "reference") else "{:.1%}"
-    values = [form.format(row[key]).rstrip("%") for key in (name, f"{name}_low", f"{name}_high") if key in row]
-    text = values[0] if len(values) == 1 else "{} [{}, {}]".format(*values)
-    return f"**{text}**" if name == "training" and row["ours"] == "above" else text
+def ours(row: Mapping[str, Any]) -> str:
+    """Returns a reward with its interval, bold if that lies above the paper's value."""
+    text = "{training:.3g} [{training_low:.3g}, {training_high:.3g}]".format(**row)
+    return f"**{text}**" if row["ours"] == "above" else text
 
 
 def verdict(row: Mapping[str, Any]) -> str:

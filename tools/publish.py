@@ -1,7 +1,7 @@
 """Publishes sweeps: curves and evaluations as two compressed tables, and the page with their figure.
 
 `python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and evaluations.csv.gz in
-results/paper, thinned. It then regenerates the figure and tables of docs/results/paper.md, and the estimates in
+results/paper, thinned. It then regenerates the figure and the table of docs/results/paper.md, and the estimates in
 results/paper, from results/ alone; without a SWEEP only this.
 
 `python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into results/measurements.json under NAME.

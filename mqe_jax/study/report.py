@@ -58,11 +58,10 @@ _HEADINGS = {
 }
 
 
-def markdown(rows: Rows, names: Mapping[str, str] | None = None) -> str:
-    """Returns rows as a Markdown table of the columns `names`, with these headings; an interval joins its value."""
-    ends = [name for name in rows[0] if name in ("low", "high") or name.endswith(("_low", "_high"))]
-    names = names or {name: name for name in rows[0] if name not in ends}
-    lines = [list(names.values()), ["---"] * len(names), *([_format_cell(row, name) for name in names] for row in rows)]
+def markdown(rows: Rows) -> str:
+    """Returns rows as a Markdown table; an interval joins its value."""
+    names = [name for name in rows[0] if name not in ("low", "high") and not name.endswith(("_low", "_high"))]
+    lines = [names, ["---"] * len(names), *([_format_cell(row, name) for name in names] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
