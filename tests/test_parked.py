@@ -5,6 +5,7 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,9 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, save_policy
+from mqe_jax.view.stage import Stage
+from mqe_jax.viz import cameras, framing, geometry
+from mqe_jax.viz.recording import Episode
 from tests.inputs import refuses
 from tests.training import random_params
 
@@ -107,6 +111,21 @@ def test_nothing_that_a_parked_robot_is_or_does_changes_anything_for_the_others(
     assert [bool(seen[f"robot{robot}/quaternion"].any()) for robot in range(len(start.active))] == start.active.tolist()
     np.testing.assert_array_equal(state.data.ctrl[env.index.actuator[absent]], env.controller.neutral[absent])
     assert np.any(np.asarray(program(env)(state, actions[0])[0].obs != program(env)(state, actions[1])[0].obs))
+
+
+@pytest.mark.parametrize("task", [BALL, SHEEP])
+def test_pictures_show_those_who_take_part(task: str) -> None:
+    env, data = sized(task, True), begun(task).data
+    poses = (np.stack([np.asarray(x)] * 2) for x in (data.qpos, data.mocap_pos, data.mocap_quat))
+    episode = Episode(*poses, dt=env.dt)
+    model = geometry.rendering_model(env.mj_model, episode)
+    shown = [model.body(body).name for body in framing.targets(model, episode)]
+    others = ["object/ball"] if task == BALL else [f"object/sheep{number}" for number in range(4)]
+    assert shown == [*(f"robot{place}/trunk" for place in PLACES[task]), *others]
+    assert max(camera.position[2] for view in cameras.VIEWS for camera in cameras.cameras(model, episode, view)) < 20
+    stage, bodies = Stage(MagicMock(), env.mj_model, episode.cut(slice(1))), [*framing.targets(env.mj_model, episode)]
+    stage.draw(episode.cut(slice(1)), (0, bodies))
+    assert stage.span < 20
 
 
 @pytest.mark.soak

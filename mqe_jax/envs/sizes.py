@@ -26,8 +26,14 @@ if TYPE_CHECKING:
 ENTITIES = "entities"
 """Group of observations of teams of any size: their blocks differ between sizes in the number of entities only."""
 
-_HEIGHT, _ABOVE = 200.0, 1.0  # m, of the first parked robot, and of each further one above it
-_OUTSIDE, _RAISED = 2.0, 20.0  # m, of parked objects from the end of the track, and of the body of the first of them
+HIGH = 100.0
+"""Height above which only parked robots are, m."""
+
+OUTSIDE = 2.0
+"""Distance of parked objects from the end of the track, m."""
+
+_HEIGHT, _ABOVE = 2 * HIGH, 1.0  # m, of the first parked robot, and of each further one above it
+_RAISED = 20.0  # m, of the body of the first parked object
 _PLACE = Block("place", 1, "the agent's place in its team: -1 the first, 1 the last, 0 if alone", categorical=True)
 _NEAR = 2  # entries that `observe_entities` adds to each entity
 _NO_MATES = entities("teammate", "robot", 1, 6 + _NEAR, "none in a team of one", masked=True)
@@ -129,9 +135,9 @@ class Herd:
     def __init__(self, compiled: CompiledScene, names: Sequence[str]) -> None:
         end, number = compiled.scene.track.start + compiled.scene.track.length, np.arange(len(names))
         objects = [compiled.objects[name] for name in names]
-        self._outside, self._rest = end + _OUTSIDE, np.asarray(compiled.model.body_pos, np.float32)
+        self._outside, self._rest = end + OUTSIDE, np.asarray(compiled.model.body_pos, np.float32)
         self._bodies, self._x = np.array([each.body for each in objects]), np.array([each.qpos[0] for each in objects])
-        self._raised = np.stack([0 * number - 2 * _OUTSIDE, 0 * number, number + _RAISED], axis=1).astype(np.float32)
+        self._raised = np.stack([0 * number - 2 * OUTSIDE, 0 * number, number + _RAISED], axis=1).astype(np.float32)
 
     def start(
         self, key: jax.Array, grids: Sequence[tuple[np.ndarray, float]], level: jax.Array
@@ -150,7 +156,7 @@ class Herd:
 
     def there(self, data: mjx.Data) -> jax.Array:
         """Returns which objects take part (S,) bool."""
-        return data.qpos[self._x] < self._outside - _OUTSIDE / 2
+        return data.qpos[self._x] < self._outside - OUTSIDE / 2
 
     def fields(self, data: mjx.Data) -> dict[str, jax.Array]:
         """Returns the model field that raises the bodies of the others."""

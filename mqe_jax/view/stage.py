@@ -9,6 +9,7 @@ import trimesh
 from mjviser.conversions import is_fixed_body, merge_geoms
 
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs.sizes import HIGH
 from mqe_jax.physics.appearance import GROUND_GROUP
 from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, posed, rendering_model
 from mqe_jax.viz.recording import Episode
@@ -55,11 +56,15 @@ class Stage:
         self.draw(frame)
 
     def draw(self, frame: Episode, followed: tuple[int, list[int]] | None = None) -> None:
-        """Renders the environments' poses; the middle of `followed` (environment, bodies) is kept at the origin."""
+        """Renders the environments' poses; the middle of `followed` (environment, bodies) is kept at the origin.
+
+        Robots that take no part in the episode are not followed.
+        """
         positions, turns = self._poses(frame)
         with self._server.atomic():
-            if followed is not None:
-                places = positions[followed]
+            places = positions[followed] if followed else np.zeros((0, 3))
+            places = places[places[:, 2] < HIGH]
+            if len(places):
                 self.span = float(np.linalg.norm(np.ptp(places, axis=0)))
                 x, y, _ = (places.min(axis=0) + places.max(axis=0)) / 2
                 self._root.position = (-x, -y, 0.0)

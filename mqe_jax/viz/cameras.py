@@ -7,7 +7,7 @@ import numpy as np
 
 from mqe_jax.core.errors import known_name
 from mqe_jax.viz.framing import Camera, fit, goal_points, hidden, smooth, targets
-from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, posed, robot_bases
+from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, posed, shown_bases
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
@@ -48,7 +48,7 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
 
 def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
     """Returns the corners (8 x targets, 3) of boxes about the targets of each frame, m."""
-    bodies, robots = targets(model, episode), len(robot_bases(model))
+    bodies, robots = targets(model, episode), len(shown_bases(model))
     local, frames = body_boxes(model, bodies), []
     margins = _MARGIN * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for data in posed(model, episode, range(len(episode))):
@@ -79,7 +79,7 @@ def _direction(
 
 def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> float:
     """Returns how much robots are behind each other in the view of a camera, 0 to 1; `right` (3,) is its direction."""
-    robots, values = robot_bases(model), []
+    robots, values = shown_bases(model), []
     for data in posed(model, episode, range(len(episode))):
         apart = (data.xpos[robots][:, None] - data.xpos[robots])[np.triu_indices(len(robots), 1)][:, :2]
         across = np.abs(apart @ right[:2]) / np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
@@ -92,7 +92,7 @@ def _following(
 ) -> list[Camera]:
     """Returns a camera for each frame that contains the targets of all frames at most `width` away, and the goal."""
     views, (near, far) = [], _DISTANCES
-    far *= max(1.0, float(np.sqrt(len(robot_bases(model)) / _FEW)))
+    far *= max(1.0, float(np.sqrt(len(shown_bases(model)) / _FEW)))
     for index in range(len(points)):
         around = points[max(0, index - width) : index + width + 1]
         corners = np.stack([np.min(around, axis=0), np.max(around, axis=0)]).reshape(-1, 3)
@@ -101,7 +101,7 @@ def _following(
 
 
 def _beside(model: mujoco.MjModel, episode: Episode) -> list[Camera]:
-    robot, views = robot_bases(model)[0], []
+    robot, views = shown_bases(model)[0], []
     for data in posed(model, episode, range(len(episode))):
         x, y, _ = data.xpos[robot]
         views.append(Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0))

@@ -15,7 +15,7 @@ from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.sensors.marks import Marks
-from mqe_jax.viz.geometry import box_corners, extent, posed, robot_bases, robot_color, scenery_geoms
+from mqe_jax.viz.geometry import box_corners, extent, posed, robot_color, scenery_geoms, shown_bases
 from mqe_jax.viz.recording import Episode
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
     axes.axis("off")
-    bases, scenery, robots = robot_bases(model), [], []
+    bases, scenery, robots = shown_bases(model), [], []
     for geom in scenery_geoms(model):
         moves = model.body_dofnum[model.body_rootid[model.geom_bodyid[geom]]] > 0
         face = "#c9ced6" if moves else "#3a3d45"

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GOAL_SITE, HIDDEN_GROUP
 from mqe_jax.sensors.marks import Marks
-from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose_boxes, posed, robot_bases, robot_color
+from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose_boxes, posed, robot_bases, robot_color, shown_bases
 from mqe_jax.viz.recording import Episode
 
 _ROOM = 1.07  # factor of the distance at which the points would reach the image's edges
@@ -123,7 +123,7 @@ _CLEAR = 0.5  # opacity below which a geom hides nothing
 
 def targets(model: mujoco.MjModel, episode: Episode) -> list[int]:
     """Returns the ids of the bodies that a clip shows: robots, then moving objects and NPCs."""
-    return [*robot_bases(model), *moving_bodies(model, episode)]
+    return [*shown_bases(model), *moving_bodies(model, episode)]
 
 
 def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
@@ -145,7 +145,7 @@ def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> 
     """
     model = copy.deepcopy(model)
     model.geom_group[model.geom_rgba[:, 3] < _CLEAR] = HIDDEN_GROUP
-    bodies, trunks = targets(model, episode), len(robot_bases(model))
+    bodies, trunks = targets(model, episode), len(shown_bases(model))
     local = body_boxes(model, bodies)
     groups = np.array([group != HIDDEN_GROUP for group in range(mujoco.mjNGROUP)], np.uint8)
     rows = []

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import mujoco
 import numpy as np
 
+from mqe_jax.envs.sizes import HIGH, OUTSIDE
 from mqe_jax.physics.appearance import GROUND_GROUP, HIDDEN_GROUP
 from mqe_jax.viz.recording import Episode
 
@@ -25,8 +26,25 @@ def robot_bases(model: mujoco.MjModel) -> list[int]:
     return bases
 
 
+def shown_bases(model: mujoco.MjModel) -> list[int]:
+    """Returns the ids of the trunks of visible robots; in a rendering model, of those that take part."""
+    return [body for body in robot_bases(model) if _drawn(model, body)]
+
+
+def _drawn(model: mujoco.MjModel, body: int) -> bool:
+    """Returns whether a visible geom belongs to a body or to one that hangs on it."""
+    geoms = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+    return bool(np.any(model.geom_group[geoms] != HIDDEN_GROUP))
+
+
+def _hide(model: mujoco.MjModel, bodies: Sequence[int]) -> None:
+    """Hides bodies with all that hang on them."""
+    roots = model.body_rootid[model.geom_bodyid]
+    model.geom_group[np.isin(roots, model.body_rootid[np.array(bodies, int)])] = HIDDEN_GROUP
+
+
 def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
-    """Returns the ids of objects and NPCs that move in the episode: free, sliding or mocap bodies, excluding robots."""
+    """Returns the ids of visible objects and NPCs that move in the episode: free, sliding or mocap, no robots."""
     moved = np.ptp(episode.mocap_pos, axis=0).max(-1) > 0.05 if model.nmocap else np.zeros(0, bool)
     bodies = [body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and moved[model.body_mocapid[body]]]
     robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
@@ -35,7 +53,7 @@ def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
         body = int(model.jnt_bodyid[joint])
         if int(model.jnt_type[joint]) in translations and int(model.body_rootid[body]) not in robots:
             bodies.append(body)
-    return sorted(set(bodies))
+    return sorted(body for body in set(bodies) if _drawn(model, body))
 
 
 def robot_color(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
@@ -108,7 +126,7 @@ def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndar
     points = []
     for index in np.unique(np.linspace(0, len(episode) - 1, 30).astype(int)):
         pose(model, data, episode, int(index))
-        for body in robot_bases(model):
+        for body in shown_bases(model):
             points += [data.xpos[body] - [0.4, 0.4, 0.3], data.xpos[body] + [0.4, 0.4, 0.2]]
     for geom in scenery_geoms(model):
         points += list(box_corners(model, data, geom))
@@ -120,16 +138,21 @@ def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndar
 def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
     """Returns a rendering copy of the model, in which mocap walls end at the track's side walls.
 
-    A gate's walls are long enough for every sampled gap position; the overhang beyond the side walls is hidden.
+    A gate's walls are long enough for every sampled gap position; the overhang beyond the side walls is hidden. So are
+    the robots and sliding objects that take no part in the episode.
     """
     model = copy.deepcopy(model)
+    data = next(posed(model, episode, [0]))
+    _hide(model, [body for body in robot_bases(model) if data.xpos[body, 2] > HIGH])
     box = int(mujoco.mjtGeom.mjGEOM_BOX)
     shown = [geom for geom in scenery_geoms(model) if int(model.geom_type[geom]) == box]
     fixed = [geom for geom in shown if int(model.geom_bodyid[geom]) == 0]
     if not fixed:
         return model
-    data = next(posed(model, episode, [0]))
-    sides = np.concatenate([box_corners(model, data, geom)[:, 1] for geom in fixed])
+    corners = np.concatenate([box_corners(model, data, geom) for geom in fixed])
+    sliding = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE)]
+    _hide(model, [body for body in sliding if data.xpos[body, 0] > corners[:, 0].max() + OUTSIDE / 2])
+    sides = corners[:, 1]
     for geom in shown:
         if model.body_mocapid[model.geom_bodyid[geom]] < 0:
             continue
