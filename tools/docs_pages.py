@@ -135,7 +135,7 @@ def overview(tasks: Mapping[str, Any]) -> str:
     for name, task in tasks.items():
         env = task(num_envs=1, impl="c")
         kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Cooperative"
-        image = f"[![{_seen(task)}]({_clip(name)})]({name}.md)<br>" if _clip(name) else ""
+        image = f"[![{task.title}: {task.aim}]({_clip(name)})]({name}.md)<br>" if _clip(name) else ""
         robots = " vs ".join(str(len(team)) for team in env.teams)
         sizes = f"{robots} robots, {env.observation_size} numbers observed by each, {env.params.episode_length:g} s"
         kinds[kind].append(f"- {image}[**{task.title}**]({name}.md) `{name}`: {sizes}")
@@ -155,7 +155,7 @@ def task_page(task: Any) -> str:
     policy = "shipped" if name in zoo.names() else "scripted" if name in PLANNERS else "forward"
     flags, against = (" --opponent scripted", " against the scripted one") if len(env.teams) > 1 else ("", "")
     caption = f"A typical success of the {policy} policy{against}: [how good it is](../results/strength.md)."
-    media = [f"![{_seen(task)}]({_clip(name)})", caption] if _clip(name) else []
+    media = [f"![{task.title}: {task.aim}]({_clip(name)})", caption] if _clip(name) else []
     commands = {
         f"mqe render {name}{flags} -o clip.webp": f"a clip of the {policy} policy",
         f"mqe view {name}{flags}": "live, in the browser",
@@ -187,13 +187,6 @@ def task_page(task: Any) -> str:
         "## Parameters\n\n" + _fields(type(env.params), "default", skip=("rewards", "randomization")),
     ]
     return "\n\n".join(sections) + "\n"
-
-
-def _seen(task: Any) -> str:
-    """Returns the alternative text of a task's clip, that of the page about the policies' strength."""
-    text = (ROOT / "docs" / "results" / "strength.md").read_text(encoding="utf-8")
-    found = re.search(rf"!\[([^\]]+)\]\(\.\./clips/{task.name}\.webp\)", text)
-    return f"{task.title}: {found[1]}" if found else task.title
 
 
 def _clip(name: str) -> str | None:

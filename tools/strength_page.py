@@ -2,21 +2,22 @@
 
 `python tools/strength_page.py` reads the rates that `mqe sweep configs/strength.yaml --part PART` measured, as
 results/strength/PART.csv, and the best responses in exploitability.csv. `python tools/strength_page.py --rates FOLDER`
-first copies FOLDER/PART/rates.csv, the tables of the parts that were measured.
+first copies FOLDER/PART/rates.csv of every part that FOLDER has. The table of other conditions has a row for each task
+that is measured under all of them.
 """
 
 import argparse
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from paper_page import filled, reduced
 
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
 from mqe_jax.policies import zoo
 from mqe_jax.train.evaluate import Rate
@@ -25,18 +26,18 @@ ROOT = Path(__file__).parents[1]
 DATA, PAGE = ROOT / "results" / "strength", ROOT / "docs" / "results" / "strength.md"
 COOPERATIVE = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender")
 MATCHES = ("go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
-PARTS = ("cooperative", "matches", "population", "robustness")
-EPISODES = 512
+PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
+EPISODES, MEMBER_EPISODES = 512, 256
 CONDITIONS = {
     "usual": "usual",
-    "slippery": "friction 0.5",
-    "payload": "3 kg more",
-    "weak-motors": "motors 80%",
-    "delay": "delay 40 ms",
-    "noise": "noise 0.05",
+    "slippery": "friction",
+    "payload": "payload",
+    "weak-motors": "motors",
+    "delay": "delay",
+    "noise": "noise",
     "go2": "Go2",
 }
-INK, BLUE, RED, PALE = "#23252b", "#4f86e0", "#b5316f", "#b9bdc6"
+INK, BLUE, RED = "#23252b", "#4f86e0", "#b5316f"
 
 Rates = dict[tuple[str, str, str], Rate]
 """Rates by task, variant and name."""
@@ -60,9 +61,14 @@ def rate(row: dict[str, str]) -> Rate:
     return Rate(float(row["value"]), float(row["low"]), float(row["high"]))
 
 
-def rates(part: str) -> Rates:
-    """Returns the rates of a part of the sweep."""
-    return {(row["task"], row["variant"], row["rate"]): rate(row) for row in rows(part)}
+def rates(part: str, by: str = "variant") -> Rates:
+    """Returns the rates of a part of the sweep, none if it is not measured; `by` is the column that names variants.
+
+    By actions, policies that are not trained keep their variant's name.
+    """
+    if not (DATA / f"{part}.csv").is_file():
+        return {}
+    return {(row["task"], row[by] or row["variant"], row["rate"]): rate(row) for row in rows(part)}
 
 
 def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
@@ -71,101 +77,124 @@ def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
 
 
 def cooperative(found: Rates) -> str:
-    """Returns the table of success and of what ends episodes early."""
+    """Returns the table of success and of what ends episodes early; `found` has rates by actions."""
     body = []
     for task in COOPERATIVE:
-        mode = zoo.card(task).mode
-        acts = "mean" if mode == "deterministic" else "sampled"
-        early = sum(found[task, acts, f"ending/{name}"].value for name in ("fall", "collision"))
-        shown = [found[task, each, "success_rate"].percent for each in ("sampled", "mean", "scripted")]
-        body.append([f"`{task}`", acts, *shown, Rate.of(early, EPISODES).percent])
-    return table(("task", "acts with", "sampled", "mean", "scripted", "falls and collisions"), body)
+        actions = "mean" if zoo.card(task).mode == "deterministic" else "sampled"
+        early = sum(found[task, actions, f"ending/{name}"].value for name in ("fall", "collision"))
+        success = found[task, actions, "success_rate"]
+        body.append([f"`{task}`", actions, success.percent, Rate.of(early, EPISODES).percent])
+    return table(("task", "actions", "success", "falls and collisions"), body)
+
+
+def against(found: Rates, task: str, opponent: str) -> tuple[Rate, Rate]:
+    """Returns wins against an opponent and losses to it."""
+    return found[task, opponent, "win_rate"], found[task, opponent, "loss_rate"]
 
 
 def matches(found: Rates) -> str:
-    """Returns the table of wins and losses against weaker teams."""
-    shown = (("scripted", "win_rate"), ("scripted", "loss_rate"), ("idle", "win_rate"), ("random", "win_rate"))
-    body = [[f"`{task}`", *(found[task, *each].percent for each in shown)] for task in MATCHES]
-    return table(("match", "wins, scripted", "losses, scripted", "wins, idle", "wins, random"), body)
+    """Returns the table of wins and losses against the scripted team."""
+    body = [[f"`{task}`", *(each.percent for each in against(found, task, "scripted"))] for task in MATCHES]
+    return table(("match", "wins", "losses"), body)
 
 
-def members(found: Rates, task: str) -> dict[str, Rate]:
-    """Returns the wins against each member of the population."""
-    prefix = "win_rate/"
-    return {
-        name.removeprefix(prefix).split("/")[-1]: value
-        for (of, _, name), value in found.items()
-        if of == task and name.startswith(prefix)
-    }
+def members(found: Rates, task: str) -> dict[str, list[Rate]]:
+    """Returns by member of the population wins against it and losses to it."""
+    every: dict[str, list[Rate]] = {}
+    for kind in ("win_rate/", "loss_rate/"):
+        for (of, _, name), value in found.items():
+            if of == task and name.startswith(kind):
+                every.setdefault(name.split("/")[-1], []).append(value)
+    return every
+
+
+def population_rates() -> Rates:
+    """Returns the rates against the population, none unless losses to its members are measured."""
+    found = rates("population")
+    return found if any(name.startswith("loss_rate/") for _, _, name in found) else {}
+
+
+def lead(win: Rate, loss: Rate, episodes: int) -> Rate:
+    """Returns wins minus losses with a conservative 95% interval, that of `mqe exploit`."""
+    value = win.value - loss.value
+    return Rate(value, *(2 * bound - 1 for bound in Rate.of(0.5 + 0.5 * value, episodes)[1:]))
 
 
 def population(found: Rates) -> str:
-    """Returns the table of mean and worst wins against the population."""
+    """Returns the table of mean wins and losses against the population, and of the smallest lead."""
     body = []
     for task in MATCHES:
-        every = members(found, task)
-        worst = min(every, key=lambda name: every[name].value)
-        mean = found[task, "plain", "win_rate"]
-        body.append([f"`{task}`", mean.percent, every[worst].percent, worst])
-    return table(("match", "mean wins", "fewest wins", "against"), body)
+        leads = {name: lead(win, loss, MEMBER_EPISODES) for name, (win, loss) in members(found, task).items()}
+        worst = min(leads, key=lambda name: leads[name].value)
+        means = [each.percent for each in against(found, task, "plain")]
+        body.append([f"`{task}`", *means, leads[worst].percent, worst])
+    return table(("match", "mean wins", "mean losses", "smallest lead, points", "against"), body)
 
 
 def exploitability() -> str:
-    """Returns the table of best responses: of each match the lead of each training, and the largest one."""
+    """Returns the table of the largest lead of a best response to each team."""
     body = []
     for task in MATCHES:
-        own = [row for row in rows("exploitability") if row["task"] == task]
-        cells = {
-            start: ", ".join(f"{100 * float(row['value']):.1f}" for row in own if row["from"] == start)
-            for start in ("scratch", "champion")
-        }
-        best = max(own, key=lambda row: float(row["value"]))
-        largest = [f"{100 * float(best[name]):.1f}" for name in ("value", "low", "high")]
-        body.append([f"`{task}`", *cells.values(), "{} ({} to {})".format(*largest)])
-    head = ("match", "response from scratch", "response that starts from the team", "exploitability at least")
-    return table(head, body)
+        best = max((row for row in rows("exploitability") if row["task"] == task), key=lambda row: float(row["value"]))
+        body.append([f"`{task}`", rate(best).percent])
+    return table(("match", "exploitability at least, points"), body)
 
 
 def robustness(found: Rates) -> str:
-    """Returns the table of the usual rate and of the worst condition."""
+    """Returns the table of the worst condition and of the other robot."""
     body = []
-    for task in COOPERATIVE:
+    for task in robust_tasks(found):
         every = {name: robust(found, task, name) for name in CONDITIONS if name not in ("usual", "go2")}
         worst = min(every, key=lambda name: every[name].value)
-        usual, other = robust(found, task, "usual"), robust(found, task, "go2")
-        body.append([f"`{task}`", usual.percent, every[worst].percent, CONDITIONS[worst], other.percent])
-    return table(("task", "usual", "worst condition", "which", "Go2"), body)
+        body.append([f"`{task}`", every[worst].percent, CONDITIONS[worst], robust(found, task, "go2").percent])
+    return table(("task", "worst of five", "condition", "Go2"), body)
+
+
+def robust_rates() -> Rates:
+    """Returns the rates under other conditions, of matches too if they are measured."""
+    return rates("robustness") | rates("robustness-matches")
 
 
 def robust(found: Rates, task: str, condition: str) -> Rate:
-    """Returns success under a condition."""
-    return found[task, condition, "success_rate"]
+    """Returns success, in a match wins, under a condition."""
+    return found[task, condition, "win_rate" if task in MATCHES else "success_rate"]
 
 
-def mates(task: str) -> dict[str, Rate]:
+def robust_tasks(found: Rates) -> list[str]:
+    """Returns the tasks that are measured under all conditions."""
+    measured = {(task, condition) for task, condition, _ in found}
+    return [task for task in (*COOPERATIVE, *MATCHES) if all((task, name) in measured for name in CONDITIONS)]
+
+
+def mates(task: str) -> dict[str, tuple[Rate]]:
     """Returns the success of teams of one seed and of two, and with a scripted or idle robot, there with its range."""
     data = json.loads((DATA / f"crossplay_{task}.json").read_text("utf-8"))
     success, count = np.asarray(data["success"]["value"]), len(data["policies"])
     shown = {"own mate": data["same"], "other seed": data["cross"]}
-    found = {name: Rate(each["value"], each["low"], each["high"]) for name, each in shown.items()}
+    found = {name: (Rate(each["value"], each["low"], each["high"]),) for name, each in shown.items()}
     for i, name in enumerate(data["references"], count):
         teams = [*success[:count, i], *success[i, :count]]
-        found[name] = Rate(float(np.mean(teams)), min(teams), max(teams))
+        found[name] = (Rate(float(np.mean(teams)), min(teams), max(teams)),)
     return found
 
 
-def draw_intervals(groups: dict[str, dict[str, Rate]], label: str) -> bytes:
-    """Returns a picture of rates with their intervals, a panel for each group."""
+def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -> bytes:
+    """Returns a picture with a panel for each group, and a row for each of its entries.
+
+    The first rate of an entry is a bar from the left, the second, losses, one from the right. Lines are intervals.
+    """
     figure = Figure((7.6, 1.0 + 1.15 * -(-len(groups) // 2)), dpi=105, layout="constrained")
     axes = figure.subplots(-(-len(groups) // 2), 2, sharex=True, squeeze=False)
     for each, (title, values) in zip(axes.ravel(), groups.items(), strict=True):
-        for i, value in enumerate(values.values()):
-            each.plot([100 * value.low, 100 * value.high], [i, i], color=BLUE, lw=2.5, solid_capstyle="round")
-            each.plot([100 * value.value], [i], "o", color=INK, ms=4)
-        each.axvline(50, color=PALE, lw=0.8, zorder=0)
-        each.set(xlim=(-2, 102), ylim=(len(values) - 0.5, -0.5))
+        for i, pair in enumerate(values.values()):
+            for value, start, way, color in zip(pair, (0, 100), (100, -100), (BLUE, RED), strict=False):
+                each.barh(i, way * value.value, left=start, height=0.62, color=color)
+                ends = [start + way * bound for bound in (value.low, value.high)]
+                each.plot(ends, [i, i], color=INK, lw=1.5, solid_capstyle="butt")
+        each.set(xlim=(0, 100), ylim=(len(values) - 0.5, -0.5))
         each.set_yticks(range(len(values)), list(values), fontsize=8)
         each.tick_params(axis="x", labelsize=8)
+        each.tick_params(axis="y", length=0)
         each.set_title(title, fontsize=9, color=INK, loc="left")
         each.spines[["top", "right"]].set_visible(False)
     figure.supxlabel(label, fontsize=9, color=INK)
@@ -184,7 +213,6 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
             axes.plot([100 * float(row["low"]), 100 * float(row["high"])], [y, y], color=color, lw=2)
             axes.plot([100 * float(row["value"])], [y], "o", color=color, ms=4)
     axes.axvline(0, color=INK, lw=0.8)
-    axes.axvline(20, color=PALE, lw=0.8, ls="--")
     axes.set_yticks(range(len(MATCHES)), MATCHES, fontsize=8)
     axes.set(ylim=(len(MATCHES) - 0.5, -0.5), xlim=(-60, 105))
     axes.set_xlabel("wins minus losses of the best response, points", fontsize=9, color=INK)
@@ -196,57 +224,76 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
 
 
 def draw_heat(found: Rates) -> bytes:
-    """Returns a picture of success in each task under each condition."""
-    values = [[100 * robust(found, task, name).value for name in CONDITIONS] for task in COOPERATIVE]
-    figure = Figure((7.6, 2.5), dpi=105, layout="constrained")
+    """Returns a picture of success, in matches of wins, under each condition."""
+    tasks = robust_tasks(found)
+    values = [[100 * robust(found, task, name).value for name in CONDITIONS] for task in tasks]
+    figure = Figure((7.6, 0.7 + 0.3 * len(tasks)), dpi=105, layout="constrained")
     axes = figure.subplots()
     axes.imshow(values, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.75)
     for i, line in enumerate(values):
         for j, value in enumerate(line):
             axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=8, color=INK)
+    axes.axhline(len(COOPERATIVE) - 0.5, color="white", lw=3)
     axes.set_xticks(range(len(CONDITIONS)), list(CONDITIONS.values()), fontsize=8)
-    axes.set_yticks(range(len(COOPERATIVE)), COOPERATIVE, fontsize=8)
+    axes.set_yticks(range(len(tasks)), tasks, fontsize=8)
     axes.xaxis.tick_top()
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     return drawn(figure)
 
 
-def update() -> None:
-    """Writes the pictures and fills the page."""
-    found = {part: rates(part) for part in PARTS}
-    learned = {
-        task: {each: found["cooperative"][task, each, "success_rate"] for each in ("sampled", "mean", "scripted")}
+def tables() -> dict[str, str]:
+    """Returns the tables of the page by section."""
+    fixed = population_rates()
+    return {
+        "cooperative": cooperative(rates("cooperative", by="actions")),
+        "matches": matches(rates("matches")),
+        **({"population": population(fixed)} if fixed else {}),
+        "exploitability": exploitability(),
+        "robustness": robustness(robust_rates()),
+    }
+
+
+def pictures() -> dict[str, bytes]:
+    """Returns the pictures by file name."""
+    success = {key[:2]: value for key, value in rates("cooperative", by="actions").items() if key[2] == "success_rate"}
+    teams = {
+        task: {each: (success[task, each],) for each in ("sampled", "mean", "scripted") if (task, each) in success}
         for task in COOPERATIVE
     }
-    against = {
-        task: {each: found["matches"][task, each, "win_rate"] for each in ("scripted", "idle", "random", "copy")}
-        for task in MATCHES
-    }
-    pictures = {
-        "success.png": draw_intervals(learned, "success, %"),
-        "wins.png": draw_intervals(against, "wins, %"),
-        "population.png": draw_intervals({t: members(found["population"], t) for t in MATCHES}, "wins, %"),
-        "mates.png": draw_intervals({task: mates(task) for task in COOPERATIVE}, "success, %"),
-        "robustness.png": draw_heat(found["robustness"]),
+    met, fixed = rates("matches"), population_rates()
+    opponents = {t: {each: against(met, t, each) for each in ("scripted", "idle", "random", "copy")} for t in MATCHES}
+    label = "wins (blue), draws (white) and losses (red), %"
+    return {
+        "success.png": draw_rates(teams, "success, %"),
+        "wins.png": draw_rates(opponents, label),
+        **({"population.png": draw_rates({t: members(fixed, t) for t in MATCHES}, label)} if fixed else {}),
+        "mates.png": draw_rates({task: mates(task) for task in COOPERATIVE}, "success, %"),
+        "robustness.png": draw_heat(robust_rates()),
         "exploitability.png": draw_leads(rows("exploitability")),
     }
-    for name, content in pictures.items():
+
+
+def copy_rates(folder: Path) -> None:
+    """Copies the rates of the parts that a folder has; InputError if it has none."""
+    files = {part: file for part in PARTS if (file := folder / part / "rates.csv").is_file()}
+    if not files:
+        raise InputError(f"--rates: {folder} has no PART/rates.csv; PART is one of {', '.join(PARTS)}")
+    for part, file in files.items():
+        write_atomically(DATA / f"{part}.csv", file.read_bytes())
+
+
+def update() -> None:
+    """Writes the page and its pictures."""
+    page = filled(PAGE.read_text("utf-8"), tables())
+    for name, content in pictures().items():
         write_atomically(PAGE.parent / name, content)
-    tables: dict[str, Any] = {
-        "cooperative": cooperative(found["cooperative"]),
-        "matches": matches(found["matches"]),
-        "population": population(found["population"]),
-        "exploitability": exploitability(),
-        "robustness": robustness(found["robustness"]),
-    }
-    write_atomically(PAGE, filled(PAGE.read_text("utf-8"), tables).encode())
+    write_atomically(PAGE, page.encode())
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rates", type=Path, help="folder of the measured parts")
     if folder := parser.parse_args().rates:
-        for part in PARTS:
-            write_atomically(DATA / f"{part}.csv", (folder / part / "rates.csv").read_bytes())
+        copy_rates(folder)
     update()
