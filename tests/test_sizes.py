@@ -150,26 +150,36 @@ def test_any_size_steps(task: str, size: int, settings: dict[str, Any]) -> None:
 
 
 def test_a_step_of_three_against_three_is_symmetric() -> None:
-    env = sized(FOOTBALL, 6)
-    random = np.random.default_rng(1)
-    start = np.array(env.spawn_poses()) + random.uniform(-0.2, 0.2, (6, 3))
-    action = random.uniform(-1, 1, (6, 12)).astype(np.float32)
-    ball, speed, swap = np.array([6.4, 0.3]), np.array([1.0, 0.5]), np.roll(np.arange(6), 3)
+    check_symmetry(sized(FOOTBALL, 6))
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("task", "size", "settings"), [row for row in ROWS if row.values[0] in (FOOTBALL, SUMO)])
+def test_a_step_of_any_match_is_symmetric(task: str, size: int, settings: dict[str, Any]) -> None:
+    check_symmetry(make(task, impl="c", control="position", num_envs=1, num_agents=size, **settings))
+
+
+def check_symmetry(env: Any) -> None:
+    """Compares a step of a match with that of its image, in which the teams have changed sides; feet on the ground."""
+    size, random = env.num_agents, np.random.default_rng(1)
+    start = np.array(env.spawn_poses()) + random.uniform(-0.1, 0.1, (size, 3))
+    action = random.uniform(-1, 1, (size, env.action_size)).astype(np.float32)
+    ball, speed, swap = np.array([6.4, 0.3]), np.array([1.0, 0.5]), np.roll(np.arange(size), size // 2)
     states = []
     for turned in (False, True):
-        sign = -1 if turned else 1
-        places, order = (np.array([14.0, 0.0]) * turned + sign * x for x in (start[:, :2], ball)), np.arange(6)
-        place, spot = places
-        order = swap if turned else order
-        yaw = start[:, 2] + np.pi * turned
-        position = np.c_[place, np.full(6, 0.32)][order]
-        euler = np.c_[np.zeros((6, 2)), yaw][order]
-        state = with_object(env, placed(env, position, euler), "ball", [*spot, 0.1], sign * speed)
+        sign, order = (-1, swap) if turned else (1, np.arange(size))
+        place, spot = (2 * np.array(env.center) * turned + sign * x for x in (start[:, :2], ball))
+        position = np.c_[place, np.full(size, env.params.spawn_height - 0.13)][order]
+        state = placed(env, position, np.c_[np.zeros((size, 2)), start[:, 2] + np.pi * turned][order])
+        if "ball" in env.objects:
+            state = with_object(env, state, "ball", [*spot, 0.1], sign * speed)
         states.append(stepped(env)(state, action[order]))
     first, second = states
     np.testing.assert_allclose(first.obs, np.asarray(second.obs)[swap], atol=1e-5)
     np.testing.assert_allclose(first.reward, np.asarray(second.reward)[swap], atol=1e-5)
-    assert np.abs(np.asarray(first.reward)).max() > 1e-4
+    own, other = np.split(np.asarray(first.reward), 2)
+    np.testing.assert_array_equal(own, -other)
+    assert "ball" not in env.objects or np.abs(np.asarray(first.reward)).max() > 1e-4
 
 
 @functools.cache
