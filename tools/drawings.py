@@ -6,6 +6,7 @@ the same bytes.
 
 import csv
 import gzip
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -290,8 +291,31 @@ def curves() -> Figure:
     return figure
 
 
+def levers() -> Figure:
+    """Rates with and without each setting, with their intervals: the table of docs/results/levers.md."""
+    text = (ROOT / "docs" / "results" / "levers.md").read_text(encoding="utf-8")
+    rate = r"([\d.]+) \(([\d.]+) to ([\d.]+)\) \| \d+ \|"
+    rows = re.findall(rf"^\| (.+?) \| (.+?) \| .+? \| {rate} {rate}$", text, re.MULTILINE)
+    figure = Figure((WIDTH / 100, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for place, (_, _, *numbers) in enumerate(rows):
+        for three, color, shift in ((numbers[:3], BLUE, -0.15), (numbers[3:], ORANGE, 0.15)):
+            value, low, high = map(float, three)
+            axes.plot([low, high], [place + shift] * 2, color=color, lw=2.5, solid_capstyle="round")
+            axes.plot(value, place + shift, "o", color=color, ms=5)
+    axes.set_yticks(range(len(rows)), [f"{task}: {setting}" for setting, task, *_ in rows], fontsize=9.5)
+    axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5))
+    axes.set_xlabel("success, or wins, %", fontsize=10.5)
+    axes.grid(axis="x", alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    for color, label in ((BLUE, "with, worst seed"), (ORANGE, "without, best seed")):
+        axes.plot([], [], "o-", color=color, label=label)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=10)
+    return figure
+
+
 DRAWINGS: dict[str, Callable[[], Figure]] = {
-    each.__name__: each for each in (architecture, observation, match_frames, league, curves)
+    each.__name__: each for each in (architecture, observation, match_frames, league, curves, levers)
 }
 
 
