@@ -6,6 +6,7 @@ the same bytes.
 
 import csv
 import gzip
+import json
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -314,8 +315,42 @@ def levers() -> Figure:
     return figure
 
 
+def sizes() -> Figure:
+    """Robot steps/s: by engine against the number of robots, and on Warp against the number of environments."""
+    entries = json.loads((ROOT / "results" / "measurements.json").read_text(encoding="utf-8"))
+    rates: dict[tuple[str, int, int], list[float]] = {}  # by engine and task, number of robots, number of environments
+    for row in (row for name in ("c", "mjx", "warp") for row in entries[f"sizes/{name}"]["rows"]):
+        case = f"{row['impl']} {row['task']}", row["num_agents"], row["num_envs"]
+        rates.setdefault(case, []).append(row["num_agents"] * row["env_steps_per_s"])
+    football = "go1football-1vs1"
+    engines = {
+        (f"warp {football}", 2048): ("Warp, football", VIOLET),
+        ("warp go1gate", 2048): ("Warp, gate", GREEN),
+        (f"c {football}", 64): ("C, football", BLUE),
+        (f"jax {football}", 4): ("MJX, football", ORANGE),
+    }
+    colors = {2: GREY, 8: VIOLET, 16: INK}
+    robots = {(f"warp {football}", number): (f"{number} robots", color) for number, color in colors.items()}
+    figure = Figure((WIDTH / 100, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axes, varied, title, lines in ((left, 1, "robots", engines), (right, 2, "environments on Warp", robots)):
+        for (kind, fixed), (label, color) in lines.items():
+            own = {case[varied]: r for case, r in sorted(rates.items()) if (case[0], case[3 - varied]) == (kind, fixed)}
+            axes.plot([*own], [np.median(values) for values in own.values()], "o-", color=color, ms=4, label=label)
+        axes.set(xscale="log", yscale="log")
+        axes.set_xlabel(title, fontsize=10.5)
+        ticks = sorted({case[varied] for case in rates if varied == 1 or "warp" in case[0]})
+        axes.set_xticks(ticks, [str(tick) for tick in ticks], fontsize=9)
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=10)
+    left.set_ylabel("robot steps/s", fontsize=10.5)
+    return figure
+
+
 DRAWINGS: dict[str, Callable[[], Figure]] = {
-    each.__name__: each for each in (architecture, observation, match_frames, league, curves, levers)
+    each.__name__: each for each in (architecture, observation, match_frames, league, curves, levers, sizes)
 }
 
 
