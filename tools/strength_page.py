@@ -108,12 +108,6 @@ def members(found: Rates, task: str) -> dict[str, list[Rate]]:
     return every
 
 
-def population_rates() -> Rates:
-    """Returns the rates against the population, none unless losses to its members are measured."""
-    found = rates("population")
-    return found if any(name.startswith("loss_rate/") for _, _, name in found) else {}
-
-
 def lead(win: Rate, loss: Rate, episodes: int) -> Rate:
     """Returns wins minus losses with a conservative 95% interval, that of `mqe exploit`."""
     value = win.value - loss.value
@@ -244,11 +238,10 @@ def draw_heat(found: Rates) -> bytes:
 
 def tables() -> dict[str, str]:
     """Returns the tables of the page by section."""
-    fixed = population_rates()
     return {
         "cooperative": cooperative(rates("cooperative", by="actions")),
         "matches": matches(rates("matches")),
-        **({"population": population(fixed)} if fixed else {}),
+        "population": population(rates("population")),
         "exploitability": exploitability(),
         "robustness": robustness(robust_rates()),
     }
@@ -261,13 +254,13 @@ def pictures() -> dict[str, bytes]:
         task: {each: (success[task, each],) for each in ("sampled", "mean", "scripted") if (task, each) in success}
         for task in COOPERATIVE
     }
-    met, fixed = rates("matches"), population_rates()
+    met, fixed = rates("matches"), rates("population")
     opponents = {t: {each: against(met, t, each) for each in ("scripted", "idle", "random", "copy")} for t in MATCHES}
     label = "wins (blue), draws (white) and losses (red), %"
     return {
         "success.png": draw_rates(teams, "success, %"),
         "wins.png": draw_rates(opponents, label),
-        **({"population.png": draw_rates({t: members(fixed, t) for t in MATCHES}, label)} if fixed else {}),
+        "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
         "mates.png": draw_rates({task: mates(task) for task in COOPERATIVE}, "success, %"),
         "robustness.png": draw_heat(robust_rates()),
         "exploitability.png": draw_leads(rows("exploitability")),
