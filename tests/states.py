@@ -19,8 +19,8 @@ from mqe_jax.physics.rotation import euler_to_quaternion
 
 @functools.cache
 def made(task: str) -> Any:
-    """The task on the C engine under position control, created once per process."""
-    return make(task, impl="c", control="position")
+    """The task on the C engine, on a GPU on MJX, under position control, created once per process."""
+    return make(task, impl="c" if jax.default_backend() == "cpu" else "jax", control="position")
 
 
 @functools.cache
