@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mqe_jax.walk.evaluation import evaluate_skill
     from mqe_jax.walk.training import train_skill
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = [
     "Clip",
     "QuadrupedEnv",
