@@ -48,7 +48,7 @@ test: $(STAMP) ## Run the tests
 docs: $(STAMP) npm ## Build the documentation site into build/site
 	JAX_PLATFORMS=cpu $(BIN)/mqe play-site -o build/play || echo "docs: the page for playing was not built"
 	NO_MKDOCS_2_WARNING=1 JAX_PLATFORMS=cpu $(BIN)/mkdocs build --strict --quiet
-	@echo "docs: open build/site/index.html"
+	@echo "docs: to read with search: python3 -m http.server --bind 127.0.0.1 --directory build/site"
 
 soak: $(STAMP) ## Run the heavy tests too (about an hour)
 	MQE_SOAK=1 $(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal

@@ -1,7 +1,7 @@
 """MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
 
-Generated: the README as first page, one page per task (clip, sizes, observation, rewards, parameters) with an overview,
-and the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/
+Generated: the pages `FILES`, one page per task (clip, sizes, observation, rewards, parameters) with an overview, and
+the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/
 lead to the repository's address, `[project.urls]` in pyproject.toml; where it is not set they become paths, so that the
 built site needs neither the repository nor another host. The page of `mqe play-site` is part of the site where it is in
 build/play, and else the site says how to build it.
@@ -28,6 +28,10 @@ from mqe_jax.policies import zoo
 ROOT = Path(__file__).parents[1]
 PLAY = ROOT / "build" / "play"
 """Folder of the page of `mqe play-site`."""
+FILES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md"}
+"""Files of the repository that are pages of the site."""
+SETTINGS = {"index.md": "hide: [toc]", "tasks/": "search: {boost: 0.3}", "reference/": "search: {boost: 0.3}"}
+"""Settings of generated pages by the start of their path. The search lists the guides first."""
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -35,7 +39,8 @@ def on_files(files: Any, config: Any) -> Any:
     (reference,) = (section["API reference"] for section in config["nav"] if "API reference" in section)
     modules = {path: f"mqe_jax.{Path(path).stem}" for path in reference}
     for path, content in (pages() | {path: f"# {x}\n\n::: {x}\n" for path, x in modules.items()}).items():
-        files.append(File.generated(config, path, content=content))
+        head = "".join(f"---\n{text}\n---\n" for start, text in SETTINGS.items() if path.startswith(start))
+        files.append(File.generated(config, path, content=head + content))
     for file in filter(Path.is_file, PLAY.rglob("*") if _playable() else ()):
         path = f"play/{file.relative_to(PLAY).as_posix()}"
         files.append(File.generated(config, path, abs_src_path=str(file)))
@@ -74,6 +79,9 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
         path = posixpath.normpath(posixpath.join("docs", folder, "..", path))
         if path.startswith("docs/"):
             return match.group(0)
+        name, mark, heading = path.partition("#")
+        if name in FILES:
+            return f"[{text}]({posixpath.relpath(FILES[name], folder or '.')}{mark}{heading})"
         if not address:
             return text if path.endswith(text.replace("\\", "").rstrip("/")) else f"{text} (`{path}`)"
         link = f"[{text}]({address}/blob/main/{path})"
@@ -119,12 +127,12 @@ def pages() -> dict[str, str]:
         from mqe_jax.envs import TASKS
     made = {f"tasks/{name}.md": task_page(task) for name, task in TASKS.items()}
     made["tasks/index.md"] = overview(TASKS)
-    made["index.md"] = front((ROOT / "README.md").read_text(encoding="utf-8"))
+    made |= {path: front((ROOT / name).read_text(encoding="utf-8")) for name, path in FILES.items()}
     return made
 
 
 def front(readme: str) -> str:
-    """Returns the README as the site's first page: its links as from docs/, tasks linked to their pages."""
+    """Returns a file of the repository as a page: its links as from docs/, tasks linked to their pages."""
     page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
     return re.sub(r"^(\| .*) `(go1[\w-]+)` \|", r"\1 [`\2`](tasks/\2.md) |", page, flags=re.MULTILINE)
 
