@@ -296,7 +296,7 @@ def levers() -> Figure:
     """Rates with and without each setting, with their intervals: the table of docs/results/levers.md."""
     text = (ROOT / "docs" / "results" / "levers.md").read_text(encoding="utf-8")
     rate = r"([\d.]+) \(([\d.]+) to ([\d.]+)\) \| \d+ \|"
-    rows = re.findall(rf"^\| (.+?) \| (.+?) \| .+? \| {rate} {rate}$", text, re.MULTILINE)
+    rows = re.findall(rf"^\| (.+?) \| .+? \| (.+?) \| {rate} {rate} .+ \|$", text, re.MULTILINE)
     figure = Figure((WIDTH / 100, 3.6), layout="constrained")
     axes = figure.subplots()
     for place, (_, _, *numbers) in enumerate(rows):
