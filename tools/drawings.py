@@ -7,7 +7,6 @@ the same bytes.
 import csv
 import gzip
 import json
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -293,18 +292,17 @@ def curves() -> Figure:
 
 
 def levers() -> Figure:
-    """Rates with and without each setting, with their intervals: the table of docs/results/levers.md."""
-    text = (ROOT / "docs" / "results" / "levers.md").read_text(encoding="utf-8")
-    rate = r"([\d.]+) \(([\d.]+) to ([\d.]+)\) \| \d+ \|"
-    rows = re.findall(rf"^\| (.+?) \| .+? \| (.+?) \| {rate} {rate} .+ \|$", text, re.MULTILINE)
+    """Rates with and without each setting, with their intervals: results/levers.csv."""
+    with (ROOT / "results" / "levers.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
     figure = Figure((WIDTH / 100, 3.6), layout="constrained")
     axes = figure.subplots()
-    for place, (_, _, *numbers) in enumerate(rows):
-        for three, color, shift in ((numbers[:3], BLUE, -0.15), (numbers[3:], ORANGE, 0.15)):
-            value, low, high = map(float, three)
+    for place, row in enumerate(rows):
+        for end, color, shift in (("", BLUE, -0.15), ("_without", ORANGE, 0.15)):
+            value, low, high = (float(row[f"{name}{end}"]) for name in ("rate", "low", "high"))
             axes.plot([low, high], [place + shift] * 2, color=color, lw=2.5, solid_capstyle="round")
             axes.plot(value, place + shift, "o", color=color, ms=5)
-    axes.set_yticks(range(len(rows)), [f"{task}: {setting}" for setting, task, *_ in rows], fontsize=9.5)
+    axes.set_yticks(range(len(rows)), [f"{row['task']}: {row['lever']}" for row in rows], fontsize=9.5)
     axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5))
     axes.set_xlabel("success, or wins, %", fontsize=10.5)
     axes.grid(axis="x", alpha=0.3)
