@@ -14,6 +14,7 @@ from mqe_jax.physics.appearance import ROBOT_COLORS, UNNUMBERED
 from mqe_jax.physics.collision import MAX_ROBOTS, robot_bits
 from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.policies.scripted.cooperative import plan_sheep_hard
 from mqe_jax.train.policy import check_policy
 from mqe_jax.viz.geometry import robot_bases, robot_color
 from tests.inputs import refuses
@@ -225,3 +226,32 @@ def judge(env: Any) -> Callable[..., Any]:
         return env.judge(*moments)
 
     return jax.jit(judged)
+
+
+def herding(robots: list[list[float]], sheep: list[list[float]]) -> dict[str, jax.Array]:
+    """Observations of robots at x, y that face the gate at x 8.5 m, y 0."""
+    base = np.zeros((len(robots), 6), np.float32)
+    base[:, :2] = robots
+    gate, flock = np.array([8.5, 0.0], np.float32), np.ravel(np.array(sheep, np.float32))
+    return {"base": jnp.asarray(base)} | {
+        name: jnp.tile(jnp.asarray(value), (len(robots), 1)) for name, value in (("gate", gate), ("sheep", flock))
+    }
+
+
+def test_the_robots_of_a_large_team_drive_sheep_whatever_their_order() -> None:
+    random = np.random.default_rng(0)
+    robots, sheep = random.uniform([0, -2.5], [7, 2.5], (5, 2)), random.uniform([2, -2.5], [9, 2.5], (11, 2))
+    order = np.array([3, 0, 4, 1, 2])
+    actions = plan_sheep_hard(herding(robots.tolist(), sheep.tolist()))
+    np.testing.assert_allclose(
+        plan_sheep_hard(herding(robots[order].tolist(), sheep.tolist())), actions[order], atol=1e-5
+    )
+    assert np.all(np.abs(actions) <= 1) and np.any(actions != 0)
+
+
+def test_robots_brake_before_they_touch_what_they_drive() -> None:
+    """The first wants to pass the second, the third the sheep before it, the fourth the gate's wall."""
+    robots = [[2.0, 0.0], [2.7, 0.0], [5.0, 1.5], [8.1, 2.2]]
+    forward = plan_sheep_hard(herding(robots, [[5.4, 1.5], [8.2, 1.6], [7.0, -1.5]]))[:, 0]
+    assert forward[0] <= 0 and forward[2] < 0 and forward[3] < 0
+    assert plan_sheep_hard(herding([[1.0, 0.0]], [[6.0, 0.0]]))[0, 0] > 0.4

@@ -90,8 +90,10 @@ PLANNERS: dict[str, Planner | str] = {name: task.planner for name, task in SHIPP
 """Scripted policies by task id; shipped ones as MODULE:FUNCTION, since this package does not import `planners`."""
 
 
-NAMED_PLANNERS: dict[str, dict[str, Planner]] = {}
-"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`)."""
+NAMED_PLANNERS: dict[str, dict[str, Planner | str]] = {
+    "go1sheep-hard": {"by-distance": "cooperative:plan_sheep_by_distance"}
+}
+"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`); shipped ones as in `PLANNERS`."""
 
 
 @check_arguments(task=str, name=str, planner=Callable)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.policies.scripted import Observation, go_to, pose
+from mqe_jax.policies.scripted import GAIN, Observation, go_to, pose
 from mqe_jax.terrain import ROW, rows_of
 
 # Narrow Gate: the first robot passes the gate while the second waits until the gate is clear. Of more than two robots
@@ -71,6 +71,10 @@ def plan_seesaw(obs: Observation) -> jax.Array:
 # Sheep Dog: drive one sheep from behind, or gather a flock towards the gate.
 _BESIDE = 0.7  # m, between robots that walk behind one sheep
 _FREE = 1.2  # m, between robots below which those of a larger team keep apart
+_CLEAR_OF_SHEEP, _CLEAR_OF_ROBOTS = 0.62, 0.85  # m, between centres
+_STOP_X, _WALK_Y = 0.62, 2.7  # m, of robots: the least distance before the gate, the greatest |y|
+_FASTEST = (1.0, 0.5)  # m/s, along x and y
+_BRAKING = 2.5  # 1/s, approach speed per distance that is left
 
 
 def _sides(obs: Observation) -> np.ndarray | jax.Array:
@@ -109,11 +113,19 @@ def plan_sheep_easy(obs: Observation) -> jax.Array:
 
 
 def plan_sheep_hard(obs: Observation) -> jax.Array:
-    """Returns the robots' actions (A, 3).
+    """Returns the robots' actions (A, 3): teams of two or three divide the flock by sides, others by distance."""
+    if "active" in obs:
+        number = jnp.sum(obs["active"])
+        return jnp.where((number == 2) | (number == 3), _drive_by_side(obs), plan_sheep_by_distance(obs))
+    return (_drive_by_side if len(obs["base"]) in (2, 3) else plan_sheep_by_distance)(obs)
+
+
+def _drive_by_side(obs: Observation) -> jax.Array:
+    """Returns the actions (A, 3) of robots that each prefer one side of the flock.
 
     Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, on
     the robot's side and close to it. Stragglers are thus driven back to the flock, whose cohesion keeps it together.
-    Of more than two robots those in the middle prefer no side, and robots keep apart.
+    Of three robots the middle one prefers no side, and robots keep apart.
     """
     side = _sides(obs)
     (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
@@ -131,6 +143,52 @@ def plan_sheep_hard(obs: Observation) -> jax.Array:
     # Repulsion from close sheep.
     goal += jnp.sum(0.8 * jnp.maximum(0.75 / near - 1.0, 0.0)[..., None] * apart, axis=1)
     return jnp.where(jnp.all(through), 0.0, go_to(position, yaw, _apart(position, goal)))
+
+
+def plan_sheep_by_distance(obs: Observation) -> jax.Array:
+    """Returns the actions (A, 3) of any number of robots, whatever their order.
+
+    Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, for
+    those that the robot is behind, and for those close to it to which no other robot is closer. Robots brake before
+    they touch each other, a sheep or the gate's wall, which would end the episode.
+    """
+    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
+    through = sheep[:, 0] > gate[0]
+    way = sheep - gate - jnp.array([0.8, 0.0])
+    far = jnp.linalg.norm(way, axis=-1)
+    apart = position[:, None] - sheep[None]
+    near = jnp.linalg.norm(apart, axis=-1)
+    behind = jnp.sum(apart * way, axis=-1) / jnp.maximum(far * near, 1e-3)  # cosine of an angle
+    score = 7.2 * far + 1.6 * behind - 3.0 * near - 3.0 * (near - jnp.min(near, axis=0))
+    weight = jax.nn.softmax(jnp.where(through, -1e3, score), axis=-1)
+    back = weight @ way
+    back /= jnp.maximum(jnp.linalg.norm(back, axis=-1, keepdims=True), 1e-3)
+    last = gate[0] - _STOP_X
+    goal = _apart(position, weight @ sheep + 0.8 * back)
+    goal = jnp.clip(goal, jnp.array([0.2, -_WALK_Y]), jnp.stack([last, _WALK_Y]))
+    velocity = jnp.clip(0.9 * (goal - position), -jnp.array(_FASTEST), jnp.array(_FASTEST))
+    for _ in range(2):
+        velocity = _brake(velocity, apart, _CLEAR_OF_SHEEP)
+        velocity = _brake(velocity, position[:, None] - position[None], _CLEAR_OF_ROBOTS)
+    (x, y), (ahead, left) = position.T, velocity.T
+    ahead = jnp.minimum(ahead, _BRAKING * (last - x))
+    left = jnp.clip(left, -_BRAKING * (_WALK_Y + y), _BRAKING * (_WALK_Y - y))
+    velocity = jnp.stack([ahead, left], axis=-1)
+    return jnp.where(jnp.all(through), 0.0, go_to(position, yaw, position + velocity / GAIN))
+
+
+def _brake(velocity: jax.Array, apart: jax.Array, least: float) -> jax.Array:
+    """Returns velocities (A, 2), m/s, with which robots stop before they come closer to others than a distance.
+
+    Args:
+        velocity: wanted (A, 2), m/s.
+        apart: positions of the robots relative to the others (A, K, 2), m; a robot is not kept from itself.
+        least: the distance, m.
+    """
+    distance = jnp.linalg.norm(apart, axis=-1, keepdims=True)
+    away = apart / jnp.maximum(distance, 1e-3)
+    approach = -jnp.sum(velocity[:, None] * away, axis=-1, keepdims=True)
+    return velocity + jnp.sum(jnp.maximum(approach - _BRAKING * (distance - least), 0.0) * away, axis=1)
 
 
 # Push Box: both robots push the box side by side and correct its heading.
