@@ -79,6 +79,25 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
     assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before
 
 
+@pytest.mark.gpu
+def test_warp_skips_zeros_with_the_same_result() -> None:
+    """Robots stand alone in one environment; in the other the last one stands in the first."""
+    after = []
+    for sparse in (False, True):
+        options = {"num_envs": 2, "num_agents": 4, "sparse_solver": sparse}
+        env = make("go1football-1vs1", impl="warp", control="position", **options)
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
+        first, last = env.index.base_qpos[0, :3], env.index.base_qpos[3, :3]
+        qpos = state.data.qpos.at[1, last].set(state.data.qpos[1, first] + jnp.array([0.0, 0.05, 0.1]))
+        state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
+        step = jax.jit(jax.vmap(env.step)).lower(state, jnp.zeros((2, 4, 12))).compile(compiler_options=QUICK)
+        for _ in range(4):
+            state = step(state, jnp.zeros((2, 4, 12)))
+        after.append(np.asarray(state.data.qpos))
+        assert (type(env.physics.mjx_model._impl.block_dim).__name__ == "SparseBlockDim") == sparse
+    np.testing.assert_allclose(after[1], after[0], rtol=0, atol=1e-4)
+
+
 class Owner:
     """Keeps its functions alive."""
 

@@ -140,6 +140,8 @@ class WarpEngine(MjxEngine):
         self._model = _with_jacobian(model)
         device = jax.local_devices()[0]
         self.mjx_model = private.without_warnings(self._mjx.put_model(self._model, device, impl="warp"))
+        if self.sparse_solver:
+            self.mjx_model = private.with_sparse_newton(self.mjx_model)
 
     @classmethod
     def is_preferred(cls) -> bool:

@@ -95,6 +95,40 @@ def overflow(data: mjx.Data) -> jax.Array:
     return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
 
 
+def with_sparse_newton(model: mjx.Model) -> mjx.Model:
+    """Returns a model whose Newton steps on Warp are those of `newton.py`, if Warp keeps its Jacobians sparse."""
+    if not model._impl.is_sparse:
+        return model
+    sizes = model._impl.block_dim
+    marked = _sparse_block_dim()(**{field.name: getattr(sizes, field.name) for field in dataclasses.fields(sizes)})
+    return model.replace(_impl=model._impl.replace(block_dim=marked))
+
+
+@functools.cache
+def _sparse_block_dim() -> type:
+    """Returns a type of Warp's block sizes that marks models, whose Newton steps Warp then takes from `newton.py`.
+
+    Of all that MJX hands to Warp, this record is the only one that keeps its type.
+    """
+    from mujoco.mjx.third_party.mujoco_warp._src import solver
+    from mujoco.mjx.warp import types
+
+    from mqe_jax.physics.engines import newton
+
+    @jax.tree_util.register_pytree_node_class
+    class SparseBlockDim(types.BlockDim):
+        pass
+
+    dense: Any = solver._cholesky_factorize_solve
+
+    def step(model: Any, *arguments: Any, **options: Any) -> None:
+        sparse = model.is_sparse and isinstance(model.block_dim, SparseBlockDim)
+        (newton.step if sparse else dense)(model, *arguments, **options)
+
+    solver._cholesky_factorize_solve = step
+    return SparseBlockDim
+
+
 def contact(data: mjx.Data) -> mjx.Contact:
     """Returns MJX-JAX's list of contacts."""
     return data._impl.contact
