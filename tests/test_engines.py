@@ -85,7 +85,7 @@ def test_warp_skips_zeros_with_the_same_result() -> None:
     after = []
     for sparse in (False, True):
         options = {"num_envs": 2, "num_agents": 4, "sparse_solver": sparse}
-        env = make("go1football-1vs1", impl="warp", control="position", **options)
+        env: Any = make("go1football-1vs1", impl="warp", control="position", **options)
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
         first, last = env.index.base_qpos[0, :3], env.index.base_qpos[3, :3]
         qpos = state.data.qpos.at[1, last].set(state.data.qpos[1, first] + jnp.array([0.0, 0.05, 0.1]))
