@@ -4,7 +4,9 @@ The soak compares all tasks. `python -m tests.engines` compares all engines.
 """
 
 import dataclasses
+import functools
 import gc
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -26,6 +28,7 @@ from mqe_jax.physics.engines import host_call as host_calls
 from mqe_jax.physics.engines.host_call import host_call
 from mqe_jax.physics.engines.mjx import WarpEngine
 from tests import engines as comparison
+from tests.inputs import refuses
 from tests.states import made
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a few steps
@@ -79,22 +82,66 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
     assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before
 
 
+@pytest.mark.parametrize(
+    ("robots", "asked", "version", "found"),
+    [
+        (4, None, private._NEWTON_OF, False),
+        (5, None, private._NEWTON_OF, True),
+        (5, False, private._NEWTON_OF, False),
+        (3, True, private._NEWTON_OF, True),
+        (2, True, private._NEWTON_OF, "None or False: .* but those of 36 degrees of freedom are dense"),
+        (5, None, "3.99.0", False),
+        (5, True, "3.99.0", f"None or False: .* mujoco-mjx {private._NEWTON_OF}, not 3.99.0"),
+    ],
+)
+def test_warp_skips_zeros_where_it_pays(
+    robots: int, asked: bool | None, version: str, found: bool | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def put_model(model: mujoco.MjModel, device: Any, impl: str) -> Any:
+        option = SimpleNamespace(integrator=SimpleNamespace(name="EULER"))
+        sparse = model.opt.jacobian == mujoco.mjtJacobian.mjJAC_AUTO
+        return SimpleNamespace(nv=model.nv, opt=option, _impl=SimpleNamespace(is_sparse=sparse))
+
+    assert importlib.metadata.version("mujoco-mjx") == private._NEWTON_OF  # of another one compare the Newton step
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
+    monkeypatch.setattr(private, "load_mjx", lambda: SimpleNamespace(put_model=put_model))
+    monkeypatch.setattr(private, "warp_is_installed", lambda: True)
+    for name in ("keep_streams", "without_warnings"):
+        monkeypatch.setattr(private, name, lambda model=None: model)
+    monkeypatch.setattr(private, "with_sparse_newton", lambda model: "sparse")
+    settings = {} if asked is None else {"sparse_solver": asked}
+    build = functools.partial(make, "go1gate", impl="warp", num_agents=robots, **settings)
+    if isinstance(found, str):
+        refuses(f"sparse_solver: True is not allowed; it must be {found}", build)
+    else:
+        env: Any = build()
+        assert (env.physics.mjx_model == "sparse") == found
+
+
 @pytest.mark.gpu
-def test_warp_skips_zeros_with_the_same_result() -> None:
+def test_warp_skips_zeros_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """Robots stand alone in one environment; in the other the last one stands in the first."""
-    after = []
-    for sparse in (False, True):
+    from mqe_jax.physics.engines import newton
+
+    def counted(*arguments: Any, **options: Any) -> None:
+        calls.append(arguments)
+        step(*arguments, **options)
+
+    after, calls, step = [], [], newton.step
+    monkeypatch.setattr(newton, "step", counted)
+    for sparse in (True, False):
+        calls.clear()  # a model of the other kind in this process changes nothing
         options = {"num_envs": 2, "num_agents": 4, "sparse_solver": sparse}
         env: Any = make("go1football-1vs1", impl="warp", control="position", **options)
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
         first, last = env.index.base_qpos[0, :3], env.index.base_qpos[3, :3]
         qpos = state.data.qpos.at[1, last].set(state.data.qpos[1, first] + jnp.array([0.0, 0.05, 0.1]))
         state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
-        step = jax.jit(jax.vmap(env.step)).lower(state, jnp.zeros((2, 4, 12))).compile(compiler_options=QUICK)
+        walk = jax.jit(jax.vmap(env.step)).lower(state, jnp.zeros((2, 4, 12))).compile(compiler_options=QUICK)
         for _ in range(4):
-            state = step(state, jnp.zeros((2, 4, 12)))
+            state = walk(state, jnp.zeros((2, 4, 12)))
         after.append(np.asarray(state.data.qpos))
-        assert (type(env.physics.mjx_model._impl.block_dim).__name__ == "SparseBlockDim") == sparse
+        assert bool(calls) == sparse
     np.testing.assert_allclose(after[1], after[0], rtol=0, atol=1e-4)
 
 
@@ -158,6 +205,7 @@ def warp(monkeypatch: pytest.MonkeyPatch) -> _Mjx:
     monkeypatch.setattr(private, "keep_streams", lambda: None)
     for name in ("without_warnings", "without_overflow"):
         monkeypatch.setattr(private, name, lambda x: x)
+    monkeypatch.setattr(private, "sparse_newton_needs", lambda model: "another model")
     monkeypatch.setattr(private, "overflow", lambda data: jnp.zeros((), bool))
     return stand_in
 

@@ -43,8 +43,8 @@ class Engine(abc.ABC):
     """Contacts per environment for which such buffers are sized, on average over environments."""
     max_constraints_per_env: int = 160
     """Maximum constraints of each environment, for engines with such a limit (Warp's njmax)."""
-    sparse_solver: bool = False
-    """Whether the solver skips the zeros between robots that do not touch, on Warp (`newton.py`)."""
+    sparse_solver: bool | None = None
+    """Whether the solver skips the zeros between robots that do not touch, on Warp (`newton.py`); None: if it pays."""
 
     @classmethod
     def is_preferred(cls) -> bool:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mqe_jax.core.settings import fail
 from mqe_jax.physics.engines import private
 from mqe_jax.physics.engines.engine import Engine
 from mqe_jax.physics.robots.index import scatter
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 _BIT, _JACOBIAN = mujoco.mjtDisableBit, mujoco.mjtJacobian
 _FRICTION, _PASSIVE = _BIT.mjDSBL_FRICTIONLOSS, _BIT.mjDSBL_SPRING | _BIT.mjDSBL_DAMPER
 _MAX_DENSE = 50  # degrees of freedom up to which Warp's line search needs no kernels of its own for dense Jacobians
+# Degrees of freedom above which Warp's solver skips zeros by default. On an H200 this gains nothing with four robots
+# (78, the most of the paper) and a third with eight (150): sizes/warp in results/measurements.json.
+_MAX_FULL = 80
 
 # The model fields of each term of the dynamics; where all are zero, so is the term. Without springs and dampers Warp
 # and MuJoCo compute no passive force at all, so theirs include gravity compensation and adhesion.
@@ -140,7 +144,10 @@ class WarpEngine(MjxEngine):
         self._model = _with_jacobian(model)
         device = jax.local_devices()[0]
         self.mjx_model = private.without_warnings(self._mjx.put_model(self._model, device, impl="warp"))
-        if self.sparse_solver:
+        needs = private.sparse_newton_needs(self.mjx_model)
+        if needs and self.sparse_solver:
+            fail("sparse_solver", True, f"None or False: it needs {needs}")
+        if not needs and (model.nv > _MAX_FULL if self.sparse_solver is None else self.sparse_solver):
             self.mjx_model = private.with_sparse_newton(self.mjx_model)
 
     @classmethod

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp  # pyright: ignore[reportMissingImports]
 
 BLOCK = 16  # rows and columns of a block, as MuJoCo Warp pads H
-ROWS = 64  # threads of each environment that read its constraints
+THREADS = 64  # of each environment, that read its constraints
 
 
 @wp.kernel
@@ -42,7 +42,7 @@ def _tops_of_constraints(
 ):
     """Lowers the first block of each block column to that of any constraint in it, active or not."""
     env, thread = wp.tid()
-    for group in range(thread, groups[env], ROWS):
+    for group in range(thread, groups[env], THREADS):
         row = first_row[env, group]
         start = row_start[env, row]
         end = start + row_length[env, row]
@@ -141,7 +141,7 @@ def step(model: Any, data: Any, context: Any, skip_unchanged: bool = False, skip
         wp.launch(_tops_of_inertia, dim=(envs, blocks), inputs=inertia, outputs=[context.tops])
         rows = data.efc
         constraints = [rows.jtdaj_adr, rows.jtdaj_nblock, rows.J_rownnz, rows.J_rowadr, rows.J_colind]
-        wp.launch(_tops_of_constraints, dim=(envs, ROWS), inputs=constraints, outputs=[context.tops])
+        wp.launch(_tops_of_constraints, dim=(envs, THREADS), inputs=constraints, outputs=[context.tops])
         context.always = wp.full((envs,), 1, dtype=int)
     changed = context.quad_changed_count if skip_unchanged else context.always
     stale = context.state_changed_count if skip_noflip else context.always

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import importlib
+import importlib.metadata
 import io
 import sys
 from collections.abc import Callable
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 # Warp's flags for a solver at its iteration limit: expected with few iterations, and not an overflow.
 _ITERATIONS = 1 << 9 | 1 << 10
+# Version of mujoco-mjx whose Newton step `newton.py` replaces: with another one, compare both before it is raised.
+_NEWTON_OF = "3.17.0"
 
 
 class _Late(ModuleType):
@@ -95,12 +98,20 @@ def overflow(data: mjx.Data) -> jax.Array:
     return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
 
 
-def with_sparse_newton(model: mjx.Model) -> mjx.Model:
-    """Returns a model whose Newton steps on Warp are those of `newton.py`, if Warp keeps its Jacobians sparse."""
+def sparse_newton_needs(model: mjx.Model) -> str | None:
+    """Returns what a model on Warp lacks for `with_sparse_newton`, as the end of "needs ..."; None if nothing."""
+    if (found := importlib.metadata.version("mujoco-mjx")) != _NEWTON_OF:
+        return f"mujoco-mjx {_NEWTON_OF}, not {found}"
     if not model._impl.is_sparse:
-        return model
-    sizes = model._impl.block_dim
-    marked = _sparse_block_dim()(**{field.name: getattr(sizes, field.name) for field in dataclasses.fields(sizes)})
+        return f"sparse Jacobians, but those of {model.nv} degrees of freedom are dense"
+    if model.opt.integrator.name == "DISCRETE":  # couples robots by tendons and actuators too
+        return "another integrator than discrete"
+    return None
+
+
+def with_sparse_newton(model: mjx.Model) -> mjx.Model:
+    """Returns a model whose Newton steps on Warp are those of `newton.py`; other models of the process keep theirs."""
+    marked = _sparse_block_dim()(**vars(model._impl.block_dim))
     return model.replace(_impl=model._impl.replace(block_dim=marked))
 
 
@@ -108,7 +119,7 @@ def with_sparse_newton(model: mjx.Model) -> mjx.Model:
 def _sparse_block_dim() -> type:
     """Returns a type of Warp's block sizes that marks models, whose Newton steps Warp then takes from `newton.py`.
 
-    Of all that MJX hands to Warp, this record is the only one that keeps its type.
+    Of all that MJX hands to Warp, this record is the only one that keeps its type, also in the keys of caches.
     """
     from mujoco.mjx.third_party.mujoco_warp._src import solver
     from mujoco.mjx.warp import types
@@ -122,7 +133,7 @@ def _sparse_block_dim() -> type:
     dense: Any = solver._cholesky_factorize_solve
 
     def step(model: Any, *arguments: Any, **options: Any) -> None:
-        sparse = model.is_sparse and isinstance(model.block_dim, SparseBlockDim)
+        sparse = isinstance(model.block_dim, SparseBlockDim) and model.is_sparse  # not that of a scene with sleep
         (newton.step if sparse else dense)(model, *arguments, **options)
 
     solver._cholesky_factorize_solve = step
