@@ -263,31 +263,51 @@ def league() -> Figure:
 
 
 def curves() -> Figure:
-    """Success in evaluations during trainings with tuned settings, of each seed and their mean."""
+    """Success in evaluations during trainings with tuned settings."""
     with gzip.open(ROOT / "results" / "paper" / "evaluations.csv.gz", "rt", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if (row["variant"], row["kind"]) == ("tuned", "training")]
-    figure = Figure((WIDTH / 100, 2.8), layout="constrained")
-    titles = {"go1gate": "Narrow Gate", "go1pushbox": "Push Box"}
-    for axes, (task, title) in zip(figure.subplots(1, len(titles), sharey=True), titles.items(), strict=True):
+    return _curves(rows, "sampled/success_rate", {"go1gate": "Narrow Gate", "go1pushbox": "Push Box"}, 2.8, (0, 102))
+
+
+def students() -> Figure:
+    """Success of training episodes while teams with sensors imitate the shipped ones: results/students.csv."""
+    with open(ROOT / "results" / "students.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    titles = {
+        "go1gate": "Narrow Gate",
+        "go1seesaw": "Seesaw",
+        "go1sheep-easy": "Sheep Dog, one",
+        "go1sheep-hard": "Sheep Dog, nine",
+        "go1pushbox": "Push Box",
+        "go1football-defender": "Football, 2 vs 1",
+    }
+    return _curves(rows, "success", titles, 4.6, (70, 101))
+
+
+def _curves(
+    rows: Sequence[dict[str, str]], rate: str, titles: dict[str, str], height: float, limits: tuple[float, float]
+) -> Figure:
+    """Draws a rate of each task over its environment steps: each seed and their mean."""
+    figure, columns = Figure((WIDTH / 100, height), layout="constrained"), min(3, len(titles))
+    panels = figure.subplots(-(-len(titles) // columns), columns, sharex=True, sharey=True, squeeze=False)
+    for axes, (task, title) in zip(panels.flat, titles.items(), strict=True):
         own = [row for row in rows if row["task"] == task]
         table: dict[float, list[float]] = {}
         for seed in sorted({row["seed"] for row in own}):
-            points = [
-                (float(x["env_steps"]) / 1e6, 100 * float(x["sampled/success_rate"])) for x in own if x["seed"] == seed
-            ]
+            points = [(float(x["env_steps"]) / 1e6, 100 * float(x[rate])) for x in own if x["seed"] == seed]
             axes.plot(*zip(*points, strict=True), color=BLUE, alpha=0.35, lw=1.2)
             for step, success in points:
                 table.setdefault(step, []).append(success)
         axes.plot([*table], [np.mean(values) for values in table.values()], color=BLUE, lw=2.4)
         axes.set_title(title, fontsize=12, color=INK, loc="left", weight="bold")
-        axes.set_xlabel("environment steps, millions", fontsize=10.5)
-        axes.set(xlim=(0, 41), ylim=(0, 102))
+        axes.set(xlim=(0, None), ylim=limits)
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].plot([], [], color=BLUE, alpha=0.35, lw=1.2, label="one seed")
-    figure.axes[0].plot([], [], color=BLUE, lw=2.4, label="mean of three")
-    figure.axes[0].legend(loc="lower right", frameon=False, fontsize=10)
-    figure.axes[0].set_ylabel("success, % of the episodes", fontsize=10.5)
+    figure.supxlabel("environment steps, millions", fontsize=10.5)
+    figure.supylabel("success, % of the episodes", fontsize=10.5)
+    panels.flat[-1].plot([], [], color=BLUE, alpha=0.35, lw=1.2, label="one seed")
+    panels.flat[-1].plot([], [], color=BLUE, lw=2.4, label="mean of three")
+    panels.flat[-1].legend(loc="lower right", frameon=False, fontsize=10)
     return figure
 
 
@@ -295,7 +315,7 @@ def levers() -> Figure:
     """Rates with and without each setting, with their intervals: results/levers.csv."""
     with (ROOT / "results" / "levers.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    figure = Figure((WIDTH / 100, 3.6), layout="constrained")
+    figure = Figure((WIDTH / 100, 2.7), layout="constrained")
     axes = figure.subplots()
     for place, row in enumerate(rows):
         for end, color, shift in (("", BLUE, -0.15), ("_without", ORANGE, 0.15)):
@@ -348,7 +368,7 @@ def sizes() -> Figure:
 
 
 DRAWINGS: dict[str, Callable[[], Figure]] = {
-    each.__name__: each for each in (architecture, observation, match_frames, league, curves, levers, sizes)
+    each.__name__: each for each in (architecture, observation, match_frames, league, curves, students, levers, sizes)
 }
 
 
