@@ -338,8 +338,10 @@ def sizes() -> Figure:
     entries = json.loads((ROOT / "results" / "measurements.json").read_text(encoding="utf-8"))
     rates: dict[tuple[str, int, int], list[float]] = {}  # by engine and task, number of robots, number of environments
     for row in (row for name in ("c", "mjx", "warp") for row in entries[f"sizes/{name}"]["rows"]):
-        case = f"{row['impl']} {row['task']}", row["num_agents"], row["num_envs"]
-        rates.setdefault(case, []).append(row["num_agents"] * row["env_steps_per_s"])
+        kind, robots, sparse = f"{row['impl']} {row['task']}", row["num_agents"], row.get("sparse_solver", False)
+        default = sparse == (row["impl"] == "warp" and robots > 4)
+        for case in [kind] * default + [f"{kind} false"] * (row.get("sparse_solver") is False):
+            rates.setdefault((case, robots, row["num_envs"]), []).append(robots * row["env_steps_per_s"])
     football = "go1football-1vs1"
     engines = {
         (f"warp {football}", 2048): ("Warp, football", VIOLET),
@@ -347,22 +349,26 @@ def sizes() -> Figure:
         (f"c {football}", 64): ("C, football", BLUE),
         (f"jax {football}", 4): ("MJX, football", ORANGE),
     }
-    colors = {2: GREY, 8: VIOLET, 16: INK}
-    robots = {(f"warp {football}", number): (f"{number} robots", color) for number, color in colors.items()}
+    colors = {2: GREY, 16: VIOLET, 64: INK}
+    sized = {(f"warp {football}", number): (f"{number} robots", color) for number, color in colors.items()}
     figure = Figure((WIDTH / 100, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    for axes, varied, title, lines in ((left, 1, "robots", engines), (right, 2, "environments on Warp", robots)):
+    for axes, varied, title, lines in ((left, 1, "robots", engines), (right, 2, "environments on Warp", sized)):
         for (kind, fixed), (label, color) in lines.items():
-            own = {case[varied]: r for case, r in sorted(rates.items()) if (case[0], case[3 - varied]) == (kind, fixed)}
-            axes.plot([*own], [np.median(values) for values in own.values()], "o-", color=color, ms=4, label=label)
+            for case, style in ((f"{kind} false", "o--"), (kind, "o-")):
+                own = {x[varied]: rate for x, rate in sorted(rates.items()) if (x[0], x[3 - varied]) == (case, fixed)}
+                look = {"color": color, "ms": 4, "label": label if case == kind else None}
+                axes.plot([*own], [np.median(values) for values in own.values()], style, **look)
         axes.set(xscale="log", yscale="log")
         axes.set_xlabel(title, fontsize=10.5)
-        ticks = sorted({case[varied] for case in rates if varied == 1 or "warp" in case[0]})
+        ticks = sorted({x[varied] for x in rates if varied == 1 or x[:2] == (f"warp {football}", 2)})
         axes.set_xticks(ticks, [str(tick) for tick in ticks], fontsize=9)
         axes.minorticks_off()
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False, fontsize=10)
+    right.plot([], [], "--", color=FAINT, label="sparse_solver=false")
+    left.legend(loc=(0.03, 0.42), frameon=False, fontsize=10)
+    right.legend(loc="lower right", frameon=False, fontsize=10)
     left.set_ylabel("robot steps/s", fontsize=10.5)
     return figure
 
