@@ -132,7 +132,7 @@ def _step_kernel(padded: int, size: int) -> Any:
 
 
 def step(model: Any, data: Any, context: Any, skip_unchanged: bool = False, skip_noflip: bool = False) -> None:
-    """Sets the Newton step of MuJoCo Warp's solver: the same as its own function of these arguments."""
+    """Sets the Newton step of a solve, as MuJoCo Warp's own `_cholesky_factorize_solve` does."""
     envs, padded, size = data.nworld, model.nv_pad, model.nv
     blocks = padded // BLOCK
     if not skip_unchanged:  # the first step of a solve, in which the constraints stay the same

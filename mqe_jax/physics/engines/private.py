@@ -133,7 +133,7 @@ def _sparse_block_dim() -> type:
     dense: Any = solver._cholesky_factorize_solve
 
     def step(model: Any, *arguments: Any, **options: Any) -> None:
-        sparse = isinstance(model.block_dim, SparseBlockDim) and model.is_sparse  # not that of a scene with sleep
+        sparse = isinstance(model.block_dim, SparseBlockDim) and model.is_sparse  # dense copies solve scenes with sleep
         (newton.step if sparse else dense)(model, *arguments, **options)
 
     solver._cholesky_factorize_solve = step
