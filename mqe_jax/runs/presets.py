@@ -2,11 +2,12 @@
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mqe_jax.core.errors import InputError, nearest
-from mqe_jax.core.settings import FrozenMapping, PathText, check, fail, load_yaml, override
+from mqe_jax.core.settings import FrozenMapping, PathText, check, fail, load_yaml, merge, override
 from mqe_jax.envs.registry import ALIASES, SHIPPED, TASKS
 from mqe_jax.train.config import TrainConfig, load_config
 
@@ -55,7 +56,8 @@ def base_config(
 
     The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
     paper/mappo for other tasks. If the parameters name sensors and the settings no group of observations, a policy that
-    sees the sensors gets the settings of `onboard.yaml`. InputError for a file or an algorithm that is not allowed.
+    sees the sensors gets the settings of `onboard.yaml`. A given parameter counts in training too: it replaces that of
+    `train_env`. InputError for a file or an algorithm that is not allowed.
     """
     task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
     if name is None and algorithm is not None:
@@ -63,8 +65,20 @@ def base_config(
     elif name is None:
         name = default_name(task)
     config = override(named_config(name, task), changes)
+    config = replace(config, train_env=FrozenMapping(_without(config.train_env, merge({}, env))))
     sensing = env.get("senses", "full") not in ("full", (), [])
     return override(config, _parts("onboard")) if sensing and config.group == "policy" else config
+
+
+def _without(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns nested values but for those of which the others have one too."""
+    kept: dict[str, Any] = {}
+    for name, value in merge({}, values).items():
+        if name not in others:
+            kept[name] = value
+        elif isinstance(value, Mapping) and isinstance(others[name], Mapping):
+            kept[name] = _without(value, others[name])
+    return kept
 
 
 def default_name(task: str) -> str:

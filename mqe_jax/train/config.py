@@ -115,7 +115,7 @@ class Imitation:
     weight: NonNegative = 1.0
     """Initial weight of the loss, annealed linearly to 0."""
     until: Positive = 0.5
-    """Fraction of training after which the weight is 0."""
+    """Fraction of training after which the weight is 0; above 1, some is left at the end."""
 
 
 @record
@@ -189,7 +189,8 @@ class TrainConfig:
     env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
     """Overrides of the task's parameters, passed to the environment unchanged."""
     train_env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
-    """Further overrides during training only, not in evaluation."""
+    """Further overrides during training only, not in evaluation. A parameter that the user gives (`--set`, `env`) replaces
+    that of the file."""
     opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
     """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, another scripted policy of
     the task, the task itself (its shipped policy), a run folder or a policy file; in training also newest (the policy
