@@ -189,8 +189,8 @@ class TrainConfig:
     env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
     """Overrides of the task's parameters, passed to the environment unchanged."""
     train_env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
-    """Further overrides during training only, not in evaluation. A parameter that the user gives (`--set`, `env`) replaces
-    that of the file."""
+    """Further overrides during training only, not in evaluation. A given parameter (`--set`, `env`) replaces that of
+    the file."""
     opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
     """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, another scripted policy of
     the task, the task itself (its shipped policy), a run folder or a policy file; in training also newest (the policy
