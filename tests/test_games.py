@@ -201,6 +201,17 @@ def test_estimates_of_teams_equal_a_recomputation_with_the_same_draws(count: int
         check(found["gap"], np.diag(rates).mean() - other, (np.array(same) - cross)[met])
 
 
+def test_an_estimate_of_partners_equals_a_recomputation_with_the_same_draws() -> None:
+    random, rates = np.random.default_rng(0), np.random.default_rng(3).uniform(size=(4, 2))
+    ended = random.standard_gamma(np.stack([16 * rates + 0.5, 16 * (1 - rates) + 0.5], axis=-1), (500, 4, 2, 2))
+    times = random.multinomial(4, [0.25] * 4, 500)
+    means = [
+        np.mean([each[i, :, 0] / each[i].sum(axis=-1) for i in range(4) for _ in range(often[i])])
+        for each, often in zip(ended, times, strict=True)
+    ]
+    check(games.partners(rates, 16), rates.mean(), np.array(means))
+
+
 def test_intervals_contain_the_truth_about_as_often_as_they_say() -> None:
     """Mean success of five of many seeds with mates of other seeds, whose abilities add up; 60 studies."""
     random, hits = np.random.default_rng(0), 0

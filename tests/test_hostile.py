@@ -242,6 +242,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("results: ", lambda x, v: games.analyse(v), (None, GAMES)),
     ("payoff: ", lambda x, v: games.nash(v), (None, 3, np.ones((1, 2)), np.ones((2, 2)), np.full((2, 2), NAN))),
     ("rates: ", lambda x, v: games.mates(v, 1), (None, np.ones((1, 2)), np.full((2, 2), 2.0), np.full((1, 1), NAN))),
+    ("rates: ", lambda x, v: games.partners(v, 1), (None, np.ones(2), np.ones((0, 2)), np.full((1, 2), 2.0))),
     ("reference: ", lambda x, v: tournament.rate(GAMES, v), (None, -1, 1, "a")),
     ("episodes", lambda x, v: recording.best(v), (None, [], [3])),
     ("episodes", lambda x, v: recording.typical(v), (None, [], [3])),

@@ -18,7 +18,7 @@ from mqe_jax.core.settings import PathText, check_arguments, fail
 from mqe_jax.core.types import AnyBatch, AnyPolicy, Memory, Observations, RandomKey, teams_of
 from mqe_jax.envs import VectorEnv
 from mqe_jax.policies import MixedTeam
-from mqe_jax.selfplay.league.games import Estimate, mates
+from mqe_jax.selfplay.league.games import Estimate, mates, partners
 from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
 from mqe_jax.selfplay.league.tournament import CSV, PICTURE
 from mqe_jax.train.evaluate import Evaluator, Rate
@@ -70,9 +70,16 @@ class CrossPlay:
 
     @functools.cached_property
     def means(self) -> dict[str, Estimate]:
-        """Means of `success` without reference policies: `same`, `cross` and `gap` of `games.mates`."""
+        """Means of `success` over policies: `same`, `cross` and `gap` of `games.mates`, and with each reference policy.
+
+        With a reference policy, named as it is, the means are of both places.
+        """
         count = len(self.policies)
-        return mates(self.success[:count, :count], self.episodes)
+        found = mates(self.success[:count, :count], self.episodes)
+        for i, name in enumerate(self.references, count):
+            teams = np.stack([self.success[:count, i], self.success[i, :count]], axis=-1)
+            found[name] = partners(teams, self.episodes)
+        return found
 
     @property
     def worst(self) -> tuple[int, int] | None:
@@ -89,6 +96,7 @@ class CrossPlay:
         count, names = len(self.policies), [*self.policies, *self.references]
         wide = max(50 * (rate.high - rate.low) for rate in itertools.starmap(self.rate, self._pairs))
         shown = {"same": "policies with themselves", "cross": "different policies", "gap": "difference"}
+        shown |= {name: f"policies with {name}" for name in self.references}
         lines = [f"{self.task}: success in % of {self.episodes} episodes (95% interval)"]
         lines += [
             f"{text:<26}{self.means[name].text(form='.1f')}" for name, text in shown.items() if name in self.means

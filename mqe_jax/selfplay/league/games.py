@@ -58,6 +58,12 @@ def _check_payoff(value: Any) -> Any:
     return value
 
 
+def _check_mixed(value: Any) -> Any:
+    if np.ndim(value) != 2 or not np.size(value) or not np.all((0 <= value) & (value <= 1)):
+        raise ValueError("rates in [0, 1] of policies in teams (P, K)")
+    return value
+
+
 def _check_rates(value: Any) -> Any:
     shape = np.shape(value)
     if len(shape) != 2 or shape[0] != shape[1] or not shape[0] or not np.all((0 <= value) & (value <= 1)):
@@ -67,6 +73,8 @@ def _check_rates(value: Any) -> Any:
 
 Results = Annotated[Any, pydantic.AfterValidator(_check_results)]
 """Kind of an argument that is a result of `round_robin` (P, P, 3); of some, with leading axes."""
+Mixed = Annotated[Any, pydantic.AfterValidator(_check_mixed)]
+"""Kind of an argument that is a rate of each policy in some teams (P, K)."""
 Payoff = Annotated[Any, pydantic.AfterValidator(_check_payoff)]
 """Kind of an argument that is an antisymmetric matrix (P, P)."""
 Rates = Annotated[Any, pydantic.AfterValidator(_check_rates)]
@@ -220,10 +228,7 @@ def mates(rates: Array, episodes: int) -> dict[str, Estimate]:
     `same` is that of policies with themselves, `cross` that with others, and `gap` the first minus the second; with one
     policy there are no others. Rates of values in [0, 1] have conservative intervals.
     """
-    random, count = np.random.default_rng(0), len(rates)
-    ended = episodes * np.stack([rates, 1 - np.asarray(rates)], axis=-1) + 0.5
-    samples = resample(ended, random)[..., 0] / (episodes + 1)
-    times = random.multinomial(count, np.full(count, 1 / count), len(samples)).astype(float)
+    count, (samples, times) = len(rates), _resample_teams(rates, episodes)
 
     def mean(rates: Array, weights: Array) -> Array:
         total = weights.sum(axis=(-1, -2))
@@ -236,3 +241,18 @@ def mates(rates: Array, episodes: int) -> dict[str, Estimate]:
         cross = mean(rates, 1 - own), mean(samples, times[:, :, None] * times[:, None, :] * (1 - own))
         found |= {"cross": estimate(*cross), "gap": estimate(same[0] - cross[0], same[1] - cross[1])}
     return found
+
+
+@check_arguments(rates=Mixed, episodes=Episodes)
+def partners(rates: Array, episodes: int) -> Estimate:
+    """Returns the mean of success rates of P policies in K teams each (P, K), over policies and episodes as `mates`."""
+    samples, times = _resample_teams(rates, episodes)
+    return estimate(np.mean(rates), (samples.mean(axis=-1) * times).sum(axis=-1) / len(rates))
+
+
+def _resample_teams(rates: Array, episodes: int) -> tuple[Array, Array]:
+    """Returns bootstrap samples of success rates (S, P, K), and how often each draws each policy (S, P)."""
+    random, count = np.random.default_rng(0), len(rates)
+    ended = episodes * np.stack([rates, 1 - np.asarray(rates)], axis=-1) + 0.5
+    samples = resample(ended, random)[..., 0] / (episodes + 1)
+    return samples, random.multinomial(count, np.full(count, 1 / count), len(samples)).astype(float)
