@@ -330,12 +330,43 @@ def test_a_part_measures_policies(
             "arguments: {episode: 3}",
             "arguments.episode: 3 is not allowed; it must be an argument of evaluate: task, policy",
         ),
+        (
+            "by_task: {go1tug: {episodes: 64}}",
+            "by_task: 'go1tug' is not allowed; it must be one of the part's tasks: go1g",
+        ),
+        ("by_task: {go1gate: 64}", "by_task.go1gate: 64 is not allowed; it must be a mapping of arguments"),
+        (
+            "arguments: {policy: ['no/*']}",
+            "arguments.policy: 'no/*' is not allowed; it must be a pattern of files that",
+        ),
     ],
 )
 def test_measurements_that_cannot_be_made_are_named(tmp_path: Path, change: str, message: str) -> None:
     part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
     with pytest.raises(InputError, match=re.escape(message)):
         measuring.plan(build(sweeps.Measurement, part), tmp_path)
+
+
+def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("go1gate-seed1", "go1gate-seed0", "go1tug-seed0"):
+        Path(name).touch()
+    part = {"measure": "tournament", "tasks": ["go1gate", "go1tug"], "arguments": {"policies": ["{task}-*"], "seed": 3}}
+    part |= {
+        "by_task": {"go1tug": {"policies": ["{task}", "{task}-*"], "episodes": 64}},
+        "variants": {"v": {"seed": 4}},
+    }
+    gate, tug = (item.arguments for item in measuring.plan(build(sweeps.Measurement, part), tmp_path))
+    assert gate == {"impl": "auto", "policies": ["go1gate-seed0", "go1gate-seed1"], "seed": 4}
+    assert tug == {"impl": "auto", "policies": ["go1tug", "go1tug-seed0"], "seed": 4, "episodes": 64}
+
+
+def test_published_parts_name_files_and_arguments_that_exist(monkeypatch: Any) -> None:
+    root = Path(__file__).parents[1]
+    monkeypatch.chdir(root)
+    for part in yaml.safe_load((root / "configs" / "strength.yaml").read_text("utf-8")):
+        settings = sweeps.load_part(root / "configs" / "strength.yaml", part)
+        assert isinstance(settings, sweeps.Measurement) and measuring.plan(settings, root / "none")
 
 
 def test_a_measurement_that_trains_has_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

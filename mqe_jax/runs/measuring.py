@@ -1,6 +1,7 @@
 """Parts of a sweep that measure policies: evaluations, tournaments and whatever else returns a result by one call."""
 
 import dataclasses
+import glob
 import inspect
 import json
 import pkgutil
@@ -43,14 +44,29 @@ def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
     known = inspect.signature(pkgutil.resolve_name(MEASURES[part.measure])).parameters
     items = []
     for task in part.tasks:
+        usual = {**part.arguments, **part.by_task.get(task, {})}
         for variant, changes in part.variants.items():
             place = folder / "results" / task / variant
-            arguments = {"impl": impl, **for_task({**part.arguments, **changes}, task_id(task))}
+            asked = for_task({**usual, **changes}, task_id(task))
+            arguments = {"impl": impl, **{name: _with_files(name, value) for name, value in asked.items()}}
             arguments |= {"folder": str(place / "runs")} if "folder" in known else {}
             for name in arguments.keys() - known.keys():
                 fail(f"arguments.{name}", arguments[name], f"an argument of {part.measure}: {', '.join(known)}")
             items.append(Item(task, variant, arguments, place / RESULT))
     return items
+
+
+def _with_files(name: str, value: Any) -> Any:
+    """Returns an argument, of a list with the files that match in place of each pattern; InputError if none does."""
+    if not isinstance(value, list):
+        return value
+    found: list[Any] = []
+    for entry in value:
+        files = sorted(glob.glob(entry)) if isinstance(entry, str) and "*" in entry else [entry]
+        if not files:
+            fail(f"arguments.{name}", entry, "a pattern of files that exist")
+        found += files
+    return found
 
 
 def measure(part: Measurement, folder: Path, impl: str = "auto", *, dry_run: bool = False) -> dict[str, Any]:

@@ -74,9 +74,18 @@ class Measurement:
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     arguments: Mapping[str, Any] = FrozenMapping()
-    """Arguments of the call, in which {task} stands for the task's id."""
+    """Arguments of the call, in which {task} stands for the task's id, in a list also * for any part of a file name."""
+    by_task: Mapping[str, Any] = FrozenMapping()
+    """Arguments of a task, by its id, that override these, such as go1gate: {episodes: 64}."""
     variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
-    """Named arguments that override these, such as slippery: {env: {friction: 0.5}}."""
+    """Named arguments that override all others, such as slippery: {env: {friction: 0.5}}."""
+
+    def __post_init__(self) -> None:
+        for task, values in self.by_task.items():
+            if task not in self.tasks:
+                fail("by_task", task, f"one of the part's tasks: {', '.join(self.tasks)}")
+            if not isinstance(values, Mapping):
+                fail(f"by_task.{task}", values, "a mapping of arguments")
 
 
 @dataclass(frozen=True)
