@@ -1,18 +1,23 @@
-"""tools/strength_page.py: the tables of docs/results/strength.md and the data behind them."""
+"""tools/strength_page.py: the tables of docs/results/strength.md, mates.md and skills.md and the data behind them."""
 
 import csv
 import importlib
 import io
+import itertools
+import json
 import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from mqe_jax.core.errors import InputError
+from mqe_jax.policies import zoo
+from mqe_jax.selfplay.league.crossplay import CrossPlay
 from mqe_jax.train.evaluate import Rate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
@@ -40,9 +45,31 @@ def lines(table: str) -> list[list[str]]:
     return [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
 
 
-def test_the_page_shows_the_published_data() -> None:
-    page = strength_page.PAGE.read_text("utf-8")
-    assert strength_page.filled(page, strength_page.tables()) == page
+def test_the_pages_show_the_published_data() -> None:
+    tables = strength_page.tables()
+    for name, sections in strength_page.SECTIONS.items():
+        page = (strength_page.PAGES / name).read_text("utf-8")
+        assert strength_page.filled(page, {each: tables.pop(each) for each in sections}) == page
+    assert not tables
+
+
+@pytest.mark.parametrize("task", strength_page.COOPERATIVE)
+def test_mixed_teams_of_a_page_are_those_of_their_rates(task: str) -> None:
+    """All act alike, and the published means are those of the published rates."""
+    found = json.loads((strength_page.DATA / f"crossplay_{task}.json").read_text("utf-8"))
+    names = {name: tuple(found[name]) for name in ("policies", "references")}
+    play = CrossPlay(task, episodes=found["episodes"], success=np.array(found["success"]["value"]), **names)
+    expected, shipped = play.to_dict(), [name for name in found["policies"] if name in zoo.names()]
+    for name, key in itertools.product(("same", "cross", "gap", "worst", *found["references"]), Rate._fields):
+        assert found[name][key] == pytest.approx(expected[name][key], abs=1e-6), name
+    assert len(found["policies"]) == 5 and all(zoo.card(name).mode == "sampled" for name in shipped)
+
+
+def test_every_match_has_best_responses_of_two_seeds() -> None:
+    kinds = [(row["task"], row["seed"], row["from"]) for row in strength_page.rows("exploitability")]
+    for task in strength_page.MATCHES:
+        own = [kind[1:] for kind in kinds if kind[0] == task]
+        assert len(own) == 4 and len({seed for seed, _ in own}) == 2
 
 
 def test_a_match_has_a_row_once_all_conditions_are_measured(data: Path) -> None:
@@ -75,10 +102,15 @@ def test_the_smallest_lead_counts_losses(data: Path) -> None:
 
 
 def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--rates: .* has no PART/rates.csv; PART is one of cooperative, matches"):
+    with pytest.raises(InputError, match=r"--rates: .* has no results of a part: cooperative, matches, .*, crossplay"):
         strength_page.copy_rates(tmp_path)
     before = (data / "matches.csv").read_bytes()
     write(tmp_path / "population" / "rates.csv", {("go1tug", "plain", "win_rate"): 0.5})
+    mixed = {"task": "go1gate", "same": {"value": 0.5}}
+    place = tmp_path / "crossplay" / "results" / "go1gate" / "plain"
+    place.mkdir(parents=True)
+    (place / "result.json").write_text(json.dumps({"measure": "tournament", "result": mixed}))
     strength_page.copy_rates(tmp_path)
     assert (data / "population.csv").read_bytes() == (tmp_path / "population" / "rates.csv").read_bytes()
     assert (data / "matches.csv").read_bytes() == before
+    assert json.loads((data / "crossplay_go1gate.json").read_text("utf-8")) == mixed

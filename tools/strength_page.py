@@ -1,9 +1,9 @@
-"""Fills the tables of docs/results/strength.md and draws its pictures from results/strength.
+"""Fills tables of docs/results/strength.md, mates.md and skills.md and draws their pictures from results/strength.
 
 `python tools/strength_page.py` reads the rates that `mqe sweep configs/strength.yaml --part PART` measured, as
-results/strength/PART.csv, and the best responses in exploitability.csv. `python tools/strength_page.py --rates FOLDER`
-first copies FOLDER/PART/rates.csv of every part that FOLDER has. The table of other conditions has a row for each task
-that is measured under all of them.
+results/strength/PART.csv, mixed teams in crossplay_TASK.json and best responses in exploitability.csv. `python
+tools/strength_page.py --rates FOLDER` first copies the results of every part that is below FOLDER. The table of other
+conditions has a row for each task that is measured under all of them.
 """
 
 import argparse
@@ -13,7 +13,6 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 from paper_page import filled, reduced
 
@@ -23,7 +22,13 @@ from mqe_jax.policies import zoo
 from mqe_jax.train.evaluate import Rate
 
 ROOT = Path(__file__).parents[1]
-DATA, PAGE = ROOT / "results" / "strength", ROOT / "docs" / "results" / "strength.md"
+DATA, PAGES = ROOT / "results" / "strength", ROOT / "docs" / "results"
+SECTIONS = {
+    "strength.md": ("cooperative", "matches", "population", "exploitability", "robustness"),
+    "mates.md": ("mates",),
+    "skills.md": ("walk",),
+}
+"""Filled sections of each page."""
 COOPERATIVE = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender")
 MATCHES = ("go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
 PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
@@ -73,7 +78,8 @@ def rates(part: str, by: str = "variant") -> Rates:
 
 def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     """Returns a Markdown table."""
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
+    first, *others = ("| " + " | ".join(line) + " |" for line in (head, *body))
+    return "\n".join((first, "|" + "---|" * len(head), *others))
 
 
 def cooperative(found: Rates) -> str:
@@ -126,12 +132,15 @@ def population(found: Rates) -> str:
 
 
 def exploitability() -> str:
-    """Returns the table of the largest lead of a best response to each team."""
+    """Returns the table of the larger lead of the two best responses of each seed."""
     body = []
     for task in MATCHES:
-        best = max((row for row in rows("exploitability") if row["task"] == task), key=lambda row: float(row["value"]))
-        body.append([f"`{task}`", rate(best).percent])
-    return table(("match", "exploitability at least, points"), body)
+        by_seed: dict[str, list[Rate]] = {}
+        for row in rows("exploitability"):
+            if row["task"] == task:
+                by_seed.setdefault(row["seed"], []).append(rate(row))
+        body.append([f"`{task}`", *(max(by_seed[seed]).percent for seed in sorted(by_seed))])
+    return table(("match", "lead, first seed", "lead, second seed"), body)
 
 
 def robustness(found: Rates) -> str:
@@ -160,16 +169,31 @@ def robust_tasks(found: Rates) -> list[str]:
     return [task for task in (*COOPERATIVE, *MATCHES) if all((task, name) in measured for name in CONDITIONS)]
 
 
-def mates(task: str) -> dict[str, tuple[Rate]]:
-    """Returns the success of teams of one seed and of two, and with a scripted or idle robot, there with its range."""
+def walk(found: Rates) -> str:
+    """Returns the table of wins against the scripted team by teams with the walking and with the agile skill."""
+    variants = ("walk", "scripted")
+    body = [[f"`{task}`", *(against(found, task, each)[0].percent for each in variants)] for task in MATCHES]
+    return table(("match", "walking team", "agile team"), body)
+
+
+def mates(task: str) -> dict[str, Rate]:
+    """Returns means over mixed teams by name, the `worst` pair, and `gap`, by which teams of one seed are better."""
     data = json.loads((DATA / f"crossplay_{task}.json").read_text("utf-8"))
-    success, count = np.asarray(data["success"]["value"]), len(data["policies"])
-    shown = {"own mate": data["same"], "other seed": data["cross"]}
-    found = {name: (Rate(each["value"], each["low"], each["high"]),) for name, each in shown.items()}
-    for i, name in enumerate(data["references"], count):
-        teams = [*success[:count, i], *success[i, :count]]
-        found[name] = (Rate(float(np.mean(teams)), min(teams), max(teams)),)
-    return found
+    names = ("same", "cross", "gap", "worst", *data["references"])
+    return {name: Rate(*(data[name][key] for key in Rate._fields)) for name in names}
+
+
+def drawn_mates(task: str) -> dict[str, tuple[Rate]]:
+    """Returns the means over mixed teams that are drawn, by label."""
+    labels = {"same": "own mate", "cross": "other seed", "scripted": "scripted", "idle": "idle"}
+    return {label: (mates(task)[name],) for name, label in labels.items()}
+
+
+def mixed() -> str:
+    """Returns the table of mixed teams."""
+    head = ("own mate", "other seed", "difference, points", "worst pair", "scripted mate", "idle mate")
+    body = [[f"`{task}`", *(each.percent for each in mates(task).values())] for task in COOPERATIVE]
+    return table(("task", *head), body)
 
 
 def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -> bytes:
@@ -237,13 +261,15 @@ def draw_heat(found: Rates) -> bytes:
 
 
 def tables() -> dict[str, str]:
-    """Returns the tables of the page by section."""
+    """Returns the tables of the pages by section."""
     return {
         "cooperative": cooperative(rates("cooperative", by="actions")),
         "matches": matches(rates("matches")),
         "population": population(rates("population")),
         "exploitability": exploitability(),
         "robustness": robustness(robust_rates()),
+        "mates": mixed(),
+        "walk": walk(rates("matches")),
     }
 
 
@@ -261,27 +287,34 @@ def pictures() -> dict[str, bytes]:
         "success.png": draw_rates(teams, "success, %"),
         "wins.png": draw_rates(opponents, label),
         "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
-        "mates.png": draw_rates({task: mates(task) for task in COOPERATIVE}, "success, %"),
+        "mates.png": draw_rates({task: drawn_mates(task) for task in COOPERATIVE}, "success, %"),
         "robustness.png": draw_heat(robust_rates()),
         "exploitability.png": draw_leads(rows("exploitability")),
     }
 
 
 def copy_rates(folder: Path) -> None:
-    """Copies the rates of the parts that a folder has; InputError if it has none."""
-    files = {part: file for part in PARTS if (file := folder / part / "rates.csv").is_file()}
-    if not files:
-        raise InputError(f"--rates: {folder} has no PART/rates.csv; PART is one of {', '.join(PARTS)}")
-    for part, file in files.items():
-        write_atomically(DATA / f"{part}.csv", file.read_bytes())
+    """Copies the rates and mixed teams of the parts below a folder; InputError if there are none."""
+    tables = {f"{part}.csv": folder / part / "rates.csv" for part in PARTS}
+    contents = {name: file.read_bytes() for name, file in tables.items() if file.is_file()}
+    for file in folder.glob("crossplay/results/*/plain/result.json"):
+        result = json.loads(file.read_text("utf-8"))["result"]
+        contents[f"crossplay_{result['task']}.json"] = f"{json.dumps(result)}\n".encode()
+    if not contents:
+        raise InputError(f"--rates: {folder} has no results of a part: {', '.join(PARTS)}, crossplay")
+    for name, content in contents.items():
+        write_atomically(DATA / name, content)
 
 
 def update() -> None:
-    """Writes the page and its pictures."""
-    page = filled(PAGE.read_text("utf-8"), tables())
+    """Writes the pages and their pictures."""
+    found = tables()
+    pages = {PAGES / name: {each: found[each] for each in sections} for name, sections in SECTIONS.items()}
+    texts = {page: filled(page.read_text("utf-8"), contents) for page, contents in pages.items()}
     for name, content in pictures().items():
-        write_atomically(PAGE.parent / name, content)
-    write_atomically(PAGE, page.encode())
+        write_atomically(PAGES / name, content)
+    for page, text in texts.items():
+        write_atomically(page, text.encode())
 
 
 if __name__ == "__main__":
