@@ -274,5 +274,5 @@ def test_shipped_settings_train_a_range_of_sizes(task: str) -> None:
     usual: Any = base_config(task, None)
     assert (config.group, config.network.name) == (ENTITIES, "blocks")
     assert config.training_env["fewest_agents"] < config.env["num_agents"] and "fewest_agents" not in config.env
-    assert config.imitation == usual.imitation and config.network.hidden_sizes == usual.network.hidden_sizes
+    assert config.ppo == usual.ppo and config.network.hidden_sizes == usual.network.hidden_sizes
     assert config.train_env.items() >= usual.train_env.items()
