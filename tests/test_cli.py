@@ -182,6 +182,12 @@ def test_a_parameter_that_is_given_counts_in_training_too() -> None:
     assert build.for_task(both, "go1sheep-easy", given).training_env["rewards"]["failure"] == -5.0
 
 
+def test_a_run_has_the_parameters_that_the_policy_to_start_from_needs() -> None:
+    settings = build.settings_of("go1tug", {"start": "go1tug"})
+    assert build.for_task(settings, "go1tug").env["skill"] == "agile"
+    assert build.for_task(settings, "go1tug", {"skill": "walk"}).env["skill"] == "walk"
+
+
 def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
     parsed = parse_train(["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"])
     expected = {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}

@@ -333,12 +333,13 @@ def settings_of(task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any]
 def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
     """Returns the settings with a task and its parameters; says so where they are those of another task.
 
-    A task by its id gets the parameters that the teacher needs, where they are not given.
+    A task by its id gets the parameters that the teacher and the policy to start from need, where they are not given.
     """
     name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
     if config.task not in (None, name):
         echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
     given = merge(config.env, merge(parameters_of(task), env or {}))
-    if config.imitation.teacher is not None and isinstance(task, str):
-        given = merge(parameters_for(name, config.imitation.teacher), given)
+    if isinstance(task, str):
+        sources = (source for source in (config.imitation.teacher, config.start) if source is not None)
+        given = merge(parameters_for(name, *sources), given)
     return override(config, {"task": name, "env": given})
