@@ -41,7 +41,7 @@ PAGE = Path(__file__).parent / "page"
 """Files of the page."""
 STARTS = 200
 """Initial states of each task."""
-LARGER = ("go1football-1vs1:num_agents=10", "go1sheep-hard:num_agents=4,num_sheep=30,episode_length=40")
+LARGER = ("go1football-1vs1:num_agents=10", "go1sheep-hard:num_agents=4,num_sheep=30,episode_length=45")
 """Tasks of other sizes that the page has by default, played by their scripted policies."""
 _SIZED = re.compile(r"([\w-]+):(\w+=\d{1,9}(?:,\w+=\d{1,9})*)")
 
