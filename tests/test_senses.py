@@ -19,16 +19,20 @@ from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.messages import Messages
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.viz import render
-from tests.sensing import EXACT, readings, scattered
+from tests.sensing import EXACT, SENSING, readings, scattered
 from tests.states import made, placed
 
 
 @pytest.mark.parametrize("impl", ["jax", pytest.param("warp", marks=pytest.mark.gpu)])
-@pytest.mark.parametrize("task", ["go1gate", "go1revolvingdoor", "go1sheep-hard"])
-def test_engines_agree_on_lidar_and_detections(task: str, impl: str) -> None:
-    """In the same 20 states."""
-    env, states = made(task), scattered(task, 20)
-    other = make(task, impl=impl, control="position", num_envs=20)
+@pytest.mark.parametrize(
+    ("task", "count"),
+    [(task, 20) for task in ("go1gate", "go1revolvingdoor", "go1sheep-hard")]
+    + [pytest.param(task, 500, marks=pytest.mark.soak) for task in SENSING],
+)
+def test_engines_agree_on_lidar_and_detections(task: str, count: int, impl: str) -> None:
+    """In states in which the C engine agrees with MuJoCo's rays (`test_sensors.py`)."""
+    env, states = made(task), scattered(task, count)
+    other = make(task, impl=impl, control="position", num_envs=count)
     given = (states.data.qpos, states.data.qvel, states.data.mocap_pos, states.data.ctrl)
     moved = dataclasses.replace(states, data=jax.vmap(other.physics.init)(*given))
 
