@@ -77,9 +77,9 @@ def test_a_task_gets_what_its_teacher_needs(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @functools.cache
-def onboard(senses: Any = "onboard") -> Any:
+def onboard() -> Any:
     """A training of the gate with sensors and a shipped teacher."""
-    return prepare("go1gate", TINY, {"senses": senses}, impl="c")
+    return prepare("go1gate", TINY, SENSES, impl="c")
 
 
 def test_policies_without_sensors_send_no_messages() -> None:
@@ -212,7 +212,8 @@ class Pacer:
 def test_a_training_with_sensors_resumes_bit_for_bit(tmp_path: Path) -> None:
     """Noise, delay, drift and dropout included."""
     late = {"all": {"noise": 0.1, "delay": 2, "dropout": 0.3}}
-    (config,), cast = onboard(["proprioception", *({"name": x, "pipeline": late} for x in ("detections", "lidar"))])
+    senses = ["proprioception", {"name": "detections", "pipeline": late}, {"name": "lidar", "pipeline": late}]
+    (config,), cast = prepare("go1gate", TINY, {"senses": senses}, impl="c")
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     train = functools.partial(train_seeds, cast.env, [config], teacher=Pacer())
     train([whole])
