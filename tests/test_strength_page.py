@@ -101,6 +101,9 @@ def test_the_smallest_lead_counts_losses(data: Path) -> None:
     assert row[3].startswith("-25.0 (-36.") and row[4] == "lost"
 
 
+RESPONSES = {"scratch": {"win": 0.5, "draw": 0.25, "loss": 0.25}, "champion": {"win": 0.75, "draw": 0.25, "loss": 0.0}}
+
+
 def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--rates: .* has no results of a part: cooperative, matches, .*, crossplay"):
         strength_page.copy_rates(tmp_path)
@@ -110,7 +113,18 @@ def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     place = tmp_path / "crossplay" / "results" / "go1gate" / "plain"
     place.mkdir(parents=True)
     (place / "result.json").write_text(json.dumps({"measure": "tournament", "result": mixed}))
+    chosen = {
+        f"runs/go1tug/default+{x}/seed20": {n: {"value": v} for n, v in each.items()} for x, each in RESPONSES.items()
+    }
+    place = tmp_path / "exploitability" / "results" / "go1tug" / "plain"
+    place.mkdir(parents=True)
+    result = {"task": "go1tug", "episodes": 512, "selection": chosen}
+    (place / "result.json").write_text(json.dumps({"measure": "exploitability", "result": result}))
     strength_page.copy_rates(tmp_path)
+    scratch, champion = strength_page.rows("exploitability")
+    assert (scratch["from"], scratch["seed"], scratch["wins"], scratch["value"]) == ("scratch", "20", "0.5", "0.25")
+    assert (champion["from"], champion["task"]) == ("champion", "go1tug") and float(champion["value"]) == 0.75
+    assert float(champion["low"]) < 0.75 < float(champion["high"]) <= 1.0
     assert (data / "population.csv").read_bytes() == (tmp_path / "population" / "rates.csv").read_bytes()
     assert (data / "matches.csv").read_bytes() == before
     assert json.loads((data / "crossplay_go1gate.json").read_text("utf-8")) == mixed

@@ -12,6 +12,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 from paper_page import filled, reduced
@@ -19,6 +20,7 @@ from paper_page import filled, reduced
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
 from mqe_jax.policies import zoo
+from mqe_jax.study import runs
 from mqe_jax.train.evaluate import Rate
 
 ROOT = Path(__file__).parents[1]
@@ -293,15 +295,32 @@ def pictures() -> dict[str, bytes]:
     }
 
 
+def leads(results: Sequence[dict[str, Any]]) -> str:
+    """Returns as CSV how all best responses fare in the episodes that choose one, from results of `mqe exploit`."""
+    body: list[dict[str, Any]] = []
+    for result in sorted(results, key=lambda each: each["task"]):
+        for run, found in result["selection"].items():
+            (cell, seed), episodes = Path(run).parts[-2:], result["episodes"]
+            win, draw, loss = (found[name]["value"] for name in ("win", "draw", "loss"))
+            own = {"task": result["task"], "from": cell.split("+")[1], "seed": seed.removeprefix("seed")}
+            own |= {"actions": "sampled", "episodes": episodes, "wins": win, "draws": draw, "losses": loss}
+            body.append(own | lead(Rate.of(win, episodes), Rate.of(loss, episodes), episodes)._asdict())
+    return runs.table(body)
+
+
 def copy_rates(folder: Path) -> None:
     """Copies the rates and mixed teams of the parts below a folder; InputError if there are none."""
     tables = {f"{part}.csv": folder / part / "rates.csv" for part in PARTS}
     contents = {name: file.read_bytes() for name, file in tables.items() if file.is_file()}
+    if responses := [
+        json.loads(x.read_text("utf-8")) for x in folder.glob("exploitability/results/*/plain/result.json")
+    ]:
+        contents["exploitability.csv"] = leads([each["result"] for each in responses]).encode()
     for file in folder.glob("crossplay/results/*/plain/result.json"):
         result = json.loads(file.read_text("utf-8"))["result"]
         contents[f"crossplay_{result['task']}.json"] = f"{json.dumps(result)}\n".encode()
     if not contents:
-        raise InputError(f"--rates: {folder} has no results of a part: {', '.join(PARTS)}, crossplay")
+        raise InputError(f"--rates: {folder} has no results of a part: {', '.join(PARTS)}, exploitability, crossplay")
     for name, content in contents.items():
         write_atomically(DATA / name, content)
 
