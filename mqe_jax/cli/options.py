@@ -73,8 +73,8 @@ class PolicyOptions(TaskOptions):
     """Policy of team 1 in a match: what --policy accepts. Default: the same as team 0 where that is the shipped one by
     default, else idle."""
     deterministic: bool = False
-    """Use a trained policy's mean actions; otherwise they are sampled, as in training, or as a shipped policy's card
-    declares."""
+    """Use mean actions of trained policies, in a match of both teams; otherwise they are sampled, as in training, or as
+    a shipped policy's card declares."""
     seed: Seed = 0
 
     @property
