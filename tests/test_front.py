@@ -233,6 +233,7 @@ def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     for more, text in shown.items():
         assert cli.main(["eval", "fake", "--policy", "forward", "--episodes", "4", *more.split()]) == 0
         assert capfd.readouterr().out == f"{text}\n"
+        assert more == "--json" or max(map(len, text.splitlines())) <= 80
 
 
 def test_a_table_of_a_match_has_what_happened() -> None:
@@ -259,6 +260,8 @@ def test_a_table_of_a_match_has_what_happened() -> None:
         ("both touched", "0.5"),
         ("diverged episodes", "1"),
     ]
+    against = dataclasses.replace(result, by_opponent={"population/1/response-champion": result})
+    assert max(map(len, str(against).splitlines())) <= 80
 
 
 def test_a_function_is_a_policy() -> None:

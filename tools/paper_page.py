@@ -94,7 +94,7 @@ def sections(estimates: Rows) -> dict[str, str]:
 
 def ours(row: Mapping[str, Any]) -> str:
     """Returns a reward with its interval, bold if that lies above the paper's value."""
-    text = "{training:.3g} [{training_low:.3g}, {training_high:.3g}]".format(**row)
+    text = "{training:.3g} ({training_low:.3g} to {training_high:.3g})".format(**row)
     return f"**{text}**" if row["ours"] == "above" else text
 
 
