@@ -43,15 +43,15 @@ class Card:
     """How a shipped policy was trained, and its results."""
 
     mode: Literal["deterministic", "sampled"]
-    """How it is meant to act."""
+    """Whether it acts by mean or sampled actions."""
     command: str
     """Command that trained it."""
     date: str
-    """Of the training, year-month-day."""
+    """Date of the training, year-month-day."""
     note: str
-    """Hardware, what shared it, how the policy was chosen."""
+    """Sentences: which of how many seeds, steps, hardware, how many trainings shared it."""
     gpu_minutes: NonNegative | None
-    """Time on one GPU, min; none where it was not recorded."""
+    """Wall time on one GPU divided by the number of trainings that shared it, min; None if unknown."""
     results: Mapping[str, Measured]
     """Rates by name, such as success, or win/scripted and loss/scripted."""
     endings: Mapping[str, float]
