@@ -114,6 +114,26 @@ def test_nothing_that_a_parked_robot_is_or_does_changes_anything_for_the_others(
 
 
 @pytest.mark.parametrize("task", [BALL, SHEEP])
+def test_a_frozen_robot_is_observed_as_if_it_took_no_part(task: str) -> None:
+    env, start, agent = sized(task, True), begun(task), PLACES[task][1]
+    frozen = dataclasses.replace(start, frozen_steps=jnp.zeros_like(start.frozen_steps).at[agent].set(2))
+    absent = dataclasses.replace(start, active=start.active.at[agent].set(False))
+    look = jax.jit(lambda state: env.with_observations(state, [ENTITIES]))
+    (hidden, without, plain) = (look(state) for state in (frozen, absent, start))
+    for seen, other, before in (
+        (hidden.obs, without.obs, plain.obs),
+        (*(x.groups[ENTITIES] for x in (hidden, without, plain)),),
+    ):
+        np.testing.assert_array_equal(seen, other)
+        assert not seen[agent].any() and np.any(np.asarray(seen != before)[PLACES[task][0]])
+    later = look(dataclasses.replace(frozen, step=frozen.step + 2))
+    np.testing.assert_array_equal(later.groups[ENTITIES], plain.groups[ENTITIES])
+    states = resets(env)(jax.random.split(jax.random.PRNGKey(1), 40), jnp.ones(40))
+    late = np.asarray(states.frozen_steps) > 0
+    assert not late[~np.asarray(states.active)].any() and (late.sum(axis=1) == 1).mean() > 0.9
+
+
+@pytest.mark.parametrize("task", [BALL, SHEEP])
 def test_pictures_show_those_who_take_part(task: str) -> None:
     env, data = sized(task, True), begun(task).data
     poses = (np.stack([np.asarray(x)] * 2) for x in (data.qpos, data.mocap_pos, data.mocap_quat))

@@ -219,7 +219,7 @@ class QuadrupedEnv(Task[S, P]):
             randomized=self.randomizer.sample(physics_key),
             task=nothing,
             assistance=assistance,
-            frozen_steps=self._sample_frozen_steps(freeze_key, assistance),
+            frozen_steps=self._sample_frozen_steps(freeze_key, assistance, active),
             key=next_key,
             active=active,
             senses=self.suite.reset() if self.params.senses else (),
@@ -299,7 +299,7 @@ class QuadrupedEnv(Task[S, P]):
                 key = jax.random.fold_in(state.key, _NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
             obs = hide(layout, obs, there) if there else obs
-            seen[name] = jnp.where(state.active[:, None], finite(obs), 0.0)
+            seen[name] = jnp.where(self.observed(state)[:, None], finite(obs), 0.0)
         privileged = self.observe_privileged(state, robots)
         seen = {"obs": seen.pop("policy"), "privileged_obs": finite(privileged), "groups": seen}
         return dataclasses.replace(state, **seen)
@@ -374,11 +374,11 @@ class QuadrupedEnv(Task[S, P]):
         qpos = scatter(model.qpos0, robots, jnp.concatenate([pose[:, :3], turn, joints], axis=-1))
         return qpos, scatter(np.zeros(model.nv), index.base_qvel, velocity)
 
-    def _sample_frozen_steps(self, key: jax.Array, assistance: jax.Array) -> jax.Array:
+    def _sample_frozen_steps(self, key: jax.Array, assistance: jax.Array, active: jax.Array) -> jax.Array:
         agent_key, time_key = jax.random.split(key)
         steps = assistance * self.params.frozen_time / self.dt * jax.random.uniform(time_key, ())
-        agent = jax.random.randint(agent_key, (), 0, self.num_agents)
-        return jnp.where(jnp.arange(self.num_agents) == agent, steps, 0.0).astype(jnp.int32)
+        number = 1 + jax.random.randint(agent_key, (), 0, self.num_agents) % jnp.sum(active)
+        return jnp.where(active & (jnp.cumsum(active) == number), steps, 0.0).astype(jnp.int32)
 
     def check_state(self, state: State[S]) -> None:
         """Raises an InputError for anything but a state of one environment of this task."""

@@ -118,7 +118,8 @@ class TaskParams:
     """
     frozen_time: Time = 4.0
     """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
-    first learn sequential subtasks one at a time. Inactive at assistance 0."""
+    first learn sequential subtasks one at a time. Where the number of robots varies, nobody observes it meanwhile: its
+    mates learn to act as a smaller team. Inactive at assistance 0."""
     shaping_floor: Fraction = 1.0
     """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at assistance 1."""
 

@@ -151,7 +151,11 @@ class Task(Sensing, Generic[S, P]):
 
     def there(self, state: State[S]) -> dict[str, jax.Array]:
         """Returns which entities of a block take part (A, count) bool, by the block's name; of other blocks all do."""
-        return robots_there(self.teams, state.active)
+        return robots_there(self.teams, self.observed(state))
+
+    def observed(self, state: State[S]) -> jax.Array:
+        """Returns which agents are observed (A,) bool: the active ones; where their number varies, not the frozen."""
+        return state.active & (state.step >= state.frozen_steps) if self.varies else state.active
 
     @property
     def action_space(self) -> Box:
@@ -191,7 +195,7 @@ class Task(Sensing, Generic[S, P]):
         """Returns the blocks of one of `groups` by name (A, width)."""
         if name == ENTITIES:
             blocks, there = self.observe(state, robot_state), self.there(state) if self.varies else {}
-            return observe_entities(self.observation_layout, blocks, there, self.teams, state.active)
+            return observe_entities(self.observation_layout, blocks, there, self.teams, self.observed(state))
         sensed = jax.tree.map(lambda x: x[: self.num_agents], robot_state.proprioception)
         joints = sensed.joint_position - self.robot.default_joints
         return {"gravity": sensed.gravity_b, "joint_position": joints, "joint_velocity": sensed.joint_velocity}
