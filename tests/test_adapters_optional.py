@@ -296,3 +296,34 @@ def test_bad_input_is_named(zoo: Any) -> None:
         zoo.parallel_env("go1gate", max_cycles=-1, impl="c", control="position")
     refuses("episode_length: give either this or max_cycles", zoo.parallel_env, "go1gate", max_cycles=4, **SHORT)
     refuses("need the id of a task", zoo.parallel_env, env.task, max_cycles=4)
+
+
+# -- Examples of trainings with other libraries ------------------------------------------------------------------------
+
+
+@pytest.mark.soak
+def test_brax_trains() -> None:
+    adapter("brax")
+    example = importlib.import_module("brax_ppo")
+    env = example.Env("go1gate", impl="c", episode_length=0.5)
+    rows = example.train(env, env, 0, 2_000, 2, num_envs=8, eval_envs=8)
+    assert len(rows) == 2 and rows[-1]["env_steps"] >= 2_000 and np.isfinite(rows[-1]["return"])
+
+
+@pytest.mark.soak
+def test_stable_baselines3_trains() -> None:
+    adapter("pettingzoo")
+    for library in ("supersuit", "stable_baselines3"):
+        pytest.importorskip(library)
+    example = importlib.import_module("sb3_pettingzoo")
+    rows = example.train(example.vectorised("go1gate", impl="c", episode_length=0.5), 200, rollout=32)
+    assert rows[-1]["env_steps"] == 256 and rows[-1]["episode_length"] <= 25
+
+
+@pytest.mark.soak
+def test_torchrl_trains() -> None:
+    adapter("pettingzoo")
+    pytest.importorskip("torchrl")
+    example = importlib.import_module("torchrl_mappo")
+    returns = example.train("go1tug", 100, 50, opponent="idle", impl="c", episode_length=0.5)
+    assert len(returns) == 2 and np.isfinite(returns).all()

@@ -1,5 +1,6 @@
 """The documentation's pages: their code, notebooks and examples run, their commands are parsed by the program."""
 
+import functools
 import importlib
 import json
 import os
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax import cli
 from mqe_jax.cli import demo
 from mqe_jax.cli.arguments import COMMANDS, parse
 from mqe_jax.core.settings import override
@@ -29,6 +31,7 @@ from mqe_jax.runs import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import NETWORKS
+from mqe_jax.walk.training import AGILE
 from tests.training import Stop
 
 ROOT = Path(__file__).parents[1]
@@ -98,13 +101,20 @@ def test_python_blocks_run(page: str) -> None:
             del TASKS[name]
 
 
-# Examples of trainings that take minutes; that of a team of processes needs an exported file.
-LONG = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_team")
-SLOW = ("export/policy",)
 SOURCES = {
     file.relative_to(ROOT / "mqe_jax").with_suffix("").as_posix(): file.read_text(encoding="utf-8")
     for file in sorted((ROOT / "mqe_jax").rglob("*.py"))
 }
+EXPLOIT = {"config": "few.yaml", "total_steps": 256, "episodes": 4, "impl": "c"}
+WALKERS = {"num_envs": 4, "total_steps": 48, "rollout_steps": 12, "network": {"chunk_length": 6}, "ppo.minibatches": 1}
+# Functions whose examples take minutes, with arguments that make them small.
+LONG: dict[str, dict[str, Any]] = {
+    "exploitability": {**EXPLOIT, "seeds": [0]},
+    "double_oracle": EXPLOIT,
+    "train_skill": {"config": override(AGILE, WALKERS)},
+    "evaluate_skill": {"episodes": 4},
+}
+SLOW = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_team", "export/policy")
 
 
 @pytest.mark.usefixtures("small")
@@ -113,11 +123,16 @@ SOURCES = {
     [
         pytest.param(name, marks=pytest.mark.soak if name in SLOW else ())
         for name in SOURCES
-        if "```python" in SOURCES[name] and name not in LONG
+        if "```python" in SOURCES[name]
     ],
 )
 def test_examples_of_docstrings_run(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(NAMED_PLANNERS, "go1tug", {})  # one of them registers a policy
+    Path("few.yaml").write_text("{num_envs: 8, rollout_steps: 16, ppo: {epochs: 1}, network: {hidden_sizes: [8]}}")
+    for name, few in LONG.items():
+        monkeypatch.setattr(mqe_jax, name, functools.partial(getattr(mqe_jax, name), **few))
+    if module == "export/robot_team":
+        assert cli.main(["export", "go1gate", "--per-robot", "--onnx", "gate.onnx"]) == 0
     for example in re.findall(r"^ +```python\n(.*?)^ +```", SOURCES[module], re.DOTALL | re.MULTILINE):
         exec(textwrap.dedent(example), {"mqe_jax": mqe_jax, "jax": jax})
 

@@ -1,4 +1,4 @@
-"""A team whose robots are processes of their own, which have nothing but an exported graph and their own readings."""
+"""A team whose robots are separate processes, each with an exported graph and its own readings only."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class _Process:
         self._name = f"export: the process of robot {number}"
         self._errors: IO[bytes] = tempfile.TemporaryFile()
         command = [sys.executable, "-m", _PROGRAM, str(file), str(seed)]
-        # In a session of its own: a Ctrl-C ends the parent, whose end it sees.
+        # Ctrl-C must reach the parent only; this process sees its end.
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, start_new_session=True
         )
@@ -140,7 +140,9 @@ def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
 
     Example:
         ```python
-        with open_team("gate.onnx") as team:
+        from mqe_jax.export.robot_team import open_team
+
+        with open_team("gate.onnx") as team:  # written by mqe export go1gate --per-robot --onnx gate.onnx
             print(mqe_jax.evaluate("go1gate", team).success)
         ```
 
