@@ -1,7 +1,7 @@
 """Self-play: trains Sumo Wrestling against a frozen snapshot of the policy itself and a scripted opponent.
 
-`python examples/self_play.py` prints the results against both; a minute or two on a CPU. 41,000 steps teach little, the
-shipped policy was trained for 150 million: `mqe train go1wrestling` has the settings.
+`python examples/self_play.py` prints the results against both, after a minute or two on a CPU. 41,000 steps teach
+little: `mqe train go1wrestling` takes 150 million.
 """
 
 from __future__ import annotations

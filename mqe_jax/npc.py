@@ -23,12 +23,13 @@ def flock(
 ) -> jax.Array:
     """Returns the velocities (S, 2), m/s, of S sheep during the next environment step, s.
 
-    v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over robots of 0.2 r / q^1.4, with c the flock's centre (this
-    term is omitted for one sheep), r = p - p_robot and q = |r squared elementwise|, zero beyond q = 9; then each
-    component is clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
-    before and half after this, so that the sheep moves at the step's mean speed. p are the sheep's positions (S, 2), m,
-    v their velocities, p_robot those of the robots (A, 2), s is the restlessness, m/s.
-    Sheep that are not `there` (S,) stand still and do not belong to the flock; by default all do.
+        v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over robots of 0.2 r / q^1.4
+
+    p are the sheep's positions (S, 2), m, c their centre, v their velocities, s the restlessness, m/s. With
+    r = p - p_robot and q = |r squared elementwise|, robots beyond q = 9 have no effect. One sheep has no c. Each
+    component is then clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
+    before this and half after it: the sheep moves at the step's mean speed. Sheep that are not `there` (S,) stand still
+    outside the flock; by default all are there.
     Source: paper, section III, with the constants of the released system.
     """
     half = friction * GRAVITY * step / 2
@@ -53,7 +54,7 @@ def slow_down(velocity: jax.Array, loss: float) -> jax.Array:
 def defend(position: jax.Array, yaw: jax.Array, ball: jax.Array, goal: jax.Array) -> jax.Array:
     """Returns the walk commands vx, vy, yaw rate (3,), m/s and rad/s, of a robot that stays between ball and goal.
 
-    With position p, goal g, target t = 0.6 ball + 0.4 g and wrap() mapping an angle to [-pi, pi]:
+    p is the robot's position, g the goal, t = 0.6 ball + 0.4 g. wrap() maps an angle to [-pi, pi].
 
         yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3      (faces away from its goal)
         vx       = clip(|t - g| - |p - g|, -0.5, 0.5)                       (as far from the goal as t)

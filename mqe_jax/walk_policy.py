@@ -129,8 +129,8 @@ def observe(robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Propr
 def infer(params: Params, history: jax.Array, *, precision: str = "highest") -> tuple[jax.Array, jax.Array]:
     """Computes unclipped actions (..., 12) and latents (..., 2) from flattened histories (..., n).
 
-    One product of the history has both first layers. The latent, whose gradient the action does not have, is added to
-    the body's as two columns of weights, so that no input of another length than the history is written.
+    One product of the history computes both first layers. Two columns of weights then add the latent to the body's: no
+    input of another length than the history is written. The action has no gradient through the latent.
     """
     adaptation, body = (params[part]["0"] for part in ("adaptation", "body"))
     inner, columns = jnp.split(body["weight"], [history.shape[-1]], axis=1)
@@ -190,11 +190,11 @@ class WalkPolicy(Skill):
 
 
 class RestrictedWalkPolicy(WalkPolicy):
-    """The walk policy where only some commands vary: the same actions from a shorter history.
+    """The walk policy if only some commands vary: the same actions from a shorter history.
 
-    The history is the end of a stream of rows, one per observation: a one, and the observation without the constant
-    commands and without the action before the last one, which is the last action of the row before. Where all feet are
-    in step or half a cycle apart, it has the first foot's clock alone, which the others equal except for the sign.
+    The history is the end of a stream of rows, one per observation. A row has a one and the observation, without
+    constant commands and without the action before the last one, which the previous row has. If all feet are in step or
+    half a cycle apart, a row has only the first foot's clock, which the others equal except for the sign.
     """
 
     def __init__(self, robot: Robot, varied: Sequence[str], gait: str | None) -> None:
@@ -231,8 +231,8 @@ class RestrictedWalkPolicy(WalkPolicy):
     def fold_history(self, params: Params) -> Params:
         """Returns weights that compute from histories of rows what `params` compute from 30 observations.
 
-        In the first layers, the weights of both occurrences of an action are added, those of constant commands,
-        times their values, become the weight of the row's one, and those of clocks that are alike become one.
+        In the first layers, the weights of both occurrences of an action are added. Those of constant commands, times
+        their values, become the weight of the row's one. Those of equal clocks become one.
         """
         params = {part: dict(chain) for part, chain in params.items()}
         for chain in params.values():

@@ -17,8 +17,8 @@ def start_in_air(robot: str = "go1") -> dict[str, dict[str, float]]:
     """Drives each joint of a leg in the air from rest with its torque limit, on the C engine.
 
     Returns:
-        by joint, simulated and, as `line_*`, of a free joint that follows its torque line exactly: mean `torque` of the
-        first physics step, N m; `speed_5` and `speed_10` after 5 and 10 ms, rad/s.
+        By joint: mean `torque` of the first physics step, N m; `speed_5` and `speed_10` after 5 and 10 ms, rad/s.
+        `line_*` are those of a free joint that follows its torque line exactly.
     """
     env: Any = make("go1plane", impl="c", robot=robot, num_agents=1, control="torque", num_envs=3)
     index, own, timestep = env.index, env.robot, env.compiled.model.opt.timestep

@@ -104,9 +104,9 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
     """Distance of an engine's trajectories from the recorded ones of the C engine, same states and actions.
 
     Returns:
-        `standing/robots_1` and so on, for standing robots and for play: the largest difference of any position (m),
-        quaternion or joint angle (rad) of robots and of objects; over environments, the maximum after one step, and
-        median, 90% and 99% quantile and maximum after 20 steps.
+        `standing/robots_1` and so on, for standing robots and for play, for robots and for objects: the largest
+        difference of any position (m), quaternion or joint angle (rad). Over environments, it is the maximum after one
+        step, and median, 90% and 99% quantile and maximum after 20 steps.
     """
     states, num_envs = reference["states"], len(reference["states"].step)
     env = comparable(task, engine, num_envs, reference["solver_iterations"])

@@ -58,7 +58,7 @@ def refuses(said: str, call: Callable[..., Any], *arguments: Any, **named: Any) 
 
 
 def records() -> dict[str, Any]:
-    """Returns the records whose fields are settings, by name; those of a task are its parameters."""
+    """Returns the classes whose fields are settings, by name; those of a task are its parameters."""
     found: dict[str, Any] = {"training": TrainConfig, "sweep": Sweep, "walk": WalkTask}
     found |= {f"network {name}": kind for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")}
     return found | {task: kind.Params for task, kind in TASKS.items()}
@@ -93,7 +93,7 @@ def refused(kind: Any) -> Strategy:
 
 @st.composite
 def wrong_settings(draw: st.DrawFn) -> tuple[str, str, Any]:
-    """A record's name, a dotted name of a number in it, and a value that it must refuse."""
+    """A settings class's name, a dotted name of a number in it, and a value that it must reject."""
     known = records()
     name = draw(st.sampled_from(sorted(known)))
     fields = dict(numbers(known[name]))
@@ -137,7 +137,7 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
 
 @st.composite
 def yaml_text(draw: st.DrawFn, record: Any) -> str:
-    """YAML of a record's names with hostile values, as text since a value may be a fragment."""
+    """YAML of the names of settings with hostile values, as text since a value may be a fragment."""
     names = [*hints_of(record), *(name for name, _ in numbers(record)), *"nothing [a] 1 null self env.task".split()]
     value = st.sampled_from(TEXTS) | st.text(max_size=30) | st.floats().map(str) | st.integers().map(str)
     lines = draw(st.lists(st.tuples(st.sampled_from(names), value), min_size=1, max_size=4))

@@ -3,7 +3,7 @@
 `python -m tests.play_agreement FOLDER --json FILE` needs Node. Episodes of the environment (C engine, one task after
 another, with the page's first policy) give initial states, actions and the NPCs' noise. The page's code replays them in
 WebAssembly with its graphs. Reported are the largest differences of the states after 1 and 20 environment steps. Then
-the page plays episodes of its own; their mean outcomes are reported.
+the page plays further episodes; their mean outcomes are reported.
 """
 
 import argparse

@@ -104,13 +104,13 @@ class Shapes:
         mujoco.mj_kinematics(self.model, self.data)
 
     def ray(self, origin: np.ndarray, angle: float, *bodies: int) -> float:
-        """Returns the distance along a ray, without the shapes of bodies of the scene; infinite if there is none."""
+        """Returns the distance along a ray, without the shapes of bodies of the scene; infinite without one."""
         self.model.geom_group = [5 * (body in bodies) for body in self.bodies]
         return ray(self.model, self.data, origin, angle, self.groups)
 
 
 def ray(model: Any, data: Any, origin: np.ndarray, angle: float, groups: np.ndarray) -> float:
-    """Returns the distance along a horizontal ray to a geom of some groups, infinite if there is none."""
+    """Returns the distance along a horizontal ray to a geom of some groups, infinite without one."""
     direction = np.array([np.cos(angle), np.sin(angle), 0.0])
     distance = mujoco.mj_ray(model, data, origin, direction, groups, True, -1, np.zeros(1, np.int32))
     return distance if distance >= 0 else np.inf

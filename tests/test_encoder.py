@@ -13,7 +13,7 @@ from mqe_jax.core.blocks import Block, entities, image
 from mqe_jax.core.settings import build
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.encoder import by_block, convolved
+from mqe_jax.train.encoder import by_block, convolve
 from mqe_jax.train.needs import Needs
 from mqe_jax.train.networks import Blocks, EnvDims
 from mqe_jax.train.normalize import features_of, running_init, running_normalize, running_update
@@ -143,7 +143,7 @@ def test_convolutions_are_those_of_loops() -> None:
         )
         x = np.maximum(x @ weight + bias, 0)
     out = np.maximum(x.reshape(-1) @ np.asarray(params["out"]["weight"]) + np.asarray(params["out"]["bias"]), 0)
-    found = convolved(params, jnp.asarray(picture.reshape(1, -1), jnp.float32), (1, 5, 4))
+    found = convolve(params, jnp.asarray(picture.reshape(1, -1), jnp.float32), (1, 5, 4))
     np.testing.assert_allclose(found, out[None], atol=1e-5)
     assert found.shape == (1, 7) and np.any(out)
 

@@ -320,7 +320,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @example(("go1gate", "episode_length", 1e-9))
 @example(("go1gate", "friction", 1e300))
 def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str, Any]) -> None:
-    """In every record: training, sweeps, walking, networks and the parameters of all tasks."""
+    """In every settings class: training, sweeps, walking, networks and the parameters of all tasks."""
     name, field, value = case
     needed = {"tasks": ("go1gate",)} if name == "sweep" else {}
     refuses(field.split(".")[-1], build, inputs.records()[name], {field: value} | needed)

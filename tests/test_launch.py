@@ -160,7 +160,7 @@ def test_a_terminal_that_interrupts(tmp_path: Path) -> None:
         assert {os.getpgid(child) for child in children(process)}.isdisjoint([process.pid])
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=60)
-    assert lines(said) == ["mqe: interrupted; the same command with --resume goes on"] and process.returncode == 130
+    assert lines(said) == ["mqe: interrupted; the same command with --resume continues"] and process.returncode == 130
     assert f"step_{updates(run) * 16:012d}" == list_checkpoints(run)[-1].stem
 
 

@@ -126,7 +126,7 @@ def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:
 
 
 def test_opponents_change_at_resets(policies: list[TrainedPolicy], door: VectorEnv) -> None:
-    """Old and new opponent are told apart by their actions, which are means."""
+    """Old and new opponent differ by their actions, which are means."""
     old, new = (dataclasses.replace(policy, deterministic=True) for policy in policies)
     env = versus(door, [old, "idle"])
     step, action = jax.jit(env.step), jnp.zeros((4, 1, 12))

@@ -203,7 +203,7 @@ def test_the_climber_enters_the_plank_centred_and_leaves_its_low_end_at_its_edge
         assert climb(2.8, y)[0, 0] < 0 and np.sign(climb(2.8, y)[0, 1]) == -np.sign(y)
         assert climb(3.5, y)[0, 0] == 1
     assert climb(3.8, 0.4)[0, 0] < 0
-    assert climb(5.0, 0.4)[0, 0] == 1  # higher up it goes on
+    assert climb(5.0, 0.4)[0, 0] == 1  # higher up it continues
 
 
 def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> None:

@@ -1,4 +1,4 @@
-"""Records of settings: accepted values, and one-line errors with path, value and bounds; files of training settings."""
+"""Settings classes: accepted values, and one-line errors with path, value and bounds; files of training settings."""
 
 import dataclasses
 import pickle

@@ -25,7 +25,7 @@ REFERENCE = Reference(label="theirs", values={"plain": {"go1gate": {"mappo": 2.7
 
 
 def made_up(cell: Cell, seed: int, *, evaluated: bool = True, scale: float = 1.0) -> Run:
-    """A run of 400 updates that learns along a saturating curve, with noise of its own."""
+    """A run of 400 updates that learns along a saturating curve, with its own noise."""
     draw = np.random.default_rng([seed, len(cell.algorithm), len(cell.task)])
     steps = np.arange(1, 401) * 100_000.0
     reached = scale * (1 - np.exp(-steps / 1e7)) * (0.8 + 0.1 * draw.normal()) + 0.03 * draw.normal(size=400)

@@ -115,7 +115,9 @@ def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(shown: SimpleN
         assert client.panel().widgets
     lines = said()
     assert len(lines) == 2
-    assert lines[0].startswith("mqe: view: refused a connection: Origin is http://evil.org, allowed: http://127.0.0.1:")
+    assert lines[0].startswith(
+        "mqe: view: rejected a connection: Origin is http://evil.org, allowed: http://127.0.0.1:"
+    )
 
 
 def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> None:

@@ -52,8 +52,8 @@ class ProbeState:
 class Probe:
     """N environments with one random sign `hidden` per episode.
 
-    `show(hidden (N,), step (N,)) -> (N, F)` is observed besides the agent's id; `pay(hidden, action (N, A, D))` is the
-    reward of the first team (N,), and its negative that of a second one, or each agent's own (N, A). Episodes of even
+    `show(hidden (N,), step (N,)) -> (N, F)` is observed besides the agent's id. `pay(hidden, action (N, A, D))` is the
+    reward of the first team (N,), and its negative that of a second one; or each agent's own (N, A). Episodes of even
     environments end after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates`
     says whether that is a termination (with `even_truncate` only in odd environments). The shorter kind is a success.
     Every step of an odd environment overflows.

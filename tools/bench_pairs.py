@@ -1,8 +1,9 @@
 """Compares the throughput of checkouts or parameters on one machine: medians and ratios of interleaved timings.
 
-`python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv FILE` starts
-one process per checkout and case, waits for compilation, and then times them in turn, so that drifts of the machine's
-speed affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few
+    python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv FILE
+
+starts one process per checkout and case, waits for compilation, and times them in turn: drifts of the machine's speed
+affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few
 calls of 50 environment steps, whole step and bare physics. `PATH,senses=onboard` is a checkout with a task parameter.
 """
 
@@ -72,7 +73,7 @@ def start(place: str, case: str, **options: Any) -> subprocess.Popen[str]:
 
 
 def answer(worker: subprocess.Popen[str], ask: bool = True) -> dict[str, Any]:
-    """Waits for the next answer of a process, a timing if it is asked for one; exits where the process died."""
+    """Waits for the next answer of a process, a timing if it is asked for one; exits if the process died."""
     assert worker.stdin is not None and worker.stdout is not None
     if ask:
         worker.stdin.write("\n")

@@ -2,9 +2,9 @@
 
 Generated: the pages `FILES`, one page per task (clip, sizes, observation, rewards, parameters) with an overview, and
 the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/
-lead to the repository's address, `[project.urls]` in pyproject.toml; where it is not set they become paths, so that the
-built site needs neither the repository nor another host. The page of `mqe play-site` is part of the site where it is in
-build/play, and else the site says how to build it.
+lead to the repository's address, `[project.urls]` in pyproject.toml. If it is not set they become paths: the built site
+then needs neither the repository nor another host. The page of `mqe play-site` is part of the site if it is in
+build/play; otherwise the site says how to build it.
 """
 
 import contextlib
@@ -70,11 +70,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 def links(markdown: str, address: str = "", folder: str = "") -> str:
     """Leads links to files outside docs/, from a page in a folder of it, to the repository's address.
 
-    Notebooks get links to Colab and Kaggle too, where the address is on GitHub. Without an address links become the
+    Notebooks get links to Colab and Kaggle too, if the address is on GitHub. Without an address links become the
     file's name and path.
     """
 
-    def led(match: re.Match[str]) -> str:
+    def resolve(match: re.Match[str]) -> str:
         text, path = match.groups()
         path = posixpath.normpath(posixpath.join("docs", folder, "..", path))
         if path.startswith("docs/"):
@@ -91,11 +91,11 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
         opened = f" (open in [Colab]({colab}), [Kaggle]({kaggle}))"
         return link + opened if hub and path.endswith(".ipynb") else link
 
-    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", led, markdown)
+    return re.sub(r"(?<!!)\[([^\[\]\n]+)\]\(\.\./([^)\s]+)\)", resolve, markdown)
 
 
 def play_link(markdown: str, present: bool) -> str:
-    """Puts the link to the page of `mqe play-site` below the title, or how to build it where it is not present."""
+    """Puts the link to the page of `mqe play-site` below the title, or how to build it if it is missing."""
     absent = "This copy of the documentation was built without the page: run `make docs`, or the commands below."
     title, _, rest = markdown.partition("\n")
     return f"{title}\n\n{'**[Open the page](play/index.html)**' if present else absent}\n{rest}"
@@ -208,7 +208,7 @@ def _meanings(cls: type[Any]) -> dict[str, str]:
 
 
 def _fields(record: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None) -> str:
-    """Returns a table of a record's fields, own ones first, with the meanings that its docstrings give.
+    """Returns a table of a settings class's fields, own ones first, with the meanings that its docstrings give.
 
     Values are defaults, or those `given`.
     """

@@ -309,7 +309,7 @@ def leads(results: Sequence[dict[str, Any]]) -> str:
 
 
 def copy_rates(folder: Path) -> None:
-    """Copies the rates and mixed teams of the parts below a folder; InputError if there are none."""
+    """Copies the rates and mixed teams of the parts below a folder; InputError without any."""
     tables = {f"{part}.csv": folder / part / "rates.csv" for part in PARTS}
     contents = {name: file.read_bytes() for name, file in tables.items() if file.is_file()}
     if responses := [

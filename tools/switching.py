@@ -2,8 +2,9 @@
 
     python -m tools.switching --episodes 5000 --num-envs 2500
 
-Flat ground, episodes of 20 s, a new command every 4 s, drawn uniformly from the default ranges (`narrow`) or those of
-the agile skill (`wide`, of which walking gets what it is trained for). Changes come after 0.2 to 2 s. Prints JSON.
+Episodes of 20 s on flat ground have a new command every 4 s. Commands are drawn uniformly from the default ranges
+(`narrow`) or the agile skill's (`wide`; walking gets the part that it is trained for). Skills change after 0.2 to 2 s.
+Prints JSON.
 """
 
 import argparse

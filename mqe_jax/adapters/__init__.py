@@ -38,9 +38,16 @@ def task_env(
 ) -> Any:
     """Returns the environment of a task, or with an opponent the `TeamEnv` of a match.
 
-    `task` is an id with `overrides` of `make`, or an environment without; `opponent` a policy of team 1, or what
-    `mqe_jax.load_policy` accepts, whose skill and command ranges an id's task gets; `max_steps` a time limit in
-    environment steps, which errors name `limit`.
+    Args:
+        task: id, or an environment.
+        opponent: policy of team 1, or what `mqe_jax.load_policy` accepts. The task of an id gets its skill and command
+            ranges.
+        max_steps: time limit in environment steps, in place of the task's.
+        limit: name of `max_steps` in errors.
+        overrides: arguments of `make`, for an id only.
+
+    Raises:
+        InputError: for an argument that is not allowed.
     """
     if isinstance(task, QuadrupedEnv):
         if overrides or max_steps is not None:

@@ -91,8 +91,8 @@ class HostEnvs:
     def step(self, action: ArrayLike, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
         """Steps all environments with actions (N, A, action_size), clipped to [-1, 1].
 
-        An environment is reset in the call that ends its episode (SAME_STEP), in the next call, which ignores its
-        action and returns a zero reward (NEXT_STEP), or not at all (DISABLED).
+        SAME_STEP resets an environment in the call that ends its episode. NEXT_STEP resets it in the next call, which
+        ignores its action and returns a reward of zero. DISABLED does not reset.
         """
         if self.state is None:
             raise InputError("step: reset the environment first")

@@ -64,8 +64,8 @@ class Env(MultiAgentEnv):
     def __init__(self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any) -> None:
         """Creates the environment of a task's id, or adapts a given one; `overrides` are those of `task_env`.
 
-        With `discrete`, actions are integers, as JaxMARL's MAPPO and Q-learning need: 0 is the zero action, 2 i + 1 and
-        2 i + 2 are +1 and -1 in dimension i, zero in the others.
+        With `discrete`, actions are integers, as JaxMARL's MAPPO and Q-learning need. 0 is the zero action. 2 i + 1 is
+        +1 and 2 i + 2 is -1 in dimension i, with zero in all others.
         """
         self.env: TaskEnv = task_env(task, **overrides)
         super().__init__(self.env.num_agents)
@@ -96,7 +96,7 @@ class Env(MultiAgentEnv):
     def step(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None = None
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
-        """Advances by one environment step and resets an ended environment, to `reset_state` where it is given.
+        """Advances by one environment step and resets an ended environment, to `reset_state` if passed.
 
         The base class selects between whole states; contact buffers of Warp are shared by all environments.
         """

@@ -68,8 +68,12 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     ) -> None:
         """Creates the environment of a task's id, or adapts a given one.
 
-        `max_cycles` is a time limit in environment steps in place of the task's, `render_mode` None or 'rgb_array',
-        `render_size` width and height, pixels; `overrides` are `opponent` of `task_env`, and arguments of `make`.
+        Args:
+            task: id, or an environment.
+            max_cycles: time limit in environment steps, in place of the task's.
+            render_mode: None or 'rgb_array'.
+            render_size: width and height, pixels.
+            overrides: `opponent` of `task_env`, and arguments of `make`.
         """
         EzPickle.__init__(
             self, task, max_cycles=max_cycles, render_mode=render_mode, render_size=render_size, **overrides

@@ -50,7 +50,7 @@ COMMANDS: dict[str, Any] = {
     "exploit": exploit.Exploit,
     "oracle": exploit.Oracle,
 }
-"""Arguments by command, or what it does, where the arguments depend on others."""
+"""Arguments by command; what it does instead, if they depend on others."""
 
 
 def overview(group: str = "") -> str:
@@ -64,7 +64,7 @@ def overview(group: str = "") -> str:
 
 
 def resolve_alias(arguments: Sequence[str]) -> list[str]:
-    """Returns the arguments with `walk COMMAND ...`, where they begin so, as `skill COMMAND walk ...`."""
+    """Returns the arguments with a leading `walk COMMAND ...` as `skill COMMAND walk ...`."""
     if list(arguments[:1]) != ["walk"]:
         return list(arguments)
     command = [word for word in arguments[1:2] if not word.startswith("-")]
@@ -82,7 +82,7 @@ def _check_words(arguments: Sequence[str]) -> None:
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Returns the record of the command that the first word or two name; its `run` returns the object of `--json`.
+    """Returns the parsed command that the first word or two name; its `run` returns the object of `--json`.
 
     InputError for an unknown command or task; SystemExit 0 after help, 2 after tyro's message about a wrong argument.
     """

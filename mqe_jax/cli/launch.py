@@ -43,13 +43,13 @@ _RANKS = {"SLURM_PROCID": "SLURM_LOCALID", "OMPI_COMM_WORLD_RANK": "OMPI_COMM_WO
 _MEMBER = re.compile(r"(\d+)/(\d+)@(\d+)")
 _GRACE = 10.0  # s, in which the others end after one has ended
 _PORT = "set JAX_COORDINATOR_PORT to a free port in all processes"
-_RESUME = "the same command with --resume goes on"
-_REPEAT = "the same command goes on"  # a sweep
+_RESUME = "the same command with --resume continues"
+_REPEAT = "the same command continues"  # a sweep
 _NOISE = re.compile(
     r"[IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo"
     r"|Additional GRPC error|:[A-Z_]+:|=== Source Location Trace|external/xla|\s*$"
 )
-"""Lines of JAX's coordination service and collectives; several of a lost connection where the training has ended."""
+"""Lines of JAX's coordination service and collectives; several of a lost connection if the training has ended."""
 
 
 @record
@@ -128,7 +128,7 @@ class Launch:
 
 
 def _gpus() -> int:
-    """Returns how many NVIDIA GPUs this host has for JAX; 0 where that is unknown."""
+    """Returns how many NVIDIA GPUs this host has for JAX; 0 if unknown."""
     if os.environ.get("JAX_PLATFORMS") == "cpu":
         return 0
     return len(list(Path("/dev").glob("nvidia[0-9]*")))
@@ -215,7 +215,7 @@ def _end_with_parent() -> None:
 
 
 class _Process:
-    """A process of the training; its standard error is shown where it is the first of its host, but for JAX's noise."""
+    """A process of the training; its standard error is shown for the first of its host, without JAX's noise."""
 
     def __init__(self, command: Sequence[str], variables: Mapping[str, str], prefix: str, shown: bool) -> None:
         self.peer, self.last, self.muted = False, "", False
@@ -250,7 +250,7 @@ class _Process:
         self._reader.join(1.0)
 
     def verdict(self, resume: str) -> str:
-        """Returns why the process has failed, in one line, or nothing where it said so itself."""
+        """Returns why the process has failed, in one line, or nothing if it printed why."""
         self.read()
         code = self.popen.returncode
         if self.peer:

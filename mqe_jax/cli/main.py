@@ -17,12 +17,15 @@ from mqe_jax.core.literal import line
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `mqe` and returns the exit code.
 
-    0; 1 for a training run that became non-finite and 2 for bad input (InputError) or a file that cannot be read or
-    written (OSError), with one line on standard error, or after tyro's message about the arguments. Any other
-    exception is a defect and keeps its traceback.
+    | code | after |
+    |---|---|
+    | 0 | success |
+    | 1 | a training that became non-finite |
+    | 2 | bad input (InputError), or a file that cannot be read or written (OSError) |
+    | 130, 143 | SIGINT (Ctrl-C), SIGTERM; for a program only (`arguments` is None) |
 
-    As a program (`arguments` is None), SIGINT (Ctrl-C) ends the process with 130 and SIGTERM with 143, with one line on
-    standard error: a training after the update in progress, everything else at once.
+    Each failure prints one line on standard error, wrong arguments tyro's message. Any other exception is a defect and
+    keeps its traceback. After a signal a training finishes its update; everything else ends at once.
     """
     if arguments is None:
         interrupts.install()

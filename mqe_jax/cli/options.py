@@ -64,14 +64,13 @@ class PolicyOptions(TaskOptions):
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN|FILE")]
     """Id of a task, run folder, or policy file."""
     policy: PolicyName = None
-    """Policy: scripted (hand-written for the task), random, idle (zero commands), forward (straight on at half speed),
-    another scripted policy of the task, a task with a shipped policy, a run folder, or a policy file. Default: that of
-    the given run; of a task: the shipped one (see `mqe zoo`), else scripted, else forward; random, where actions are
-    not commands. A task by its id gets the skill, gait, command ranges, control mode and robot that a trained policy
-    needs."""
+    """A run folder, a policy file or a task with a shipped policy. Or scripted (hand-written for the task), another
+    scripted policy of the task, random, idle (zero commands), forward (straight on at half speed). Default: the run's
+    policy, else the shipped (see `mqe zoo`), scripted or forward one; random if actions are not commands. A task by its
+    id gets the skill, gait, command ranges, control mode and robot that a trained policy needs."""
     opponent: PolicyName = None
-    """Policy of team 1 in a match: what --policy accepts. Default: the same as team 0 where that is the shipped one by
-    default, else idle."""
+    """Policy of team 1 in a match: what --policy accepts. Default: the shipped one if team 0 has it by default, else
+    idle."""
     deterministic: bool = False
     """Use mean actions of trained policies, in a match of both teams; otherwise they are sampled, as in training, or as
     a shipped policy's card declares."""
@@ -125,7 +124,7 @@ def print_columns(columns: Mapping[str, Sequence[str]], left: int) -> None:
 def standard_output(*, reserved: bool) -> Iterator[TextIO]:
     """Yields a file that writes to standard output.
 
-    With `reserved`, everything else that is written to standard output meanwhile, also by C code, goes to standard
+    With `reserved`, all other standard output, also of C code, goes to standard
     error, so that the `--json` object is the only output.
     """
     if not reserved:

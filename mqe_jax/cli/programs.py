@@ -1,4 +1,4 @@
-"""The start of a command, and compiled programs that JAX stores: where they are, and that each file is whole."""
+"""The start of a command, and compiled programs that JAX stores: their folder, and a check that each file is whole."""
 
 import contextlib
 import gc
@@ -34,7 +34,7 @@ def import_mujoco() -> None:
 
 
 def keep() -> None:
-    """Has JAX store compiled programs in the user's cache folder, one for each kind of processor, unless told where."""
+    """Has JAX store compiled programs in the user's cache folder, by kind of processor, unless its variable is set."""
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     from mqe_jax.core.files import user_cache

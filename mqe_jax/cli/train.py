@@ -50,7 +50,7 @@ class Train(TaskOptions):
     Settings are those of a configuration file, changed by the flags below, which show the file's values as defaults.
     """
 
-    # `parse_train` fills the record with tyro.MISSING here.
+    # `parse_train` fills the settings with tyro.MISSING here.
     target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK"), pydantic.SkipValidation()]  # pyright: ignore[reportCallIssue]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]

@@ -44,7 +44,7 @@ class Block:
 
     @property
     def continuous(self) -> np.ndarray:
-        """1 where an entry is a continuous quantity, 0 where it is categorical or a mask (width,)."""
+        """1 for a continuous quantity, 0 for a categorical entry or a mask (width,)."""
         row = np.full(self.width, not self.categorical, np.float32)
         if self.entities is not None and self.entities.masked:
             row.reshape(self.entities.count, -1)[:, -1] = 0.0

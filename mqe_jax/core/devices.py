@@ -62,7 +62,7 @@ def mean(tree: PyTree) -> PyTree:
 
 
 def mean_where(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Array:
-    """Returns the mean of the elements where a mask of the same shape is true, over an axis and processes; else 0."""
+    """Returns the mean of the elements whose mask (same shape) is true, over an axis and processes; 0 without any."""
     count = jnp.maximum(total(jnp.sum(mask.astype(jnp.float32), axis)), 1.0)
     return total(jnp.sum(jnp.where(mask, x, 0.0), axis)) / count
 
@@ -94,7 +94,7 @@ def normal(key: jax.Array, shape: Sequence[int], dtype: Any) -> jax.Array:
 
 @contextlib.contextmanager
 def alone() -> Iterator[None]:
-    """Computes as a single process meanwhile: the same in each of them."""
+    """Makes each process compute as a single one, all the same."""
     token = _ALONE.set(True)
     try:
         yield
@@ -110,7 +110,7 @@ def translate_errors() -> Iterator[None]:
     except (jax.errors.JaxRuntimeError, ValueError) as error:  # either, by where the collective was called
         if isinstance(error, InputError) or jax.process_count() == 1 or not PEER.search(str(error)):
             raise
-        raise ConnectionError(f"{PEER_ENDED}; the same command with --resume goes on") from None
+        raise ConnectionError(f"{PEER_ENDED}; the same command with --resume continues") from None
 
 
 def share(name: str, count: int, parts: int) -> int:
@@ -162,15 +162,15 @@ class Processes:
         return jax.jit(jax.shard_map(inner, mesh=self._mesh, in_specs=(given,), out_specs=result, check_vma=False))
 
     def own(self, state: PyTree) -> PyTree:
-        """Returns this process's part of the state, in arrays of its own."""
+        """Returns this process's part of the state, as local arrays."""
         return state if self.count == 1 else jax.tree.map(self._local, state, self._specs)
 
     def together(self, own: PyTree) -> PyTree:
-        """Returns the state of which every process gives its part."""
+        """Returns the global state, assembled from every process's part."""
         return own if self.count == 1 else self._together(own, self._specs)
 
     def join(self, own: PyTree) -> PyTree:
-        """Returns, on the host, the state of which every process gives its part."""
+        """Returns the global state on the host, gathered from every process's part."""
 
         def whole(x: Any, spec: PartitionSpec) -> Any:
             if self.count == 1 or _whole(x, spec):
@@ -180,11 +180,11 @@ class Processes:
         return jax.tree.map(whole, own, self._specs)
 
     def part(self, state: PyTree) -> PyTree:
-        """Returns this process's part of the state of all environments."""
+        """Returns this process's part of a global state on the host."""
         return jax.tree.map(self._rows, state, self._specs)
 
     def gather(self, numbers: Sequence[int]) -> np.ndarray:
-        """Returns numbers of every process (P, n); called by all of them."""
+        """Returns the n numbers of every process (P, n); all P processes must call it."""
         own = np.array(numbers)
         return own[None] if self.count == 1 else multihost_utils.process_allgather(own)
 

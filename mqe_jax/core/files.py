@@ -71,7 +71,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def append(path: Path, content: bytes) -> None:
-    """Appends to a file, which it creates where there is none; an OSError names it, also where it is a link."""
+    """Appends to a file, which it creates if missing; an OSError names it, even for a link."""
     check_locks(path)
     no_links = getattr(os, "O_NOFOLLOW", 0)
     with naming(path), open(path, "ab", opener=lambda name, flags: os.open(name, flags | no_links, 0o666)) as file:
@@ -79,14 +79,14 @@ def append(path: Path, content: bytes) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Creates a folder, where there is none, in one that exists; an OSError names it."""
+    """Creates a folder, if missing, in one that exists; an OSError names it."""
     check_locks(path)
     with naming(path):
         path.mkdir(exist_ok=True)
 
 
 def check_locks(path: Path) -> None:
-    """Raises an InputError where a locked folder around `path` was removed, renamed or replaced."""
+    """Raises an InputError if a locked folder around `path` was removed, renamed or replaced."""
     for folder in path.parents:
         if folder in _locks:
             with contextlib.suppress(OSError):
@@ -258,7 +258,7 @@ def archive(path: Path, limit: int, what: str) -> Iterator[zipfile.ZipFile]:
 
 
 def user_cache() -> Path:
-    """Returns this package's folder in the user's cache; an InputError where there is no home folder."""
+    """Returns this package's folder in the user's cache; an InputError without a home folder."""
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:

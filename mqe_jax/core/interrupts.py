@@ -1,6 +1,6 @@
 """SIGINT and SIGTERM: a training ends after the update in progress, any other command at once.
 
-Python runs a signal's handler between two of its own instructions, which compiled code may delay for minutes, and JAX
+Python runs a signal's handler between two of its instructions, which compiled code may delay for minutes, and JAX
 loses an exception that is raised in a callback. So in the command line a thread waits for the signals.
 """
 
@@ -27,7 +27,7 @@ _noted, _since = 0, 0.0
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal after which everything was saved; the text says how to go on."""
+    """A signal after which everything was saved; the text says how to continue."""
 
     def __init__(self, text: str = "", number: int = 0) -> None:
         super().__init__(text)
@@ -83,7 +83,7 @@ def defer() -> Iterator[Callable[[], int]]:
 
 
 def _note(number: int) -> bool:
-    """Notes the first signal while signals are deferred; returns whether the process goes on."""
+    """Notes the first signal while signals are deferred; returns whether the process continues."""
     global _noted, _since
     if not _deferring:
         return False

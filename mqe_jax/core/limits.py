@@ -1,7 +1,7 @@
-"""What input may hold and cost: the one list of bounds. Whatever is outside of them is refused with an `InputError`.
+"""What input may hold and cost: the one list of bounds. Whatever is outside of them raises an `InputError`.
 
-Kinds of numbers are types of fields of records (`settings.record`) and of arguments (`settings.check_arguments`).
-A plain `int` or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
+Kinds of numbers are types of settings (`settings.record`) and of arguments (`settings.check_arguments`). A plain `int`
+or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
 """
 
 import typing
@@ -28,7 +28,7 @@ ClipLength = Annotated[float, Ge(0.02), Le(600)]  # s
 FrameRate = Annotated[float, Ge(0.1), Le(240)]  # Hz
 Speed = Annotated[float, Ge(0.01), Le(100)]  # of a clip, relative to real time
 
-# -- counts: integers; a number with a fraction, NaN, a boolean are none -----------------------------------------------
+# -- counts: integers, not numbers with a fraction, NaN or booleans ----------------------------------------------------
 Integer = Annotated[int, Ge(-(10**12)), Le(10**12)]
 PositiveInt = Annotated[int, Gt(0), Le(10**6)]
 NonNegativeInt = Annotated[int, Ge(0), Le(10**6)]
@@ -70,7 +70,7 @@ CHECKPOINT_BYTES = 2**34
 WEIGHT = 1e4  # magnitude of a weight of a policy, a skill or an actuator network; trained ones are below 10
 RECORDING_BYTES = 2**28  # all members
 
-# -- memory, refused before it is allocated ----------------------------------------------------------------------------
+# -- memory, checked before it is allocated ----------------------------------------------------------------------------
 CLIP_BYTES = 2**30  # recorded episodes; images of a clip that is not streamed
 MEMORY_SHARE = 0.5  # of the free memory, for the states of all environments or for a rollout
 

@@ -18,7 +18,7 @@ def bytes_of(tree: Any) -> int:
 
 
 def free_memory() -> float:
-    """Returns the free bytes of the device that JAX uses; infinity where that is unknown."""
+    """Returns the free bytes of the device that JAX uses; infinity if unknown."""
     device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
@@ -34,7 +34,7 @@ def free_memory() -> float:
 
 
 def check_memory(name: str, value: object, needed: float) -> None:
-    """Raises an InputError where a setting needs more bytes than `limits.MEMORY_SHARE` of the free memory."""
+    """Raises an InputError if a setting needs more bytes than `limits.MEMORY_SHARE` of the free memory."""
     allowed = limits.MEMORY_SHARE * free_memory()
     if needed > allowed:
         limit = f"at most {allowed / _GIGABYTE:.1f} GB may be used"

@@ -1,6 +1,6 @@
-"""Typed, validated records of settings, built from keyword arguments, mappings, dotted names or YAML.
+"""Typed, validated settings classes, built from keyword arguments, mappings, dotted names or YAML.
 
-A record is a frozen dataclass whose fields carry their types and bounds once, as annotations:
+A settings class is a frozen dataclass whose annotations hold the type and the bounds of each field:
 
     @record
     class Ppo:
@@ -11,8 +11,8 @@ Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, valida
 `InputError`: `ppo.clip: -1 is not allowed; it must be greater than 0`.
 
 Every number has bounds: those of its kind (`mqe_jax.core.limits`), or of `Number` and `Integer` for a plain `float` or
-`int`. Booleans are rejected as numbers; numpy scalars and strings such as "7e-4" (which YAML does not read
-as a number) are accepted, bytes are not; "none" means None for an optional field.
+`int`. Numpy scalars are numbers, and so are strings such as "7e-4", which YAML does not read as a number. Booleans and
+bytes are not. For an optional field, "none" means None.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, brief, nearest, short_repr
 from mqe_jax.core.files import read_yaml
-from mqe_jax.core.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for those who declare records)
+from mqe_jax.core.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for modules that declare settings)
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -44,7 +44,7 @@ R = TypeVar("R")
 
 
 class FrozenMapping(Mapping[str, Any]):
-    """A mapping in a record, which can be hashed like the record; equal to any mapping with its entries."""
+    """An immutable, hashable mapping for settings; equal to any mapping with its entries."""
 
     def __init__(self, values: Mapping[str, Any] = {}) -> None:
         self._values = dict(values)
@@ -94,7 +94,7 @@ def record(cls: type[T]) -> type[T]:
     """Makes a class a frozen, keyword-only dataclass that validates its fields.
 
     Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
-    of nested records are prefixed with their path. A subclass of a record must be decorated too.
+    of nested settings are prefixed with their path. A subclass must be decorated too.
     """
     hints = typing.get_type_hints(cls, include_extras=True)
     cls.__annotations__ = {name: _accept_yaml(hints[name]) for name in inspect.get_annotations(cls)}
@@ -145,7 +145,7 @@ def is_text(value: str) -> bool:
 
 
 def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a function check some of its arguments, each against a type, as a record checks its fields.
+    """Makes a function check some of its arguments, each against a type, as settings classes check their fields.
 
     `annotated` are names of arguments that are checked against their annotations.
     """
@@ -168,7 +168,7 @@ def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]],
 
 
 def check(name: str, value: Any, kind: Any) -> Any:
-    """Returns a value as a type has it; raises the InputError of `fail` where it is none of the type."""
+    """Returns a value converted to a type; raises the InputError of `fail` if that is not possible."""
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return value if isinstance(value, kind) else fail(name, value, f"a {kind.__name__}")
     try:
@@ -196,7 +196,7 @@ def fail(name: str, value: object, allowed: str) -> NoReturn:
 
 
 def build(kind: type[T], values: Mapping[str, Any]) -> T:
-    """Builds a record from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted (`{"ppo.clip": 0.1}`).
+    """Builds settings from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted (`{"ppo.clip": 0.1}`).
 
     InputError for a value that is not allowed or an unknown name, with the nearest known one.
     """
@@ -206,7 +206,7 @@ def build(kind: type[T], values: Mapping[str, Any]) -> T:
 
 
 def override(settings: T, changes: Mapping[str, Any]) -> T:
-    """Returns a record with fields replaced, given as in `build`; mappings are `joined`. InputError as `build`."""
+    """Returns settings with fields replaced, named as in `build`; mappings are `joined`. InputError as `build`."""
     if not is_record(settings):
         fail("settings", settings, "a record, such as TrainConfig()")
     return type(settings)(**_joined(type(settings), _fields(settings), changes))
@@ -215,7 +215,7 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
 def _joined(kind: Any, first: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(changes, Mapping):
         fail(kind.__name__, changes, "a mapping of names to values")
-    made = merge({}, changes)  # which refuses what is nested too deep
+    made = merge({}, changes)  # which rejects what is nested too deep
     for name, following in itertools.pairwise(sorted(_names(changes))):
         if name == following:
             raise InputError(f"{name}: is given twice")
@@ -229,7 +229,7 @@ def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
 
 
 def differences(settings: Any, default: Any) -> dict[str, Any]:
-    """Returns the fields of a record that differ from another of its type, by dotted names."""
+    """Returns the fields that differ from other settings of the same type, by dotted names."""
     found: dict[str, Any] = {}
     for name, value in _fields(settings).items():
         other = getattr(default, name)
@@ -252,7 +252,7 @@ def leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 def merge(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
     """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
 
-    A record with a `name`, a choice among several records, is replaced as a whole by another one. InputError for
+    Settings with a `name`, which selects one of several classes, are replaced as a whole. InputError for
     mappings that are nested more than `depth` deep.
     """
     both: dict[str, Any] = {}
@@ -270,7 +270,7 @@ def merge(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limi
 
 
 def to_mapping(settings: Any) -> dict[str, Any]:
-    """Returns a record as nested mappings, lists and scalars for YAML and JSON; InputError for any other value."""
+    """Returns settings as nested mappings, lists and scalars for YAML and JSON; InputError for any other value."""
 
     def plain(value: Any) -> Any:
         if hasattr(value, "tolist"):
@@ -293,7 +293,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def hints_of(kind: Any) -> dict[str, Any]:
-    """Returns the annotated types of a record's fields by name."""
+    """Returns the annotated types of a settings class's fields by name."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
@@ -321,7 +321,7 @@ def _accept_yaml(hint: Any) -> Any:
 
 
 def _add_bounds(hint: Any) -> Any:
-    """Returns an annotated number with the default bound on a side where it has none."""
+    """Returns an annotated number, with the default bound on each side without one."""
     kind, *parts = typing.get_args(hint)
     low, high = limits.bounds(hint)
     default = limits.bounds(limits.Integer if kind is int else limits.Number)
@@ -355,14 +355,14 @@ def _boolean(value: Any) -> bool:
 
 
 def _fields(value: Any) -> Mapping[str, Any]:
-    """Returns a mapping, or a record as one; empty for another value."""
+    """Returns a mapping, or settings as one; empty for another value."""
     if is_record(value):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     return value if isinstance(value, Mapping) else {}
 
 
 def _record_in(hint: Any) -> Any:
-    """Returns the record type within an annotated or optional type, or None."""
+    """Returns the settings class within an annotated or optional type, or None."""
     if is_record(hint):
         return hint
     return next((found for part in typing.get_args(hint) if (found := _record_in(part)) is not None), None)

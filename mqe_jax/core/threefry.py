@@ -16,8 +16,8 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 def threefry(key0: Any, key1: Any, x0: Any, x1: Any) -> tuple[Any, Any]:
     """Returns the random bits of two counters, by Threefry-2x32 with 20 rounds (Salmon et al. 2011); all uint32."""
     if key0.size == 1 < x0.size:
-        # One key is computed apart from its numbers: otherwise, where it comes from others by several splits, LLVM of
-        # jaxlib 0.11 does not finish the loop over the numbers in 25 minutes.
+        # The barrier keeps the splits that a key comes from out of the loop over its numbers, which LLVM of jaxlib 0.11
+        # otherwise does not compile within 25 minutes.
         key0, key1 = jax.lax.optimization_barrier((key0, key1))
     keys = key0, key1, key0 ^ key1 ^ np.uint32(0x1BD11BDA)
     x0, x1 = x0 + keys[0], x1 + keys[1]

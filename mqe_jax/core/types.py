@@ -56,7 +56,7 @@ def _level(value: Any) -> Any:
     traced, dtype = isinstance(value, Tracer), getattr(value, "dtype", None)
     kinds = (jnp.integer, jnp.floating)
     number = isinstance(value, int | float) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in kinds)
-    # By numpy: under jit comparisons are traced even where an array is a captured constant.
+    # By numpy: under jit comparisons are traced even if an array is a captured constant.
     inside = number and not np.shape(value) and (traced or 0 <= np.asarray(value) <= 1)
     if isinstance(value, bool) or not inside:
         raise ValueError("a number in [0, 1]")
@@ -95,21 +95,32 @@ Teams = tuple[tuple[int, ...], ...]
 class VectorEnv(Protocol):
     """N environments of A agents with automatic reset; `reset` and `step` are pure and may be jitted.
 
-    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`; the environment clips actions, unbounded
-    samples of the policy, to its range. The state is any pytree with these fields: obs (N, A, O) is the input of the
-    next action; privileged_obs (N, P); final_obs (N, A, O) and final_privileged_obs (N, P) belong to the state reached
-    by the step, before any reset, and may be None if the critic does not read them (`NetworkSettings.critic_reads`);
-    reward (N, A); terminated, truncated (N,) bool; outcome, an `Outcome`, counts at the end of an episode; metrics maps
-    names to (N,), which are averaged over steps, except for the counts `diverged` and `overflow`. All names are present
-    from the reset on.
+    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`. The policy samples unbounded actions,
+    which the environment clips. A state is any pytree with these fields, all present from the reset on:
 
-    Optional attributes: `teams` (tuple of tuples of agents; one team by default); learning needs a single one.
-    `max_episode_steps` (int) and `state.step` (N,), which `stagger_episodes` sets; `state.assistance` (N,),
-    which `curriculum.assistance` sets (see `replace_fields`); `state.active` (N, A) bool, the agents that take part: no
-    others enter statistics, losses and results; `state.learners` (N, A) bool, the active agents whose actions the
-    policy chooses: it learns from no others; `state.groups` and `state.final_groups`, further observations by name
-    (N, A, O_g), with `group_sizes`, their lengths. In several processes, `share(parts)` returns the batch of
-    one, whose states are consecutive rows of those of all (`devices.rows`).
+    | field | shape | meaning |
+    |---|---|---|
+    | `obs` | (N, A, O) | input of the next action |
+    | `privileged_obs` | (N, P) | observation of the critic |
+    | `final_obs`, `final_privileged_obs` | as above | before any reset; None if not in `NetworkSettings.critic_reads` |
+    | `reward` | (N, A) | of the step |
+    | `terminated`, `truncated` | (N,) bool | whether the step ended the episode |
+    | `outcome` | | an `Outcome`, valid at the end of an episode |
+    | `metrics` | (N,) by name | averaged over steps; `diverged` and `overflow` are summed |
+
+    Optional attributes of the environments are `teams` (one by default; learning needs a single one),
+    `max_episode_steps` and `group_sizes` (lengths of further observations). With several processes, `share(parts)`
+    returns the batch of one: its states are consecutive rows of the whole batch (`devices.rows`).
+
+    Optional fields of the state:
+
+    | field | shape | meaning |
+    |---|---|---|
+    | `step` | (N,) | steps in the episode; set by `stagger_episodes` |
+    | `assistance` | (N,) | set by `curriculum.assistance` (`replace_fields`) |
+    | `active` | (N, A) bool | agents that take part; the others enter neither statistics, losses nor results |
+    | `learners` | (N, A) bool | active agents whose actions the policy chooses; it learns from these only |
+    | `groups`, `final_groups` | (N, A, O_g) by name | further observations |
     """
 
     @property
@@ -204,7 +215,7 @@ class Outcome:
     """How an episode ended, for K teams; before its last step, as if it ended there. Any leading axes."""
 
     success: Any = None
-    """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None where there is no such measure."""
+    """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None without such a measure."""
     win: Any = None  # whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss
     draw: Any = None  # whether it was a draw (K,)
     loss: Any = None  # whether each team lost (K,)

@@ -62,7 +62,7 @@ def add_libraries(folder: Path, source: Path | None = None) -> None:
 
 
 def _archive(package: Package) -> Path:
-    """Returns the archive of a package, fetched where the cache lacks it."""
+    """Returns the archive of a package, fetched if the cache lacks it."""
     title = f"{package.name}@{package.version}"
     archive = user_cache() / "play" / f"{package.name.lstrip('@').replace('/', '-')}-{package.version}.tgz"
     if not archive.is_file():

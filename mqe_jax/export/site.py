@@ -168,7 +168,7 @@ def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
 
 
 def _short(path: Path, taken: Iterable[str]) -> str:
-    """Returns the name of a run on the page: the last part of its path, or the last two where that is taken."""
+    """Returns the name of a run on the page: the last part of its path, or the last two if that is taken."""
     last = path.name if path.is_dir() else path.stem
     names = (last, f"{path.parent.name}/{last}")
     if free := [name for name in names if name not in {*taken, "shipped", "scripted", "idle"}]:
@@ -177,7 +177,7 @@ def _short(path: Path, taken: Iterable[str]) -> str:
 
 
 def titles(found: Sequence[Entry]) -> list[str]:
-    """Returns the titles of tasks, with a number where an earlier one has the same."""
+    """Returns the titles of tasks, with a number if an earlier one is equal."""
     headings = [entry.env.heading for entry in found]
     before = [headings[:place].count(heading) for place, heading in enumerate(headings)]
     return [f"{heading} {count + 1}" if count else heading for heading, count in zip(headings, before, strict=True)]
@@ -219,7 +219,7 @@ def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
 def _graph(
     function: Function, inputs: dict[str, tuple[int, ...]], name: str, states: dict[str, np.ndarray]
 ) -> onnx.ModelProto:
-    """Returns the graph of a function, checked on initial states where they have its inputs, else on random numbers."""
+    """Returns the graph of a function, checked on initial states if they have its inputs, else on random numbers."""
     random = np.random.default_rng(0)
     known = {**states, **{f"before_{key}": np.roll(x, 1, axis=0) for key, x in states.items()}}
 

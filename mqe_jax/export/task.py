@@ -101,8 +101,9 @@ class TaskFunctions:
     def judge(self, inputs: Arrays) -> dict[str, jax.Array]:
         """Returns the observation, the result and the task's next fields after a step.
 
-        `obs` (A, O), `outcome`: those of `outcomes` as if the episode ended here, `next_task_NAME`, and as 0 or 1
-        `terminated`, `truncated`, `fell` and `collided`: whether a fall or a collision ended the episode.
+        Outputs are `obs` (A, O), `outcome` (the values of `outcomes` as if the episode ended here) and
+        `next_task_NAME`. `terminated`, `truncated`, `fell` and `collided` are 0 or 1; the last two say whether a fall
+        or a collision ended the episode.
         """
         env, after = self.env, self.state(inputs)
         before = self.state({**inputs, **{name: inputs[f"before_{name}"] for name in PHYSICS}})

@@ -33,7 +33,7 @@ REPLACED: dict[str, Callable[..., jax.Array]] = {
     "select_n": _select,
     "rem": lambda x, y: x - y * (jnp.trunc(x / y) if x.dtype == jnp.float32 else jax.lax.div(x, y)),
 }
-"""Operations that jax2onnx refuses where an axis is symbolic, or onnxruntime for some types."""
+"""Operations that jax2onnx rejects for a symbolic axis, or onnxruntime for some types."""
 
 
 def translate(
@@ -60,7 +60,7 @@ def translate(
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     try:
         model = jax2onnx.to_onnx(evaluate_batch, arguments, model_name=name, opset=OPSET, **names)
-    except Exception as error:  # jax2onnx has no exception of its own
+    except Exception as error:  # jax2onnx has no exception class
         raise InputError(f"onnx: jax2onnx cannot translate {name} ({one_line(error)})") from error
     _halve(model.graph)
     del model.graph.value_info[:]  # onnxruntime infers them

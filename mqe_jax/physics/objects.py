@@ -1,4 +1,4 @@
-"""Scene objects: records, which a task's parameters may nest, that add one body each to a scene; SI units."""
+"""Scene objects: settings classes that add one body each to a scene; SI units. A task's parameters may nest them."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

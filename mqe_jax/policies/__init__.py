@@ -165,8 +165,8 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
 
     Args:
         source: one of `NAMES`, of the task's `NAMED_PLANNERS`, a task with a shipped policy
-            (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path; a folder with one of these
-            names is given as ./NAME.
+            (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path. A folder with one of these
+            names is ./NAME.
         env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
         deterministic: whether a trained policy acts with its mean actions; it does so too where its file or the card
             of a shipped one declares it.
@@ -226,8 +226,8 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
     These include the sensors of policies that see them.
 
     Policies of different skills get those with which they can meet. The sources are policies, or what `load_policy`
-    accepts; those that are no trained policy of the task need nothing, but the scripted member of a population needs
-    the task's default skill, so that it is the same opponent for all.
+    accepts. Only trained policies of the task need something, and the scripted member of a population: it always has
+    the task's default skill.
     """
     params: dict[str, Any] = {}
     every: list[Needs] = []
@@ -235,7 +235,7 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
     for source in sources:
         policy = source
         if isinstance(source, str | Path) and str(source) not in NAMES:
-            with contextlib.suppress(InputError):  # `load_as` raises it, where it matters
+            with contextlib.suppress(InputError):  # `load_as` raises it if it matters
                 policy = population.resolve(source, task)
                 scripted = [TASKS[task].Params().actions("command")] if policy == "scripted" else scripted
                 policy = load_policy(policy)
@@ -292,7 +292,7 @@ def _act_scripted(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) 
 
 def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """Returns a scripted policy of the task for a batch: observations (N, A, O) and a key to actions (N, A, 3)."""
-    scripted_policy(env, name)  # which raises where there is none
+    scripted_policy(env, name)  # which raises if it is missing
     if env.control != "command":
         raise InputError(
             f"policy: {name!r} outputs walk commands; control is {env.control!r}, use another, such as random"

@@ -148,8 +148,9 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
 
     The task is that of the settings, or `task` as in `make_env`.
 
-    In a match the policy is team 0 against `opponents`. Without, both teams of each of `num_envs` / 2 matches are
-    environments of the policy; it is evaluated against the scripted policy, or an idle team where that does not fit.
+    In a match the policy is team 0 against `opponents`. Without opponents, both teams of each of `num_envs` / 2 matches
+    are environments of the policy. It is then evaluated against the scripted policy, or an idle team if that does not
+    fit.
     InputError for a task, an opponent or a demonstrator that is not allowed.
     """
     task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
@@ -199,7 +200,7 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
 
 
 def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:
-    """Raises an InputError where a training of seeds could not start."""
+    """Raises an InputError if a training of seeds could not start."""
     check_loggers(config.loggers)
     cast = environments(impl, config, seeds)
     learner.make_learner(cast.env, config, league=cast.league, teacher=cast.teacher)
@@ -209,7 +210,7 @@ def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None
 
 
 def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv, config: TrainConfig) -> None:
-    """Raises an InputError where a policy that is trained in a task could not act in it as it is evaluated."""
+    """Raises an InputError if a policy that is trained in a task could not act in it as it is evaluated."""
     differing = needs_of(training, config).mismatches(needs_of(env, config))
     for name, (value, evaluated) in differing.items():
         fail(f"train_env.{name}", value, f"that of env, {evaluated!r}, in which the policy is evaluated")
@@ -271,8 +272,8 @@ def players(
 
     `sensors` gives the robots those of the set `onboard`, unless they have some.
 
-    A run has its own task, parameters and policy. Without a policy, a task has its shipped one if no parameters are
-    given, on both sides of a match; else its scripted one, or `forward`; where actions are not commands, `random`. A
+    A run has its own task, parameters and policy. Without a policy and parameters, a task has its shipped policy, on
+    both sides of a match. Otherwise it has its scripted one, or `forward`, or `random` if actions are not commands. A
     task by its id has the parameters that trained policies need, such as their skill.
     """
     made, name, params = task, "", dict(env or {})
@@ -309,7 +310,7 @@ def players(
 
 
 def run_config(target: str) -> TrainConfig:
-    """Returns the settings of the policy in a run folder or a policy file; InputError if there is none."""
+    """Returns the settings of the policy in a run folder or a policy file; InputError if it is missing."""
     if not target.endswith(".safetensors") and not (Path(target) / POLICY_FILE).is_file():
         runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{POLICY_FILE}"))
         hint = f"; did you mean {runs[0]}?" if runs else ""
@@ -319,7 +320,7 @@ def run_config(target: str) -> TrainConfig:
 
 
 def settings_of(task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Returns the settings that `mqe_jax.learn` is given, but for task parameters, whose sensors select others."""
+    """Returns the settings passed to `mqe_jax.learn`, without task parameters, whose sensors select others."""
     if isinstance(config, TrainConfig):
         return config
     changes = dict(config) if isinstance(config, Mapping) else {"config": config}
@@ -331,9 +332,9 @@ def settings_of(task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any]
 
 
 def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Returns the settings with a task and its parameters; says so where they are those of another task.
+    """Returns the settings with a task and its parameters; says so if they are those of another task.
 
-    A task by its id gets the parameters that the teacher and the policy to start from need, where they are not given.
+    A task by its id gets the parameters that the teacher and the policy to start from need, unless they are passed.
     """
     name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
     if config.task not in (None, name):

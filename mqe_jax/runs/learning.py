@@ -95,7 +95,7 @@ class Run:
         path = Path(check("folder", folder, PathText))
         check_folder(path, "folder")
         check_run(path)
-        save_policy(path, self.policy)  # first: it refuses weights that are not finite
+        save_policy(path, self.policy)  # first: it rejects weights that are not finite
         write_config(path, self.config)
         log = CsvLog(path, 0)
         for values in zip(*self.metrics.values(), strict=True):

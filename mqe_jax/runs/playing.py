@@ -57,7 +57,7 @@ def evaluate(
     Args:
         task: id, environment, or the run folder or policy file of a trained policy, which brings its task.
         policy: a policy, or what `load_policy` accepts. Default: the run's; of a task the shipped one, else the
-            scripted one, else `forward`, or `random` where actions are not commands. A task by its id gets the skill,
+            scripted one, else `forward`, or `random` if actions are not commands. A task by its id gets the skill,
             gait, command ranges, control mode and robot that a trained policy needs.
         opponent: policy of the other team of a match, or a population (`mqe_jax.policies.zoo.population`), whose
             members play `episodes` each. Default: that of the first team if it is the shipped one by

@@ -52,7 +52,7 @@ def named_config(name: str, task: str) -> TrainConfig:
 def base_config(
     task: str, name: str | None, algorithm: str | None = None, env: Mapping[str, Any] = FrozenMapping()
 ) -> TrainConfig:
-    """Returns the settings of a file or a shipped name, with the presets of the algorithm and of given task parameters.
+    """Returns the settings of a file or a shipped name, with the presets of the algorithm and of the task parameters.
 
     The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
     paper/mappo for other tasks. If the parameters name sensors and the settings no group of observations, a policy that

@@ -39,8 +39,8 @@ def programs(
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
     """Returns what is timed, neither jitted: whole environment steps, and physics alone.
 
-    The first maps a state and a random key to `steps` later ones under random actions, and to what is `seen` of each
-    state; the second maps a physics state to a later one under its constant control.
+    The first maps a state and a random key to those `steps` later under random actions, and returns `seen` of each
+    state. The second maps a physics state to a later one under its constant control.
     """
     shape = (vector.num_envs, env.num_agents, env.action_size)
 

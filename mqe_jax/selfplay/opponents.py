@@ -1,4 +1,4 @@
-"""A match as an environment of one team: against given opponents (`versus`), or with both teams learning (`Mirror`)."""
+"""A match as an environment of one team: against opponents (`versus`), or with both teams learning (`Mirror`)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
 class OpponentState:
     """The opponent of a block of B environments."""
 
-    arrays: PyTree  # arrays of the opponent; empty where it cannot change
+    arrays: PyTree  # arrays of the opponent; empty if it cannot change
     before: PyTree  # arrays of the opponent before the last change
     waiting: jax.Array  # environments whose episode is still against the opponent before the change (B,) bool
     memory: Memory  # recurrent state, leading axis B
@@ -114,7 +114,7 @@ class Versus(OneTeam):
     @single
     @check_arguments(key=RandomKey)
     def reset(self, key: jax.Array) -> TeamState:
-        """Returns the initial states of all environments, against the opponents given at the start."""
+        """Returns the initial states of all environments, against the first opponents."""
         key, match_key = jax.random.split(key)
         match = self.inner.reset(match_key)
         opponents = []
@@ -152,7 +152,7 @@ class Versus(OneTeam):
         """Returns the state with another opponent in a block, a trained policy of the same architecture.
 
         Each environment keeps its opponent until its episode ends, unless `at_once`. While environments still wait for
-        an earlier change, only the opponent for which they wait is replaced, also where it already plays.
+        an earlier change, only the opponent for which they wait is replaced, even if it already plays.
         """
         if not block < len(self.opponents):
             fail("block", block, f"below {len(self.opponents)}, the number of blocks")

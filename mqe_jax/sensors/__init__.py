@@ -1,6 +1,6 @@
 """Sensors: what robots measure, as blocks of an observation; their registry.
 
-A sensor is a settings record derived from `Sensor` in its own file, registered by `register`.
+A sensor is a settings class derived from `Sensor` in its own file, registered by `register`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Sensor:
     """Base of all sensors: functions of one environment, for all its agents."""
 
     engines: ClassVar[tuple[str, ...]] = ()
-    """Engines on which it works; all if there are none."""
+    """Engines on which it works; empty: all."""
 
     name: str = ""
     """Name in the registry; of a subclass, a `Literal` with its value as the default."""
@@ -65,13 +65,13 @@ class Sensor:
 
 
 SENSORS: dict[str, type[Sensor]] = {}
-"""Settings records of sensors by name."""
+"""Settings classes of sensors by name."""
 
 S = TypeVar("S", bound=type[Sensor])
 
 
 def register(sensor: S) -> S:
-    """Registers a record under the default of its field `name`, and returns it; a class decorator.
+    """Registers a settings class under the default of its field `name`, and returns it; a class decorator.
 
     Raises:
         InputError: for anything else, without a name, or if another class is registered under it.

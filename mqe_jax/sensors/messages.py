@@ -41,7 +41,7 @@ class Messages(Sensor):
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
         mates, _ = scene.mates
         if not mates.shape[1]:
-            fail("senses", self.name, f"left out where no robot has teammates: there are {len(scene.teams)} teams of 1")
+            fail("senses", self.name, f"left out if no robot has teammates: there are {len(scene.teams)} teams of 1")
         meaning = "what each teammate sent in the last step, as received"
         return (entities("messages", "robot", mates.shape[1], self.numbers, meaning, masked=True),)
 

@@ -1,7 +1,7 @@
 """The agile skill: fast velocity commands to joint targets, for one robot, by a small network.
 
-Its memory holds what every skill could share: frames of the last steps, the action that the joint targets of the last
-step amount to, and the phase of the gait cycle. A frame has 39 numbers:
+Its memory holds frames of the last steps, the action that corresponds to the last joint targets, and the phase of the
+gait cycle. A frame has 39 numbers:
 
 | block | size | content |
 |---|---|---|
@@ -12,8 +12,8 @@ step amount to, and the phase of the gait cycle. A frame has 39 numbers:
 
 Input of the network: the frames of the steps `OFFSETS` before this one, oldest first (zeros before an episode's first
 step), the three commands times their scale, and the clock. The clock is sine and cosine of the phase of a trot, or
-zeros where the robot shall stand; the trot's frequency grows with the commanded velocity. 200-256-256-128-12 with ELU
-give the action, clipped to +-10; the joint target is default + scale x action.
+zeros if the command is to stand. The trot's frequency grows with the commanded velocity. Layers 200-256-256-128-12 with
+ELU give the action, clipped to +-10. The joint target is default + scale x action.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ JOINT_VELOCITY_SCALE = 0.05
 PRECISION = "tensorfloat32"  # as in the walk policy
 FREQUENCY = (3.0, 4.2)  # of the trot, Hz: at rest, and from the velocity `FAST` on
 FAST = np.array([2.5, 1.0, 2.5], np.float32)  # m/s forward, m/s to the left, rad/s
-STAND = 0.02  # share of `FAST` below which the robot shall stand
+STAND = 0.02  # share of `FAST` below which the robot stands
 
 COMMANDS = (
     Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0, trained=(-1.5, 2.5)),
@@ -67,7 +67,7 @@ def _pace(velocity: jax.Array) -> jax.Array:
 
 
 def stands(velocity: jax.Array) -> jax.Array:
-    """Returns whether a robot with this commanded velocity (3,) shall stand () bool."""
+    """Returns whether a robot with this commanded velocity (3,) should stand () bool."""
     return _pace(velocity) < STAND
 
 

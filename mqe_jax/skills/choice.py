@@ -29,7 +29,7 @@ from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Command, Skill
 
 THRESHOLD = 0.1
-"""Distance of the entry from the edge of a skill's part below which the skill that acts goes on."""
+"""Distance of the entry from the edge of a skill's part below which the acting skill continues."""
 HOLD = 10
 """Steps that a skill acts at least."""
 SHARED = ("action", "gait")

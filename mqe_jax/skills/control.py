@@ -145,7 +145,7 @@ class Controller(Commander):
             raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
         if not jnp.issubdtype(action.dtype, jnp.floating):
             raise InputError(f"action: dtype {action.dtype}; expected a floating-point type")
-        # Under jit the result is traced even where the action is a captured constant.
+        # Under jit the result is traced even if the action is a captured constant.
         finite = jnp.all(jnp.isfinite(action))
         if not isinstance(finite, Tracer) and not bool(finite):
             raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")

@@ -71,7 +71,7 @@ def final_reward(run: Run) -> float:
 
 
 def absolute(run: Run, name: str) -> float:
-    """Returns a number of the absolute metric under sampled actions, NaN if there is none."""
+    """Returns a number of the absolute metric under sampled actions, NaN if missing."""
     value = (run.absolute or {"sampled": {}})["sampled"].get(name)
     return math.nan if value is None else float(value)
 

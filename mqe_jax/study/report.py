@@ -14,7 +14,7 @@ from mqe_jax.train.logs import number
 
 
 def report(folder: Path, reference: Reference | None = None) -> list[Path]:
-    """Writes FOLDER/report from the finished runs of a sweep; returns the files. InputError if there are none."""
+    """Writes FOLDER/report from the finished runs of a sweep; returns the files. InputError without a finished run."""
     runs = read_runs(folder)
     check_folder(folder / "report", "folder")
     return write_report(runs, folder / "report", reference or Reference())

@@ -78,7 +78,7 @@ def finished(run_dir: Path) -> bool:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Reads the finished runs of a sweep's folder, ordered by path and seed; InputError if there is none."""
+    """Reads the finished runs of a sweep's folder, ordered by path and seed; InputError without any."""
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
         if path.parent.name.removeprefix("seed").isdecimal() and finished(path.parent):

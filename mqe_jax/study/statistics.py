@@ -40,7 +40,7 @@ def bootstrap_interval(
 ) -> tuple[Array, Array]:
     """Returns the bounds of a 95% percentile bootstrap interval; runs are resampled within each task.
 
-    `scores` are the statistic's arguments, resampled independently where there are several. Tasks are the strata and
+    `scores` are the statistic's arguments, if several, each resampled independently. Tasks are the strata and
     stay fixed. `random` is a `numpy.random.Generator`, or has its `integers`. The bounds of one run are the statistic.
     InputError if scores are not (runs, tasks), or not finite.
     """

@@ -152,8 +152,8 @@ def plan(
     """Returns the remaining jobs, in the order of training, of the cells that `select` returns for `cells`.
 
     `seeds` are some of the sweep's, all if empty. `config_of(task, algorithm)` gives the settings that those of the
-    sweep override; `check(config, seeds)` raises an InputError for settings with which so many seeds could not start,
-    before the first cell is trained. Seeds whose newest checkpoints differ are trained in separate jobs.
+    sweep override. `check(config, seeds)` raises an InputError for settings with which so many seeds could not start;
+    no cell is trained before. Seeds whose newest checkpoints differ are trained in separate jobs.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")

@@ -1,4 +1,4 @@
-"""Settings of a training run: typed, validated, nested records that YAML files and flags mirror."""
+"""Settings of a training run: typed, validated, nested classes that YAML files and flags mirror."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -111,7 +111,7 @@ class Imitation:
 
     teacher: str | None = None
     """Policy that sees its own group of observations: scripted, the task (its shipped policy), a run folder or a policy
-    file; none disables imitation. Task parameters that are not given are those that it needs."""
+    file; none disables imitation. Other task parameters are those that it needs."""
     weight: NonNegative = 1.0
     """Initial weight of the loss, annealed linearly to 0."""
     until: Positive = 0.5
@@ -189,13 +189,13 @@ class TrainConfig:
     env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
     """Overrides of the task's parameters, passed to the environment unchanged."""
     train_env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
-    """Further overrides during training only, not in evaluation. A given parameter (`--set`, `env`) replaces that of
-    the file."""
+    """Further overrides during training, not in evaluation. A parameter of `--set` or `env` replaces one of the
+    file."""
     opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
-    """Opponent in a match, in training and its evaluations: scripted, random, idle, forward, another scripted policy of
-    the task, the task itself (its shipped policy), a run folder or a policy file; in training also newest (the policy
-    itself), older (a member of the league's pool, more often one that is hard to beat) or uniform (any member). Several
-    have equal shares of the environments. Without, both teams of each match learn."""
+    """Opponent in a match, in training and its evaluations. A run folder, a policy file or the task itself (its shipped
+    policy). Or scripted, another scripted policy of the task, random, idle, forward. In training also newest (the
+    policy itself), older (a member of the league's pool, preferably one that is hard to beat) or uniform (any member).
+    Opponents share the environments equally. Without any, both teams of each match learn."""
     mates: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _MATE] = ()
     """Pool of mates in a task of one team, in training and its evaluations: what `opponents` accept but newest, older
     and uniform. Each has an equal share of the environments, in which it acts for one robot and the policy learns as
@@ -203,14 +203,14 @@ class TrainConfig:
     both_sides: bool = False
     """Whether the policy plays its opponents as the task's team 1 in half of the environments, in evaluations too."""
     draw_reward: float = 0.0
-    """Added to the reward where an episode against opponents ends in a draw, during training only."""
+    """Added to the reward of a draw against opponents, during training only."""
     time_limit_ends: bool = False
     """Whether the time limit ends the episode for the learner too: no value follows, and the privileged observation
     includes the time left. During training only."""
     league: LeagueSettings = LeagueSettings()
     start: FileName | None = None
-    """Run folder, policy file or, for its shipped policy, task whose policy the run starts from: its parameters and
-    observation statistics; none starts from nothing."""
+    """Policy to start from: a run folder, a policy file, or a task for its shipped policy. The run takes over its
+    parameters and observation statistics. None: from scratch."""
     group: str = "policy"
     """Group of observations that the policy sees (`env.groups`), and its critic if that reads observations."""
     seed: Seed = 0

@@ -44,9 +44,10 @@ def of_team(encoder: Encoder, agents: int) -> Encoder:
 
 
 def by_block(settings: Blocks, dims: EnvDims) -> Encoder:
-    """Returns the encoder of observations by their blocks, which `dims` describe; InputError if it does not.
+    """Returns the encoder that pools entities, convolves images and passes on all other blocks.
 
-    Blocks that are neither of entities nor images stay as they are.
+    Raises:
+        InputError: if `dims` does not describe the blocks of the observation.
     """
     blocks = dims.blocks
     if sum(block.width for block in blocks) != dims.observation:
@@ -70,8 +71,8 @@ def by_block(settings: Blocks, dims: EnvDims) -> Encoder:
 
     def encode(params: Params, block: Block, x: jax.Array) -> jax.Array:
         if block.entities is not None:
-            return pooled(params[_kind(block.entities)], x, block.entities)
-        return convolved(params[block.name], x, block.image) if block.image else x
+            return pool(params[_kind(block.entities)], x, block.entities)
+        return convolve(params[block.name], x, block.image) if block.image else x
 
     def apply(params: Params, x: jax.Array) -> jax.Array:
         ends = [sum(block.width for block in blocks[: i + 1]) for i in range(len(blocks))]
@@ -90,7 +91,7 @@ def _kind(entities: Entities) -> str:
     return f"{entities.kind}_{entities.width}"
 
 
-def pooled(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
+def pool(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
     """Returns maxima and means of the features of the entities that are there: (..., block) -> (..., 2 W); 0 if none.
 
     What a mask hides has no effect, and neither has the order of the entities, but for rounding.
@@ -103,7 +104,7 @@ def pooled(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
     return jnp.concatenate([jnp.max(features, axis=-2), jnp.sum(features, axis=-2) / count], axis=-1)
 
 
-def convolved(params: Params, x: jax.Array, image: tuple[int, int, int]) -> jax.Array:
+def convolve(params: Params, x: jax.Array, image: tuple[int, int, int]) -> jax.Array:
     """Returns features of an image (..., channels x height x width): convolutions of 3 x 3 pixels at stride 2."""
     x = jnp.moveaxis(x.reshape(*x.shape[:-1], *image), -3, -1)
     for i in range(len(params) - 1):

@@ -229,7 +229,7 @@ def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -
         function = functools.partial(_call_with_obs, either)
         return functools.partial(_act, function, (num_envs, env.num_agents, env.action_size)), memory
     if (trained := getattr(either, "task", "")) and trained != env.name:
-        fail("policy", f"one of {trained}", f"one of {env.name}; its `act` may be given alone")
+        fail("policy", f"one of {trained}", f"one of {env.name}; pass its `act` instead")
     if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
         allowed = f"one of all {env.num_agents}; `mqe_jax.versus` shows one team of a match"
         fail("policy", f"one of {agents} agents", allowed)
@@ -276,8 +276,8 @@ def evaluate_batch(
 class Evaluator:
     """Evaluates B policies in one compiled program; see `evaluate_batch`.
 
-    `act(params, seen, memory, key) -> (action, memory)` is the policy, `seen` its `Observations`; `params` has a
-    leading axis B, one set for each evaluation, or is None if all evaluations share one policy.
+    `act(params, seen, memory, key) -> (action, memory)` is the policy, `seen` its `Observations`. `params` has one set
+    for each evaluation, on a leading axis B, or is None if all evaluations share one policy.
     """
 
     def __init__(
@@ -301,7 +301,7 @@ class Evaluator:
             keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.split(key)[1], done_steps))(keys)
             return jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
 
-        # Random keys are computed inside of both: a program of its own for each would delay the first block.
+        # Random keys are computed inside of both: separate programs would delay the first block.
         self._begin = jax.jit(jax.vmap(lambda key: _begin(env, jax.random.split(key)[0], memory)))
         self._run = jax.jit(run)
 

@@ -203,8 +203,8 @@ def _prepare(
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
-    The critic evaluates each step's observation and final observation as a chunk of two, batched over all steps: the
-    next value uses the recurrent state after the step's observation, whether or not the episode ended there.
+    The critic evaluates each step's observation and final observation as a chunk of two, batched over all steps. The
+    next value then uses the recurrent state after the step's observation, even if the episode ended there.
     """
     network, config = stages.network, stages.config
     active, normalize = transitions.active, config.normalization.observations

@@ -110,7 +110,7 @@ def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]
 class TensorBoardLog(MetricsLog):
     """TensorBoard events where tensorboardX is installed, otherwise nothing.
 
-    Its own writer has a thread, which dies where the disk is full; the training would wait for it for ever.
+    TensorBoard's writer has a thread that dies if the disk is full, and the training would wait for it for ever.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -137,7 +137,7 @@ class TensorBoardLog(MetricsLog):
         self._append(step=int(row["env_steps"]), summary={"value": values})
 
     def _append(self, **fields: Any) -> None:
-        """Appends an event as TensorFlow's records are: length, its checksum, data, their checksum."""
+        """Appends an event in TensorFlow's format: length, its checksum, data, their checksum."""
         data = self._proto.Event(wall_time=time.time(), **fields).SerializeToString()
         length = struct.pack("<Q", len(data))
         checksums = [struct.pack("<I", self._checksum(part)) for part in (length, data)]
@@ -147,8 +147,8 @@ class TensorBoardLog(MetricsLog):
 class WandbLog(MetricsLog):
     """A Weights & Biases run, logged offline to `run_dir/wandb` unless WANDB_MODE=online is set.
 
-    `wandb sync` uploads it later. A resumed training run keeps its run id. wandb's own process writes the file, the
-    last rows at the latest when the program ends; `wandb.teardown()` waits for them, but ends all runs of the program.
+    `wandb sync` uploads it later. A resumed training run keeps its run id. wandb's own process writes the file, and
+    finishes it when the program ends. `wandb.teardown()` finishes it at once, but ends all runs of the program.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:

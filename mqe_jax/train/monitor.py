@@ -1,4 +1,4 @@
-"""Evaluation during training: records of a run's evaluations, its best policy, and the absolute metric.
+"""Evaluation during training: a run's evaluations, its best policy, and the absolute metric.
 
     RUN/evaluations.json          {"evaluations": [...], "absolute": {...} or null}
     RUN/best/step_*.safetensors   the policy of the best evaluation so far

@@ -49,7 +49,7 @@ class Needs:
     def by_name(self) -> dict[str, Any]:
         """Returns what must be equal in an environment, by name.
 
-        These include each setting of the sensors, and the form of blocks of entities and images, where it is known.
+        These include each setting of the sensors, and the form of blocks of entities and images, if known.
         """
         names = ("version", *ACTIONS, "group")
         needs = {"task": self.task, "agents": self.dims.agents, **{x: getattr(self, x) for x in names}}

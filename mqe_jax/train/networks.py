@@ -1,7 +1,7 @@
 """The network protocol and the registry of networks.
 
-A network is one registered settings record whose `build` returns the functions that the learner, the rollout and a
-saved policy use. To add an architecture, register another settings record:
+A network is one registered settings class whose `build` returns the functions that the learner, the rollout and a
+saved policy use. To add an architecture, register another settings class:
 
     @register_network("mine")
     class MyNetwork(NetworkSettings):
@@ -63,18 +63,20 @@ class ChunkResult(NamedTuple):
 class Network(NamedTuple):
     """The functions that make up a network.
 
-    `init(key) -> params`
-    `policy_params(params) -> params`: the parameters used by `act`, stored in a saved policy
-    `initial_memory(num_envs) -> memory`: recurrent state of zeros with leading axis N
-    `act(policy_params, actor_memory, obs (N, A, O), key or None, active (N, A)) -> (action (N, A, D),
-    log_prob (N, A, D), actor_memory)`; without a key the action is the deterministic one. Actions are unbounded. Agents
-    may act autoregressively within one call.
-    `value(params, critic_memory, is_first (L, N), obs (L, N, A, O), privileged (L, N, P), active (L, N, A)) ->
-    (value (L, N, V), critic_memory)`
-    `evaluate(params, memory, is_first (L, C), obs, privileged, action, active) -> ChunkResult`, all agents in parallel
-    `active` says which agents take part, None: all. The observations of the others are 0; a network in which agents see
-    each other leaves them out.
-    `chunk_length`: steps of truncated backpropagation through time; 1 for feed-forward networks
+    - `init(key) -> params`
+    - `policy_params(params) -> params` returns the parameters of `act`, which a saved policy has.
+    - `initial_memory(num_envs) -> memory` returns a recurrent state of zeros with leading axis N.
+    - `act(policy_params, actor_memory, obs, key, active) -> (action, log_prob, actor_memory)`, with obs (N, A, O),
+      active (N, A), action and log_prob (N, A, D). Actions are unbounded, and without a key deterministic. Agents may
+      act autoregressively within one call.
+    - `value(params, critic_memory, is_first, obs, privileged, active) -> (value, critic_memory)`, with is_first (L, N),
+      obs (L, N, A, O), privileged (L, N, P), active (L, N, A), value (L, N, V).
+    - `evaluate(params, memory, is_first (L, C), obs, privileged, action, active) -> ChunkResult` takes all agents in
+      parallel.
+
+    `active` marks the agents that take part; None: all. The observations of the others are 0; a network in which agents
+    see each other must leave them out. `chunk_length` is the number of steps of truncated backpropagation through time,
+    1 for feed-forward networks.
     """
 
     init: Callable[[jax.Array], Params]
@@ -87,7 +89,7 @@ class Network(NamedTuple):
 
 
 class NetworkSettings:
-    """Base of every network's settings record."""
+    """Base of every network's settings class."""
 
     name: str
     """Registered name of the network that the other fields configure."""
@@ -140,12 +142,12 @@ class GaussianSettings(NetworkSettings):
 
 
 NETWORKS: dict[str, type[NetworkSettings]] = {}
-"""Settings records by the name that `network.name` gives."""
+"""Settings classes by the name that `network.name` gives."""
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
-    """Makes a class a settings record and registers it; the functions of its network compute in single precision."""
+    """Makes a class a settings class and registers it; the functions of its network compute in single precision."""
     check("name", name, str)
 
     def register(cls: type[Any]) -> type[Any]:
@@ -169,7 +171,7 @@ def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
 
 
 def network_settings(value: Any) -> Any:
-    """Returns the settings record that a mapping with a `name` describes (by default actor_critic)."""
+    """Returns the settings that a mapping with a `name` describes (by default actor_critic)."""
     if not isinstance(value, Mapping):
         return value
     name = value.get("name", "actor_critic")
@@ -201,7 +203,7 @@ class ActorCritic(GaussianSettings):
     """Activation after each hidden layer."""
     openrl_layers: bool = False
     """Add the layers of OpenRL's networks: a normalisation after each hidden layer and after the recurrent unit, and a
-    linear layer with one of its own after the hidden layers."""
+    linear layer with its own normalisation after the hidden layers."""
     recurrent: bool = True
     """Use a gated recurrent unit after the hidden layers of actor and critic."""
     gru_size: Width = 64

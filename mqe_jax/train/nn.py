@@ -26,8 +26,8 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Arra
             column = column - jnp.matmul(q, jnp.matmul(column, q, precision=PRECISION), precision=PRECISION)
         return q.at[:, j].set(column / jnp.linalg.norm(column))
 
-    # Gram-Schmidt in place of jnp.linalg.qr: on a CPU with few cores, LAPACK decompositions in one program run
-    # concurrently in XLA's threads, each waits for a free thread, and the program deadlocks.
+    # Gram-Schmidt in place of jnp.linalg.qr, which can deadlock on a CPU with few cores: LAPACK decompositions in one
+    # program run concurrently in XLA's threads, and each waits for a free thread.
     q = jax.lax.fori_loop(0, min(shape), add_column, jnp.zeros_like(normal))
     return scale * (q if rows >= columns else q.T)
 
@@ -114,8 +114,8 @@ def gru(params: Params, h: jax.Array, x: jax.Array) -> jax.Array:
 def clip_parameter(x: jax.Array, low: float, high: float) -> jax.Array:
     """Clips a parameter to [low, high] with a custom gradient.
 
-    Within the bounds the gradient is that of the identity. Outside, it is passed where a descent step reduces the
-    violation and zero where it would increase it.
+    Within the bounds the gradient is that of the identity. Outside, it is passed if a descent step reduces the
+    violation and zero if it would increase it.
     """
     return jnp.clip(x, low, high)
 

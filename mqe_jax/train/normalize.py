@@ -49,10 +49,7 @@ def features_of(blocks: Sequence[Block]) -> Features:
 
 
 class RunningStatistics(NamedTuple):
-    """Mean and variance (size,) of all samples so far, and their number () float32.
-
-    With `Features` of each of these (F,).
-    """
+    """Mean (size,), variance (size,) and number () float32 of all samples so far; with `Features`, each is (F,)."""
 
     mean: jax.Array
     variance: jax.Array

@@ -41,9 +41,9 @@ POLICY_FILE = "policy.safetensors"
 class Policy(Protocol):
     """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled code.
 
-    `initial_memory(num_envs)` is the recurrent state at an episode's start, leading axis N;
-    `act(obs (N, A, O), memory, key) -> (action (N, A, D) in [-1, 1], memory)`; one with `groups`, the names of those
-    that it sees, also accepts `Observations`.
+    `initial_memory(num_envs)` returns the recurrent state at an episode's start, leading axis N.
+    `act(obs, memory, key) -> (action, memory)` maps observations (N, A, O) to actions (N, A, D) in [-1, 1]. A policy
+    with `groups`, the names of the observation groups that it sees, also accepts `Observations`.
     """
 
     @property

@@ -27,7 +27,7 @@ class SeedBatch:
     def map(self, update: Callable[[PyTree], tuple[PyTree, PyTree]]) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
         """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled; metrics gain a leading axis S.
 
-        A single seed is computed without a batch axis, and thus bit for bit as outside of `SeedBatch`.
+        A single seed is computed without a batch axis: bit for bit as outside of `SeedBatch`.
         """
 
         def alone(states: PyTree) -> tuple[PyTree, PyTree]:

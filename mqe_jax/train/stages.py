@@ -134,6 +134,6 @@ def _mean(x: jax.Array, learners: jax.Array) -> jax.Array:
 
 
 def _adapt(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
-    """Returns a smaller learning rate where the KL divergence exceeds the target, a larger one where it is below."""
+    """Returns a smaller learning rate if the KL divergence exceeds the target, a larger one if it is below."""
     factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
     return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)

@@ -152,7 +152,7 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
 
 
 def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[str, Any]) -> None:
-    """Raises an InputError naming the first parameter of a task that differs in the settings, where they name any."""
+    """Raises an InputError naming the first parameter of a task that differs in the settings, if they name any."""
     task: Any = getattr(env, "env", None)
     if not is_record(getattr(task, "params", None)) or not (config.task or config.training_env):
         return

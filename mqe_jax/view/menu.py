@@ -30,7 +30,7 @@ class Entry:
 class Menu:
     """The choices, and how one becomes a session."""
 
-    open: Callable[[Entry], Session]  # creates the session of a choice; raises an InputError where that is not possible
+    open: Callable[[Entry], Session]  # creates the session of a choice; raises an InputError if that is not possible
     shown: Entry  # the choice on the page
     runs: dict[str, str] = field(default_factory=dict)  # task of each run folder
 

@@ -281,7 +281,7 @@ class Panel:
 
 
 def robot_labels(model: mujoco.MjModel) -> list[str]:
-    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, without colours where they bear numbers."""
+    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, without colours if they bear numbers."""
     shown = np.array([robot_color(model, trunk) for trunk in robot_bases(model)])
     if len(shown) > UNNUMBERED:
         return [f"robot {i + 1}" for i in range(len(shown))]

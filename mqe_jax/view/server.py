@@ -39,7 +39,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
         headers = request.headers
         reason = refusal(headers.get_all("Host"), headers.get_all("Origin"), authorities(host, address, local_port))
         if reason is not None:
-            echo(f"mqe: view: refused a connection: {brief(reason)}")
+            echo(f"mqe: view: rejected a connection: {brief(reason)}")
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"mqe view: {reason}\n")
         response = page(connection, request) if page is not None else None
         if response is not None:
@@ -66,7 +66,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
 def authorities(host: str, address: str, port: int) -> frozenset[str]:
     """Returns the values of the header `Host` that name this server, in lower case, on loopback localhost too.
 
-    `host` is the host given to listen on, `address` the local IP address of the connection, `port` its port.
+    `host` is the host to listen on, `address` the local IP address of the connection, `port` its port.
     """
     names = {host.lower(), address}
     if ipaddress.ip_address(address.partition("%")[0]).is_loopback:
@@ -76,7 +76,7 @@ def authorities(host: str, address: str, port: int) -> frozenset[str]:
 
 
 def refusal(hosts: Sequence[str], origins: Sequence[str], allowed: frozenset[str]) -> str | None:
-    """Returns why a request is refused, or None; `hosts` and `origins` are all values of the two headers."""
+    """Returns why a request is rejected, or None; `hosts` and `origins` are all values of the two headers."""
     if len(hosts) != 1 or hosts[0].lower() not in allowed:
         return f"Host is {' and '.join(hosts) or 'missing'}, allowed: {', '.join(sorted(allowed))}"
     if origins and [origin.lower() for origin in origins] != [f"http://{hosts[0].lower()}"]:

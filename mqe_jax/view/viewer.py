@@ -106,7 +106,7 @@ class Viewer:
             self.server.stop()
 
     def _open_chosen(self) -> bool:
-        """Opens the session that was chosen on the page, if any; keeps the present one where that is not possible."""
+        """Opens the session that was chosen on the page, if any; keeps the current one if that is not possible."""
         choice = self._panel.take_choice()
         if choice is None or self._menu is None:
             return False

@@ -164,7 +164,7 @@ def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> 
 def _struck(
     model: mujoco.MjModel, data: mujoco.MjData, eye: np.ndarray, points: np.ndarray, groups: np.ndarray
 ) -> np.ndarray:
-    """Returns the first geom on each way from `eye` (3,) to `points` (P, 3); -1 if there is none."""
+    """Returns the first geom on each way from `eye` (3,) to `points` (P, 3); -1 without a hit."""
     ways = points - eye
     lengths = np.linalg.norm(ways, axis=1)
     geoms, distances = np.full(len(points), -1, np.int32), np.zeros(len(points))

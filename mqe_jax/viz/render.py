@@ -51,7 +51,7 @@ def gl_backend() -> str | None:
 
 @cache
 def _working_backend() -> str | None:
-    """Tries the GL libraries, that of `MUJOCO_GL` first; none where it is `disable` or the like.
+    """Tries the GL libraries, that of `MUJOCO_GL` first; none if it is `disable` or the like.
 
     Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's import or crashes.
     """

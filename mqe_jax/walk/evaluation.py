@@ -114,11 +114,17 @@ def measure(env: WalkEnv, params: Params, scenario: Scenario, episodes: int, see
     """Runs one scenario and returns its metrics.
 
     Returns:
-        rms_vx, rms_vy (m/s), rms_yaw (rad/s): root mean square errors from 1 s after a change of command until a fall;
-        cycle_vx, cycle_vy, cycle_yaw: those of the errors' means over the gait cycle that follows; bias_vx, bias_vy,
-        bias_yaw: mean errors likewise; fall_rate: fraction of episodes with a fall; drift: mean distance covered in the
-        10 s after the first, m; step_frequency: median over episodes and feet of the strongest frequency of the foot's
-        height, Hz; cost_of_transport: mean mechanical power of the joints over weight x mean horizontal speed.
+        Values by name. Errors count from 1 s after a change of command until a fall:
+
+        | name | meaning |
+        |---|---|
+        | rms_vx, rms_vy (m/s), rms_yaw (rad/s) | root mean square errors |
+        | cycle_vx, cycle_vy, cycle_yaw | root mean square of errors averaged over the gait cycle that follows |
+        | bias_vx, bias_vy, bias_yaw | mean errors |
+        | fall_rate | fraction of episodes with a fall |
+        | drift | mean distance covered in the 10 s after the first, m |
+        | step_frequency | median over episodes and feet of the strongest frequency of the foot's height, Hz |
+        | cost_of_transport | mean mechanical power of the joints over weight x mean horizontal speed |
     """
     steps, warm = round(scenario.duration / walk_policy.STEP), round(WARM_UP / walk_policy.STEP)
     change = round((scenario.period or scenario.duration) / walk_policy.STEP)

@@ -62,7 +62,7 @@ _COMMANDS = _signs(*(command.mirror for command in walk_policy.COMMANDS))
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """What the network of a skill has of its own."""
+    """What is specific to the network of a skill."""
 
     networks: Networks  # its networks and their files
     rows: np.ndarray  # rows of the history that it sees, from the oldest on; the last one is the newest
@@ -123,7 +123,7 @@ class HistorySettings(GaussianSettings):
     """Weight of the loss of left-right symmetry."""
 
     form: ClassVar[Form]
-    """What the network has of its own."""
+    """What is specific to this network."""
 
     def build(self, dims: EnvDims) -> Network:
         form = self.form

@@ -71,8 +71,8 @@ def reward_terms(
 ) -> dict[str, jax.Array]:
     """Computes all terms (), named as their weights in `WalkRewards`.
 
-    `phases` are those of the feet (4,), `targets` the joint targets of the last three steps, newest first (3, 12),
-    `applied` the one that the motors had; `tolerance` is that of `WalkTask`. The others are as in `WalkState`.
+    `phases` are those of the feet (4,). `targets` are the joint targets of the last three steps, newest first (3, 12),
+    and `applied` the one that the motors had. `tolerance` is that of `WalkTask`. The others are as in `WalkState`.
     """
     target, previous_target, earlier_target = targets
     quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]

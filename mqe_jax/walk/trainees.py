@@ -1,4 +1,4 @@
-"""The skills that the walking task trains: their observations, their gaits, and what they shall be good at."""
+"""The skills that the walking task trains: their observations, their gaits, and the goals of their rewards."""
 
 import abc
 from collections.abc import Callable

@@ -31,7 +31,7 @@ WALK = TrainConfig(
     checkpoint=Checkpointing(every=100, environments=False),
     loggers=(),
 )
-"""Settings for training walk weights from nothing; the assistance is the curriculum of slopes, forces and pushes."""
+"""Settings for training walk weights from scratch; the assistance is the curriculum of slopes, forces and pushes."""
 
 AGILE = override(
     WALK,
@@ -43,7 +43,7 @@ AGILE = override(
         "curriculum.assistance_until": 0.5,
     },
 )
-"""Settings for training the agile skill from nothing; the assistance is the curriculum of commands and disturbances."""
+"""Settings for training the agile skill from scratch; the assistance is the curriculum of commands and disturbances."""
 
 AGILE_TASK = WalkTask(start=0.5, tolerance=2.0, command_period=4.0, slope=0.15, shove=100.0, action_lag=1)
 """The walking task of the agile skill: fast commands, shoves as in contact with robots and boxes, gentle slopes."""

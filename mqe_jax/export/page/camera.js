@@ -52,7 +52,7 @@ export class Camera {
     this.jumps = true;
   }
 
-  /** Fits the picture to the part of the canvas that is not covered by controls; an opened menu is none of them. */
+  /** Fits the picture to the part of the canvas that is not covered by controls; an open menu does not count. */
   resize(width, height, above, below) {
     const bar = Math.min(above, height / 4);
     const free = height - bar - Math.min(below, height / 2);

@@ -41,7 +41,7 @@ class Graph {
     return Object.fromEntries(Object.entries(outputs).map(([name, tensor]) => [name, tensor.data]));
   }
 
-  /** How many numbers an input has, 0 where there is none. */
+  /** How many numbers an input has, 0 if it is missing. */
   size(name) {
     const shape = this.shapes.inputs[name];
     return shape ? shape.slice(1).reduce((a, b) => a * b, 1) : 0;

@@ -254,7 +254,7 @@ class Meter {
     const detail = drawing.low ? 'low' : 'high';
     const version = site.mujoco.mj_versionString();
     element('about').textContent =
-      `${rate.toFixed(0)} pictures per second in ${detail} detail, ${pace.toFixed(1)} x real time, MuJoCo ${version}.`;
+      `${rate.toFixed(0)} frames per second in ${detail} detail, ${pace.toFixed(1)} x real time, MuJoCo ${version}.`;
     Object.assign(this, new Meter());
     if (rate < SLOW && page.detail === 'auto' && !drawing.low && !document.hidden) setDetail(true);
   }

@@ -40,7 +40,7 @@ ROBOT_COLOR_NAMES = ("blue", "green", "red", "orange")
 ROBOT_COLORS: tuple[Color, ...] = _palette(
     ((0.10, 0.47, 0.95, 1.0), (0.22, 0.72, 0.25, 1.0), (0.90, 0.20, 0.17, 1.0), (1.00, 0.58, 0.08, 1.0)), MAX_ROBOTS
 )
-UNNUMBERED = 4  # robots of a scene, at most, that are told apart by their colours and bear no numbers
+UNNUMBERED = 4  # robots of a scene, at most, that differ by colour and bear no numbers
 
 
 def team_colors(size: int) -> tuple[int, ...]:

@@ -143,7 +143,7 @@ def _goal(x: float, depth: float, half: float, height: float, color: Color) -> l
 
 
 def climb(length: float, width: float, top: tuple[float, float, float], size: tuple[float, float, float]) -> Ground:
-    """Returns a running track with a finish line on a platform, given by the centre of its top and its extents, m."""
+    """Returns a running track with a finish line on a platform with this centre of its top and these extents, m."""
     (x, y, z), half = top, size[1] / 2
     base = rectangle((x - size[0] / 2, x + size[0] / 2), (y - half, y + half), WHITE, 1, z)
     line_ = finish(x - size[0] / 2, (y - half, y + half), 10, z)

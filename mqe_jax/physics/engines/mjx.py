@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _BIT, _JACOBIAN = mujoco.mjtDisableBit, mujoco.mjtJacobian
 _FRICTION, _PASSIVE = _BIT.mjDSBL_FRICTIONLOSS, _BIT.mjDSBL_SPRING | _BIT.mjDSBL_DAMPER
-_MAX_DENSE = 50  # degrees of freedom up to which Warp's line search needs no kernels of its own for dense Jacobians
+_MAX_DENSE = 50  # degrees of freedom up to which Warp's line search needs no extra kernels for dense Jacobians
 # Degrees of freedom above which Warp's solver skips zeros by default. On an H200 this gains nothing with four robots
 # (78, the most of the paper) and a third with eight (150): sizes/warp in results/measurements.json.
 _MAX_FULL = 80

@@ -122,7 +122,7 @@ def _capsule_box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> tuple[jax
     """Returns distances (N,), positions (N, 3) and normals (N, 3) where N capsules are nearest to boxes.
 
     The squared distance to the box is a convex, piecewise quadratic function of the position t in [-1, 1] on the
-    capsule's axis: its minimum is between the two breakpoints of its derivative at which the sign changes.
+    capsule's axis. Its minimum is between the two breakpoints of its derivative at which the sign changes.
     """
     capsule, box = geom.T
     turn, half = data.geom_xmat[box], model.geom_size[box]

@@ -75,8 +75,8 @@ def warp_is_installed() -> bool:
 def keep_streams() -> None:
     """Makes Warp remember JAX's streams until the process ends.
 
-    It forgets a stream when the garbage collector finds an old handle to it, even while a step is being recorded on a
-    newer one, which then fails with "unknown stream" (warp 1.18; seen with several environments in one process).
+    Warp forgets a stream when the garbage collector finds an old handle to it, even while a newer handle captures a
+    step. The capture then fails with "unknown stream" (warp 1.18, with several environments in one process).
     """
     stream = importlib.import_module("warp").Stream
     release = stream.__del__
@@ -119,7 +119,7 @@ def with_sparse_newton(model: mjx.Model) -> mjx.Model:
 def _sparse_block_dim() -> type:
     """Returns a type of Warp's block sizes that marks models, whose Newton steps Warp then takes from `newton.py`.
 
-    Of all that MJX hands to Warp, this record is the only one that keeps its type, also in the keys of caches.
+    Of all that MJX hands to Warp, this class is the only one that keeps its type, also in the keys of caches.
     """
     from mujoco.mjx.third_party.mujoco_warp._src import solver
     from mujoco.mjx.warp import types

@@ -3,10 +3,10 @@
 Source: the public Unitree Go1 description (masses, inertias, limits); collision shapes are spheres and capsules,
 which all three engines support.
 
-Motors are those of the simulation in which walk-these-ways was trained (its `go1.urdf`), so that its walk policies and
-the paper's results are comparable: 33.5 N m, and 50 rad/s at the hip, 28 at thigh and calf. Unitree's description
-gives 23.7 N m and 30.1 rad/s, at the calf 35.55 N m and 20.06 rad/s. The torque line of a thigh, 20 N m up to 11.3
-rad/s and zero at 28, is conservative beside a measured curve of the motor: 20.2 N m up to 13.5 rad/s, zero at 30.
+Motors are those of walk-these-ways (its `go1.urdf`): 33.5 N m, and 50 rad/s at the hip, 28 at thigh and calf. Its walk
+policies and the paper's results are then comparable. Unitree's description gives 23.7 N m and 30.1 rad/s, at the calf
+35.55 N m and 20.06 rad/s. The torque line of a thigh is 20 N m up to 11.3 rad/s and zero at 28. A measured curve of the
+motor is higher: 20.2 N m up to 13.5 rad/s, zero at 30.
 """
 
 import numpy as np
@@ -32,8 +32,8 @@ _DARK = (0.19, 0.20, 0.23, 1.0)
 _GREY = (0.36, 0.38, 0.42, 1.0)
 _SILVER = (0.68, 0.70, 0.74, 1.0)
 
-# Trunk box 0.376 x 0.094 x 0.114 and the head box 0.27 ahead of its centre as one capsule, wide enough to leave at most
-# 2 cm of their edges outside; hip cylinders r 0.046; thigh boxes 0.034 x 0.0245; calf boxes 0.016 x 0.016; feet.
+# One capsule covers the trunk's box, 0.376 x 0.094 x 0.114, and the head's, 0.27 ahead of its centre; at most 2 cm of
+# their edges are outside. Hips are cylinders of radius 0.046, thighs boxes 0.034 x 0.0245, calves boxes 0.016 x 0.016.
 _COLLISION = (
     CollisionShape("trunk", capsule(0.065, (-0.125, 0, 0), (0.245, 0, 0))),
     CollisionShape("hip", sphere(0.05, (0, 0.06, 0))),

@@ -3,9 +3,9 @@
 Source: MuJoCo Menagerie's inertial parameters and limits of the Go2 and Unitree's description (motor speeds);
 collision shapes are spheres and capsules, which all three engines support.
 
-Choices for position control and the walk policy: default angles as on the Go1, whose legs have the same lengths; gains
-scale with the mass (15.2 kg against 11.3 kg), kp 30 (Go1: 20) and kd 0.75 (Go1: 0.5), so that sag and damping
-are alike; action scale as on the Go1; torques up to the motors' limits.
+Default angles and action scale for position control and the walk policy are the Go1's, whose legs have the same
+lengths. Gains scale with the mass (15.2 kg against 11.3 kg), which gives equal sag and damping: kp 30 (Go1: 20) and kd
+0.75 (Go1: 0.5). Torques reach the motors' limits.
 """
 
 import numpy as np

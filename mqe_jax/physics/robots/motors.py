@@ -1,15 +1,15 @@
 """Motors: the torque and the speed that a robot's joint motors can give.
 
-A motor gives at most its controller's limit L and at most the torque of a DC motor, S (1 - v / V), in the direction of
-its speed v: S is its stall torque, V its speed limit. Above V it brakes, with L at (1 + `BAND`) V. These bounds are
-evaluated at the start of every physics step.
+A motor has a controller's limit L, and a DC motor's stall torque S and speed limit V. In the direction of its speed v
+it gives at most L and at most S (1 - v / V). Above V it brakes, with L at (1 + `BAND`) V. These bounds are evaluated at
+the start of every physics step.
 
 Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So some joints get an
 armature (rotor inertia) for this physics step. In a leg that is fast, or whose torques can carry it far beyond V within
 the step, it is the implicit form of the braking above V. In a joint whose torque line is too steep for the step (the
-calf of the Go2), it is the implicit form of that line, in proportion to the torque; a free joint then moves as by
-backward Euler. What torques, joint limits and contacts still accelerate beyond `CLAMP` V is set to `CLAMP` V, as PhysX
-does with a joint's velocity limit.
+calf of the Go2), it is the implicit form of that line, in proportion to the torque. A free joint then moves as by
+backward Euler. Speeds beyond `CLAMP` V, from torques, joint limits and contacts, are set to `CLAMP` V, as PhysX does
+with a joint's velocity limit.
 
 The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
 """
@@ -75,9 +75,15 @@ class Motors:
     def limit(self, xp: Any, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> tuple[Any, Any]:
         """Returns the control of one physics step under which the actuators' forces are the motors' torques (..., J).
 
-        It is `ctrl` where the motors can give what is asked. The second result is the armature (..., J), kg m^2. The
-        arguments are control, rad or N m, joint angles and velocities (..., J), and of the actuators, whose force is
-        gain x ctrl + bias, the gain (..., J) and the constant, position and velocity coefficients (..., J, 3).
+        It is `ctrl` if the motors can give its torque. The second result is the armature (..., J), kg m^2.
+
+        Args:
+            xp: numpy or jax.numpy.
+            ctrl: control, rad or N m (..., J).
+            position: joint angles (..., J), rad.
+            velocity: joint velocities (..., J), rad/s.
+            gain: of the actuators, whose force is gain x ctrl + bias (..., J).
+            bias: its constant, position and velocity coefficients (..., J, 3).
         """
         pace = xp.abs(velocity)
         below = self.speed - pace

@@ -124,7 +124,7 @@ def _drive_by_side(obs: Observation) -> jax.Array:
     """Returns the actions (A, 3) of robots that each prefer one side of the flock.
 
     Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, on
-    the robot's side and close to it. Stragglers are thus driven back to the flock, whose cohesion keeps it together.
+    the robot's side and close to it. Stragglers are driven back to the flock, whose cohesion keeps it together.
     Of three robots the middle one prefers no side, and robots keep apart.
     """
     side = _sides(obs)
@@ -148,9 +148,9 @@ def _drive_by_side(obs: Observation) -> jax.Array:
 def plan_sheep_by_distance(obs: Observation) -> jax.Array:
     """Returns the actions (A, 3) of any number of robots, whatever their order.
 
-    Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, for
-    those that the robot is behind, and for those close to it to which no other robot is closer. Robots brake before
-    they touch each other, a sheep or the gate's wall, which would end the episode.
+    Each robot walks behind a weighted mean of the sheep positions. Weights are larger for sheep that are far from the
+    gate, that the robot is behind, or that no other robot is closer to. Robots brake before they touch each other, a
+    sheep or the gate's wall, which would end the episode.
     """
     (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
     through = sheep[:, 0] > gate[0]

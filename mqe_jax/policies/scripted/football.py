@@ -45,7 +45,7 @@ def plan_defender(obs: Observation) -> jax.Array:
 
 def plan_match(obs: Observation) -> jax.Array:
     """Returns the actions (T, 3) of a team in its own frame."""
-    mates = obs.get("teammate", jnp.full_like(obs["base"], 1e3))  # far away where there is none
+    mates = obs.get("teammate", jnp.full_like(obs["base"], 1e3))  # far away without one
     mates, opponents = (x.reshape(len(x), -1, 6)[..., :2] for x in (mates, obs["opponents"]))
     return jax.vmap(_play)(obs["base"], mates, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
 

@@ -73,7 +73,7 @@ def card(task: str) -> Card:
     """Returns the card of a task's shipped policy.
 
     Raises:
-        InputError: where there is none.
+        InputError: if the task has none.
     """
     if task not in names():
         raise InputError(f"policy: none is shipped for {task!r}; shipped: {', '.join(names())}")

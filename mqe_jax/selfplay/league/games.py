@@ -103,8 +103,8 @@ def cycles(payoff: Array) -> float:
 def nash(payoff: Array) -> Array:
     """Returns the weights (P,) of the maximum-entropy Nash equilibrium of a symmetric zero-sum game (P, P).
 
-    Copies of a policy have equal weights, and share that of a unique equilibrium. The payoff of each policy against the
-    equilibrium, `payoff @ nash(payoff)`, is its Nash average: 0 within the support, at most 0 outside.
+    Copies of a policy share its weight equally. The payoff of each policy against the equilibrium,
+    `payoff @ nash(payoff)`, is its Nash average: 0 within the support, at most 0 outside.
     """
     from scipy.linalg import null_space
     from scipy.optimize import linprog
@@ -112,8 +112,8 @@ def nash(payoff: Array) -> Array:
     matrix = (np.asarray(payoff, np.float64) - np.transpose(payoff)) / 2
     matrix /= np.max(np.abs(matrix)) or 1.0
     count = len(matrix)
-    # An equilibrium p in which, for every policy, either its weight or its loss (A p) exceeds a bound, made as large as
-    # possible: the support of p is the largest one (Goldman and Tucker 1956), which is that of maximum entropy.
+    # The linear program maximises a bound: the weight of each policy in p, or its loss A p, exceeds it. The equilibrium
+    # p then has the largest support (Goldman and Tucker 1956), which is that of maximum entropy.
     ones, zeros = np.ones((count, 1)), np.zeros((count, 1))
     loses = np.block([[matrix, zeros], [matrix - np.eye(count), ones]])
     tight = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}

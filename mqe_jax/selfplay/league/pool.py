@@ -15,7 +15,7 @@ class Pool(NamedTuple):
     """M places for members; B stands for blocks of environments."""
 
     arrays: PyTree  # the members' arrays, leading axis M
-    born: jax.Array  # update after which each became a member (M,) int32; -1 where the place is free
+    born: jax.Array  # update after which each became a member (M,) int32; -1 if the place is free
     score: jax.Array  # the learner's wins, and half of its draws, against each (M,)
     games: jax.Array  # games against each (M,)
     rating: jax.Array  # rating of each when it became a member (M,), Elo points

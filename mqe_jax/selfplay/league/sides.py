@@ -13,8 +13,8 @@ from mqe_jax.envs.wrappers import Wrapper
 class BothSides(Wrapper):
     """Matches, in the second half of which team 0 is the task's team 1; outcomes and rewards are the new teams'.
 
-    The privileged observation has one more number: 1 where the teams have changed places, else 0. It makes a difference
-    where a match is symmetric under a reflection: robots walk not quite as their mirror images.
+    The privileged observation has one more number: 1 if the teams have changed places, else 0. It makes a difference
+    even if a match is symmetric under a reflection: mirrored robots do not walk exactly alike.
     """
 
     def __init__(self, inner: Any) -> None:
