@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from mqe_jax.core.errors import InputError
@@ -104,27 +105,48 @@ def test_the_smallest_lead_counts_losses(data: Path) -> None:
 RESPONSES = {"scratch": {"win": 0.5, "draw": 0.25, "loss": 0.25}, "champion": {"win": 0.75, "draw": 0.25, "loss": 0.0}}
 
 
-def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--rates: .* has no results of a part: cooperative, matches, .*, crossplay"):
-        strength_page.copy_rates(tmp_path)
-    before = (data / "matches.csv").read_bytes()
-    write(tmp_path / "population" / "rates.csv", {("go1tug", "plain", "win_rate"): 0.5})
-    mixed = {"task": "go1gate", "same": {"value": 0.5}}
-    place = tmp_path / "crossplay" / "results" / "go1gate" / "plain"
+def save(folder: Path, part: str, task: str, result: Any) -> None:
+    """Writes the result of a call of a part."""
+    place = folder / part / "results" / task / "plain"
     place.mkdir(parents=True)
-    (place / "result.json").write_text(json.dumps({"measure": "tournament", "result": mixed}))
+    (place / "result.json").write_text(json.dumps({"measure": part, "result": {"task": task, **result}}))
+
+
+def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
+    """Those of other tasks stay."""
+    with pytest.raises(InputError, match=r"--rates: .* has no results of a part: cooperative, matches, .*, pools"):
+        strength_page.copy_rates(tmp_path)
+    before = {file.name: file.read_bytes() for file in data.iterdir()}
+    responses, games = strength_page.rows("exploitability"), strength_page.published("oracle")
+    write(tmp_path / "population" / "rates.csv", {("go1tug", "plain", "win_rate"): 0.5})
+    mixed = {"same": {"value": 0.5}}
+    save(tmp_path, "crossplay", "go1gate", mixed)
+    save(tmp_path, "pools", "go1seesaw", {"start": "before", **mixed})
+    save(tmp_path, "oracle", "go1tug", {"rounds": []})
     chosen = {
         f"runs/go1tug/default+{x}/seed20": {n: {"value": v} for n, v in each.items()} for x, each in RESPONSES.items()
     }
-    place = tmp_path / "exploitability" / "results" / "go1tug" / "plain"
-    place.mkdir(parents=True)
-    result = {"task": "go1tug", "episodes": 512, "selection": chosen}
-    (place / "result.json").write_text(json.dumps({"measure": "exploitability", "result": result}))
+    save(tmp_path, "exploitability", "go1tug", {"episodes": 512, "selection": chosen})
     strength_page.copy_rates(tmp_path)
-    scratch, champion = strength_page.rows("exploitability")
+    others = [row for row in strength_page.rows("exploitability") if row["task"] != "go1tug"]
+    assert others == [row for row in responses if row["task"] != "go1tug"]
+    scratch, champion = (row for row in strength_page.rows("exploitability") if row["task"] == "go1tug")
     assert (scratch["from"], scratch["seed"], scratch["wins"], scratch["value"]) == ("scratch", "20", "0.5", "0.25")
-    assert (champion["from"], champion["task"]) == ("champion", "go1tug") and float(champion["value"]) == 0.75
+    assert champion["from"] == "champion" and float(champion["value"]) == 0.75
     assert float(champion["low"]) < 0.75 < float(champion["high"]) <= 1.0
+    assert strength_page.published("oracle") == games | {"go1tug": {"task": "go1tug", "rounds": []}}
+    assert strength_page.published("crossplay_go1gate") == {"task": "go1gate", **mixed}
+    assert strength_page.published("pool_go1seesaw")["start"] == "before"
     assert (data / "population.csv").read_bytes() == (tmp_path / "population" / "rates.csv").read_bytes()
-    assert (data / "matches.csv").read_bytes() == before
-    assert json.loads((data / "crossplay_go1gate.json").read_text("utf-8")) == mixed
+    names = ("population.csv", "exploitability.csv", "oracle.json", "crossplay_go1gate.json", "pool_go1seesaw.json")
+    assert {name: before[name] for name in names} == {
+        file.name: before[file.name] for file in data.iterdir() if file.read_bytes() != before[file.name]
+    }
+
+
+@pytest.mark.parametrize("task", strength_page.POOLS)
+def test_a_pool_of_mates_has_neither_the_team_nor_the_new_mate(task: str) -> None:
+    pool = strength_page.published(f"pool_{task}")
+    part = yaml.safe_load((strength_page.ROOT / "configs" / "strength.yaml").read_text("utf-8"))["pools"]
+    assert len(pool["mates"]) == 3 and not {pool["start"], pool["policies"][-1]} & {*pool["mates"]}
+    assert (pool["start"], [pool["policies"][-1]]) == tuple(part["by_task"][task][name] for name in ("start", "others"))

@@ -1,16 +1,12 @@
 """Sweeps on a probe: what is left, stops at any moment, complete run folders and a report at the end."""
 
-import csv
-import itertools
 import json
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import yaml
 
 from mqe_jax import cli
 from mqe_jax.core.errors import InputError
@@ -19,7 +15,6 @@ from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast
 from mqe_jax.policies import zoo
 from mqe_jax.runs import build as setup
-from mqe_jax.runs import exploiting, measuring, playing
 from mqe_jax.runs.presets import preset
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import read_runs
@@ -277,102 +272,3 @@ def test_one_file_may_hold_several_sweeps(tmp_path: Path) -> None:
     path.write_text("first: {tasks: [go1gate]}\nsecond: {tasks: [go1tug]}")
     assert sweeps.load_sweep(path, "second").tasks == ("go1tug",)
     refuses(r"has no part 'secnd' \(did you mean 'second'\?\); it has: first, second", sweeps.load_sweep, path, "secnd")
-
-
-MEASURES = """
-rates:
-  measure: evaluate
-  tasks: [go1gate, go1tug]
-  arguments: {policy: "{task}", episodes: 100}
-  variants: {scripted: {opponent: scripted}, heavy: {env: {robot: go2, randomization.payload: [3, 3]}}}
-"""
-
-
-def test_a_part_measures_policies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    calls: list[Any] = []
-
-    def evaluate(
-        task: str, policy: Any = None, opponent: Any = None, *, env: Any = None, episodes: int, impl: str
-    ) -> Any:
-        calls.append((task, policy, opponent, env, impl))
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return SimpleNamespace(
-            to_dict=lambda: {"win_rate": 0.5, "episodes": episodes, "intervals": {"win_rate": [0.4, 0.6]}}
-        )
-
-    monkeypatch.setattr(playing, "evaluate", evaluate)
-    file, folder = tmp_path / "strength.yaml", tmp_path / "out"
-    file.write_text(MEASURES)
-    arguments = ["sweep", str(file), "--part", "rates", "--folder", str(folder), "--impl", "c"]
-    assert cli.main([*arguments, "--dry-run"]) == 0
-    assert capfd.readouterr().out.count("go1tug heavy") == 1 and not folder.exists()
-    cli.main(arguments)  # interrupted
-    assert cli.main(arguments) == 0 == cli.main(arguments)
-    assert calls[0] == ("go1gate", "go1gate", "scripted", None, "c") and len(calls) == 5
-    task, policy, _, env, _ = calls[-1]
-    assert (task, policy.task, policy.needs.robot, env["robot"]) == ("go1tug", "go1tug", "go2", "go2")
-    rows = list(csv.DictReader((folder / "rates.csv").open()))
-    assert [(row["task"], row["variant"]) for row in rows] == list(
-        itertools.product(("go1gate", "go1tug"), ("scripted", "heavy"))
-    )
-    assert [rows[0][name] for name in ("rate", "value", "low", "high")] == ["win_rate", "0.5", "0.4", "0.6"]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("measure: evaluates", "measure: 'evaluates' is not allowed; it must be one of evaluate, tournament"),
-        ("tasks: [go1gat]", "did you mean 'go1gate'"),
-        (
-            "arguments: {episode: 3}",
-            "arguments.episode: 3 is not allowed; it must be an argument of evaluate: task, policy",
-        ),
-        (
-            "by_task: {go1tug: {episodes: 64}}",
-            "by_task: 'go1tug' is not allowed; it must be one of the part's tasks: go1g",
-        ),
-        ("by_task: {go1gate: 64}", "by_task.go1gate: 64 is not allowed; it must be a mapping of arguments"),
-        (
-            "arguments: {policy: ['no/*']}",
-            "arguments.policy: 'no/*' is not allowed; it must be a pattern of files that",
-        ),
-    ],
-)
-def test_measurements_that_cannot_be_made_are_named(tmp_path: Path, change: str, message: str) -> None:
-    part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
-    with pytest.raises(InputError, match=re.escape(message)):
-        measuring.plan(build(sweeps.Measurement, part), tmp_path)
-
-
-def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("go1gate-seed1", "go1gate-seed0", "go1tug-seed0"):
-        Path(name).touch()
-    part = {"measure": "tournament", "tasks": ["go1gate", "go1tug"], "arguments": {"policies": ["{task}-*"], "seed": 3}}
-    part |= {
-        "by_task": {"go1tug": {"policies": ["{task}", "{task}-*"], "episodes": 64}},
-        "variants": {"v": {"seed": 4}},
-    }
-    gate, tug = (item.arguments for item in measuring.plan(build(sweeps.Measurement, part), tmp_path))
-    assert gate == {"impl": "auto", "policies": ["go1gate-seed0", "go1gate-seed1"], "seed": 4}
-    assert tug == {"impl": "auto", "policies": ["go1tug", "go1tug-seed0"], "seed": 4, "episodes": 64}
-
-
-def test_published_parts_name_files_and_arguments_that_exist(monkeypatch: Any) -> None:
-    root = Path(__file__).parents[1]
-    monkeypatch.chdir(root)
-    for part in yaml.safe_load((root / "configs" / "strength.yaml").read_text("utf-8")):
-        settings = sweeps.load_part(root / "configs" / "strength.yaml", part)
-        assert isinstance(settings, sweeps.Measurement) and measuring.plan(settings, root / "none")
-
-
-def test_a_measurement_that_trains_has_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = {"exploitability_lower_bound": {"value": 0.2}}
-    monkeypatch.setattr(exploiting, "exploitability", lambda task, policy, folder, impl: {**found, "folder": folder})
-    part = {"measure": "exploitability", "tasks": ["go1tug"], "arguments": {"policy": "{task}"}}
-    measuring.measure(build(sweeps.Measurement, part), tmp_path)
-    place = tmp_path / "results" / "go1tug" / "plain"
-    assert json.loads((place / "result.json").read_text())["result"] == {**found, "folder": str(place / "runs")}

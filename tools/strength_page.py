@@ -1,8 +1,9 @@
 """Fills tables of docs/results/strength.md, mates.md and skills.md and draws their pictures from results/strength.
 
 `python tools/strength_page.py` reads the rates that `mqe sweep configs/strength.yaml --part PART` measured, as
-results/strength/PART.csv, mixed teams in crossplay_TASK.json and best responses in exploitability.csv. `python
-tools/strength_page.py --rates FOLDER` first copies the results of every part that is below FOLDER. The table of other
+results/strength/PART.csv, mixed teams in crossplay_TASK.json and pool_TASK.json, best responses in exploitability.csv
+and double oracles in oracle.json. `python tools/strength_page.py --rates FOLDER` first copies the results of every part
+that is below FOLDER; best responses, double oracles and mixed teams of tasks that it lacks stay. The table of other
 conditions has a row for each task that is measured under all of them.
 """
 
@@ -27,12 +28,13 @@ ROOT = Path(__file__).parents[1]
 DATA, PAGES = ROOT / "results" / "strength", ROOT / "docs" / "results"
 SECTIONS = {
     "strength.md": ("cooperative", "matches", "population", "exploitability", "robustness"),
-    "mates.md": ("mates",),
+    "mates.md": ("mates", "pools"),
     "skills.md": ("walk",),
 }
 """Filled sections of each page."""
 COOPERATIVE = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender")
 MATCHES = ("go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
+POOLS = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1football-defender")
 PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
 EPISODES, MEMBER_EPISODES = 512, 256
 CONDITIONS = {
@@ -178,11 +180,25 @@ def walk(found: Rates) -> str:
     return table(("match", "walking team", "agile team"), body)
 
 
+def published(name: str) -> dict[str, Any]:
+    """Returns the content of a published JSON file."""
+    return json.loads((DATA / f"{name}.json").read_text("utf-8"))
+
+
 def mates(task: str) -> dict[str, Rate]:
     """Returns means over mixed teams by name, the `worst` pair, and `gap`, by which teams of one seed are better."""
-    data = json.loads((DATA / f"crossplay_{task}.json").read_text("utf-8"))
+    data = published(f"crossplay_{task}")
     names = ("same", "cross", "gap", "worst", *data["references"])
     return {name: Rate(*(data[name][key] for key in Rate._fields)) for name in names}
+
+
+def team(task: str, first: str, second: str) -> Rate:
+    """Returns the success of a team whose agent 0 follows one policy, the others another one."""
+    for data in (published(f"pool_{task}"), published(f"crossplay_{task}")):
+        if {first, second} <= {*data["policies"]}:
+            i, j = (data["policies"].index(name) for name in (first, second))
+            return Rate(*(data["success"][key][i][j] for key in Rate._fields))
+    raise InputError(f"results/strength: has no team of {first} and {second}")
 
 
 def drawn_mates(task: str) -> dict[str, tuple[Rate]]:
@@ -196,6 +212,17 @@ def mixed() -> str:
     head = ("own mate", "other seed", "difference, points", "worst pair", "scripted mate", "idle mate")
     body = [[f"`{task}`", *(each.percent for each in mates(task).values())] for task in COOPERATIVE]
     return table(("task", *head), body)
+
+
+def pools() -> str:
+    """Returns the table of teams before and after they trained with a pool of mates."""
+    body = []
+    for task in POOLS:
+        data = published(f"pool_{task}")
+        before, after, new = data["start"], data["policies"][0], data["policies"][-1]
+        pairs = ((before, before), (after, after), (new, before), (new, after))
+        body.append([f"`{task}`", *(team(task, *pair).percent for pair in pairs)])
+    return table(("task", "own mate: before", "after", "new mate as agent 0: before", "after"), body)
 
 
 def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -> bytes:
@@ -271,6 +298,7 @@ def tables() -> dict[str, str]:
         "exploitability": exploitability(),
         "robustness": robustness(robust_rates()),
         "mates": mixed(),
+        "pools": pools(),
         "walk": walk(rates("matches")),
     }
 
@@ -295,32 +323,43 @@ def pictures() -> dict[str, bytes]:
     }
 
 
-def leads(results: Sequence[dict[str, Any]]) -> str:
-    """Returns as CSV how all best responses fare in the episodes that choose one, from results of `mqe exploit`."""
+def leads(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns rows of how all best responses fare in the episodes that choose one, from results of `mqe exploit`."""
     body: list[dict[str, Any]] = []
-    for result in sorted(results, key=lambda each: each["task"]):
-        for run, found in result["selection"].items():
+    for result in found:
+        for run, rates in result["selection"].items():
             (cell, seed), episodes = Path(run).parts[-2:], result["episodes"]
-            win, draw, loss = (found[name]["value"] for name in ("win", "draw", "loss"))
+            win, draw, loss = (rates[name]["value"] for name in ("win", "draw", "loss"))
             own = {"task": result["task"], "from": cell.split("+")[1], "seed": seed.removeprefix("seed")}
             own |= {"actions": "sampled", "episodes": episodes, "wins": win, "draws": draw, "losses": loss}
             body.append(own | lead(Rate.of(win, episodes), Rate.of(loss, episodes), episodes)._asdict())
-    return runs.table(body)
+    return body
+
+
+def results(folder: Path, part: str) -> list[dict[str, Any]]:
+    """Returns the results of a part's calls below a folder."""
+    files = sorted(folder.glob(f"{part}/results/*/plain/result.json"))
+    return [json.loads(file.read_text("utf-8"))["result"] for file in files]
 
 
 def copy_rates(folder: Path) -> None:
-    """Copies the rates and mixed teams of the parts below a folder; InputError without any."""
+    """Copies the results of the parts below a folder; InputError without any."""
     tables = {f"{part}.csv": folder / part / "rates.csv" for part in PARTS}
     contents = {name: file.read_bytes() for name, file in tables.items() if file.is_file()}
-    if responses := [
-        json.loads(x.read_text("utf-8")) for x in folder.glob("exploitability/results/*/plain/result.json")
-    ]:
-        contents["exploitability.csv"] = leads([each["result"] for each in responses]).encode()
-    for file in folder.glob("crossplay/results/*/plain/result.json"):
-        result = json.loads(file.read_text("utf-8"))["result"]
-        contents[f"crossplay_{result['task']}.json"] = f"{json.dumps(result)}\n".encode()
+    if responses := results(folder, "exploitability"):
+        tasks = {result["task"] for result in responses}
+        others = [row for row in rows("exploitability") if row["task"] not in tasks]
+        both = sorted([*others, *leads(responses)], key=lambda row: row["task"])
+        contents["exploitability.csv"] = runs.table(both).encode()
+    if oracles := results(folder, "oracle"):
+        content = published("oracle") | {result["task"]: result for result in oracles}
+        contents["oracle.json"] = f"{json.dumps(content)}\n".encode()
+    for part, name in (("crossplay", "crossplay"), ("pools", "pool")):
+        for result in results(folder, part):
+            contents[f"{name}_{result['task']}.json"] = f"{json.dumps(result)}\n".encode()
     if not contents:
-        raise InputError(f"--rates: {folder} has no results of a part: {', '.join(PARTS)}, exploitability, crossplay")
+        parts = ", ".join((*PARTS, "exploitability", "oracle", "crossplay", "pools"))
+        raise InputError(f"--rates: {folder} has no results of a part: {parts}")
     for name, content in contents.items():
         write_atomically(DATA / name, content)
 

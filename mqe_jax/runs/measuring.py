@@ -5,6 +5,7 @@ import glob
 import inspect
 import json
 import pkgutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from mqe_jax.core.settings import fail
 from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy
 from mqe_jax.study.runs import table
-from mqe_jax.study.sweep import Measurement, for_task
+from mqe_jax.study.sweep import Measurement, for_task, matching
 from mqe_jax.train.policy import TrainedPolicy
 
 MEASURES = {
@@ -23,8 +24,9 @@ MEASURES = {
     "tournament": "mqe_jax.runs.playing:tournament",
     "exploitability": "mqe_jax.runs.exploiting:exploitability",
     "double_oracle": "mqe_jax.runs.exploiting:double_oracle",
+    "pool_of_mates": "mqe_jax.runs.pooling:pool_of_mates",
 }
-"""Functions of the front door by the name in `measure`. Those with a folder get that of the measurement."""
+"""Functions by the name in `measure`. Those with a folder get that of the measurement."""
 RESULT, RATES = "result.json", "rates.csv"
 
 
@@ -69,10 +71,17 @@ def _with_files(name: str, value: Any) -> Any:
     return found
 
 
-def measure(part: Measurement, folder: Path, impl: str = "auto", *, dry_run: bool = False) -> dict[str, Any]:
-    """Makes the measurements of a part whose results are not there, and tabulates the rates; see `sweep`."""
+def measure(
+    part: Measurement, folder: Path, impl: str = "auto", cells: Sequence[str] = (), *, dry_run: bool = False
+) -> dict[str, Any]:
+    """Makes the measurements of a part whose results are not there, and tabulates the rates; see `sweep`.
+
+    With `cells`, it makes only those whose names, TASK/VARIANT, match a pattern.
+    """
     items = plan(part, folder, impl)
-    for item in items:
+    names = {f"{item.task}/{item.variant}": item for item in items}
+    chosen = [names[name] for name in matching(names, cells, "*/plain")]
+    for item in chosen:
         if dry_run or item.file.is_file():
             continue
         try:
@@ -89,7 +98,7 @@ def measure(part: Measurement, folder: Path, impl: str = "auto", *, dry_run: boo
     if rows:
         write_atomically(folder / RATES, table(rows).encode())
     left = [
-        {"task": x.task, "variant": x.variant, "steps_left": 0, "seconds": None} for x in items if not x.file.is_file()
+        {"task": x.task, "variant": x.variant, "steps_left": 0, "seconds": None} for x in chosen if not x.file.is_file()
     ]
     total = {"steps_left": 0, "seconds": None}
     return {"left": {"jobs": left, **total}, "report": [str(folder / RATES)] if rows else []}

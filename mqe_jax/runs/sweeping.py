@@ -7,17 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from mqe_jax.core.errors import InputError, NonFiniteError, one_line
+from mqe_jax.core.files import write_atomically
 from mqe_jax.core.limits import Positive, Seed
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, check_arguments
+from mqe_jax.core.settings import PathText, check_arguments, fail, to_mapping
 from mqe_jax.envs.registry import task_id
 from mqe_jax.runs import build
 from mqe_jax.runs.measuring import measure
 from mqe_jax.runs.presets import base_config
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
-from mqe_jax.study.sweep import Job, Measurement, load_part
+from mqe_jax.study.sweep import Job, Measurement, Sweep, load_part
 from mqe_jax.train.config import TrainConfig
 
 
@@ -49,7 +52,7 @@ def sweep(
         file: YAML file with the fields of `mqe_jax.study.sweep.Sweep` or `Measurement`.
         folder: folder of the sweep; runs go into runs/, the report into report/.
         part: name of one sweep in a file that maps names to sweeps.
-        cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT]. Default: all.
+        cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT], or to measure, TASK/VARIANT. Default: all.
         seeds: seeds to train. Default: all.
         time_limit: time after which the training in progress is saved and the sweep ends, min. Default: none.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
@@ -64,7 +67,10 @@ def sweep(
     """
     settings, folder, began = load_part(Path(file), part), Path(folder), time.monotonic()
     if isinstance(settings, Measurement):
-        return measure(settings, folder, impl, dry_run=dry_run)
+        for name, value in {"seeds": seeds, "time_limit": time_limit}.items():
+            if value:
+                fail(name, value, "left out: the part measures policies")
+        return measure(settings, folder, impl, cells, dry_run=dry_run)
     for task in settings.tasks:
         task_id(task)
 
@@ -97,6 +103,17 @@ def sweep(
         names = _names([job for job, _ in failed])
         raise kind(f"cells: {len(failed)} of {len(jobs)} trainings failed: {names}")
     return {"left": _estimate(folder, left), "report": [str(file) for file in files]}
+
+
+def trained(plan: Sweep, folder: Path, file: str, impl: str) -> list[Path]:
+    """Trains all runs of a sweep, which it writes into a file of its folder, and returns theirs, cell by cell.
+
+    InputError if trainings failed or are left to other processes.
+    """
+    write_atomically(folder / file, yaml.safe_dump(to_mapping(plan), sort_keys=False).encode())
+    if left := sweep(folder / file, folder, impl=impl)["left"]["jobs"]:
+        raise InputError(f"folder: {folder} has {len(left)} unfinished trainings; the same command resumes them")
+    return [folder / "runs" / cell.path / f"seed{seed}" for cell in sweeps.select(plan) for seed in plan.seeds]
 
 
 def _names(jobs: Sequence[Job]) -> str:

@@ -9,7 +9,7 @@ import contextlib
 import fnmatch
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -70,7 +70,7 @@ class Measurement:
     """Settings of a part that measures policies: a call for every combination of tasks and variants."""
 
     measure: str
-    """What is called: evaluate, tournament, exploitability or double_oracle, as in `mqe_jax`."""
+    """What is called: evaluate, tournament, exploitability or double_oracle, as in `mqe_jax`, or pool_of_mates."""
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     arguments: Mapping[str, Any] = FrozenMapping()
@@ -131,14 +131,19 @@ def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
     """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all without patterns."""
     product = itertools.product(sweep.tasks, sweep.algorithms, sweep.variants)
     cells = {cell.path.as_posix(): cell for cell in itertools.starmap(Cell, product)}
-    wanted = set()
+    return [cells[name] for name in matching(cells, patterns, "*/mat")]
+
+
+def matching(names: Iterable[str], patterns: Sequence[str], example: str) -> list[str]:
+    """Returns the names of cells that match a pattern, all without patterns; InputError for one that matches none."""
+    known, wanted = [*names], set[str]()
     for pattern in patterns or ("*",):
-        found = [name for name in cells if fnmatch.fnmatchcase(name, pattern)]
+        found = [name for name in known if fnmatch.fnmatchcase(name, pattern)]
         if not found:
-            allowed = f"allowed: {', '.join(cells)}, or patterns such as */mat"
-            raise InputError(f"cells: {pattern!r} matches no cell{nearest(pattern, cells)}; {allowed}")
+            allowed = f"allowed: {', '.join(known)}, or patterns such as {example}"
+            raise InputError(f"cells: {pattern!r} matches no cell{nearest(pattern, known)}; {allowed}")
         wanted.update(found)
-    return [cell for name, cell in cells.items() if name in wanted]
+    return [name for name in known if name in wanted]
 
 
 def plan(
