@@ -48,19 +48,27 @@ class Sensor:
         raise NotImplementedError(f"sensor {type(self).__name__}: layout() is not defined")
 
     def init_memory(self, scene: SensedScene) -> Any:
-        """Returns its recurrent state at the start of an episode, a pytree of arrays."""
+        """Returns its recurrent state (`memory`) at the start of an episode, a pytree of arrays."""
         return ()
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the readings of all agents by block (A, width), each in its own frame, and the next memory."""
+        """Returns the readings of all agents by block (A, width), each in its own frame, and the next memory.
+
+        Args:
+            scene: what does not change, such as `num_agents`, `dt`, and `mirror` (A,), by which angles to the left are
+                multiplied.
+            snapshot: the step: poses of robots and entities, and each agent's pose in its own frame.
+            memory: what the last call returned, at first `init_memory(scene)`; always the same shapes.
+            key: a random key, one for all agents: draw arrays (A, ...).
+        """
         raise NotImplementedError(f"sensor {type(self).__name__}: observe() is not defined")
 
     def draw(
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
-        """Returns what shows its latest readings by block (A, width), as policies get them but for their scale."""
+        """Returns the marks that `--sensors` draws, for the latest readings by block (A, width), unscaled."""
         return ()
 
 

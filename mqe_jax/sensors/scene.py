@@ -186,7 +186,10 @@ class SensedScene:
 
 
 def reach(scene: SensedScene, snapshot: Snapshot, direction: jax.Array, limit: float) -> jax.Array:
-    """Returns how far each agent's rays (A, N, 2) get from its trunk's centre (A, N), m, at most `limit`."""
+    """Returns how far each agent's rays get from its trunk's centre (A, N), m, at most `limit`.
+
+    `direction` (A, N, 2) has unit vectors in the frame of `Snapshot.places`.
+    """
 
     def read(origin: jax.Array, direction: jax.Array, radius: jax.Array) -> jax.Array:
         circles = jnp.concatenate([snapshot.circles[:, :2], radius[:, None]], axis=-1)

@@ -75,6 +75,16 @@ def resolve(source: Any, task: str) -> Any:
 def add(version: str, task: str, member: str, policy: Trained | None = None, folder: str | Path | None = None) -> None:
     """Adds a member to a new population: a policy, its parameters as float16, or without one the name of a policy.
 
+    A published population never changes, so that results stay comparable. Without `folder`, the package's own is used.
+
+    Example:
+        ```python
+        from mqe_jax.policies.zoo import population
+
+        population.add("1", "go1tug", "scripted", folder="population")
+        population.add("1", "go1tug", "late", mqe_jax.load_policy("go1tug"), folder="population")
+        ```
+
     InputError for a member that exists, one too many, or a policy whose file is too large.
     """
     folder = FOLDER if folder is None else Path(folder)
