@@ -263,10 +263,16 @@ def league() -> Figure:
 
 
 def curves() -> Figure:
-    """Success in evaluations during trainings with tuned settings."""
+    """Success in evaluations during trainings with tuned settings, but `network.openrl_layers: false`."""
     with gzip.open(ROOT / "results" / "paper" / "evaluations.csv.gz", "rt", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if (row["variant"], row["kind"]) == ("tuned", "training")]
-    return _curves(rows, "sampled/success_rate", {"go1gate": "Narrow Gate", "go1pushbox": "Push Box"}, 2.8, (0, 102))
+    return _curves(
+        rows,
+        "sampled/success_rate",
+        {"go1gate": "Narrow Gate, plain layers", "go1pushbox": "Push Box, plain layers"},
+        2.8,
+        (0, 102),
+    )
 
 
 def students() -> Figure:
