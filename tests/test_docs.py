@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+import itertools
 import json
 import os
 import re
@@ -190,6 +191,18 @@ def check_commands(text: str) -> None:
 @pytest.mark.parametrize("page", NAMES)
 def test_commands_on_pages_exist(page: str) -> None:
     check_commands(read(page))
+
+
+@pytest.mark.parametrize("page", [name for name in NAMES if name != "SECURITY.md"])
+def test_a_page_begins_with_a_command_or_code_that_works(page: str) -> None:
+    """The first command has no placeholder, and reads no file or run that is not in the repository."""
+    language, code = re.findall(r"^```(\w+)\n(.*?)^```", read(page), re.DOTALL | re.MULTILINE)[0]
+    assert language in ("bash", "python")
+    if language == "bash":
+        words = commands(f"```bash\n{code}```")[0]
+        assert [word for word in words if re.fullmatch(r"[A-Z][A-Z_:]+(\.\w+)?", word)] == []
+        read_paths = [b for a, b in itertools.pairwise(words) if "/" in b and a not in ("-o", "--run-dir", "--folder")]
+        assert [path for path in read_paths if not any(ROOT.glob(path)) and not path.startswith("population/")] == []
 
 
 def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
