@@ -22,7 +22,7 @@ class Entities:
     width: int
     """Number of entries of each, without its mask."""
     masked: bool = False
-    """Whether a last entry of each says if it is there, 1 or 0; the others of one that is not there are 0."""
+    """Whether each has a last entry, 1 if it is there; all entries of one that is not there are 0."""
 
 
 @dataclasses.dataclass(frozen=True)

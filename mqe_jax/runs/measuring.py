@@ -1,4 +1,4 @@
-"""Parts of a sweep that measure policies: evaluations, tournaments and whatever else returns a result by one call."""
+"""Parts of a sweep that measure policies: evaluations, tournaments and other calls that return a result."""
 
 import dataclasses
 import glob

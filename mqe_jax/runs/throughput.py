@@ -73,7 +73,7 @@ def bench(
     An environment step is one step of one environment. `env_steps_per_s` includes everything: control, skill, physics
     steps, observations, sensors, rewards and automatic resets, under random actions sampled inside the same scan.
     `bare_env_steps_per_s` is the same scene and number of physics steps under constant control, without skill, reward
-    and resets. Both are medians; `slowest` and `fastest` are the range of the former. `compile_s` is the first call
+    and resets. Both are medians; `slowest` and `fastest` are the range of the first. `compile_s` is the first call
     minus the median call. `overflow` counts the environment steps of one call in which the engine may have dropped
     contacts or constraints.
 

@@ -30,7 +30,7 @@ from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
 from mqe_jax.skills import Command, Skill, register
 from mqe_jax.skills.weights import Networks, Params, layers
 
-OFFSETS = (8, 4, 2, 1, 0)  # steps before the present one
+OFFSETS = (8, 4, 2, 1, 0)  # steps before the current one
 LENGTH = max(OFFSETS) + 1
 FRAME_SIZE = 3 + 3 * NUM_JOINTS
 NOW_SIZE = 5  # commands and clock

@@ -93,8 +93,8 @@ class Curriculum:
     assistance_until: Positive = 0.5
     """Fraction of training after which the assistance is 0."""
     demonstrator: str | None = None
-    """Policy in states of whose episodes training episodes start, with the probability `assistance`: scripted, a run
-    folder or a policy file; none starts all as the task does."""
+    """Policy whose episodes provide initial states, with the probability `assistance`: scripted, a run folder or a
+    policy file; none starts all episodes as the task does."""
     failure_bootstrap: Fraction = 0.0
     """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
     only its penalty, not the future return, which encourages exploration."""
@@ -141,7 +141,7 @@ class LeagueSettings:
     snapshot_steps: Steps = 3_000_000
     """Environment steps after which the policy becomes a member."""
     snapshot_win_rate: Fraction = 0.7
-    """Mean win rate against the members from which it becomes one already after a quarter of these steps."""
+    """Mean win rate against the members at which the policy joins them after a quarter of these steps."""
     episodes: Episodes = 200
     """Episodes of a block of environments against a member until it plays another one."""
 
@@ -197,9 +197,9 @@ class TrainConfig:
     policy itself), older (a member of the league's pool, preferably one that is hard to beat) or uniform (any member).
     Opponents share the environments equally. Without any, both teams of each match learn."""
     mates: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _MATE] = ()
-    """Pool of mates in a task of one team, in training and its evaluations: what `opponents` accept but newest, older
-    and uniform. Each has an equal share of the environments, in which it acts for one robot and the policy learns as
-    the others. In one more share the policy acts for the whole team."""
+    """Pool of mates in a task of one team, in training and its evaluations: what `opponents` accept, except newest,
+    older and uniform. Each has an equal share of the environments, in which it acts for one robot and the policy learns
+    as the others. In one more share the policy acts for the whole team."""
     both_sides: bool = False
     """Whether the policy plays its opponents as the task's team 1 in half of the environments, in evaluations too."""
     draw_reward: float = 0.0
@@ -233,7 +233,7 @@ class TrainConfig:
     normalization: Normalization = Normalization()
     checkpoint: Checkpointing = Checkpointing()
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
-    """Loggers besides metrics.csv: tensorboard (where tensorboardX is installed), wandb (offline unless
+    """Loggers besides metrics.csv: tensorboard (if tensorboardX is installed), wandb (offline unless
     WANDB_MODE=online is set)."""
     evaluation: EvaluationSettings = EvaluationSettings()
 

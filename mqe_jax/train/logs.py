@@ -56,7 +56,7 @@ class CsvLog(MetricsLog):
             self._path.unlink(missing_ok=True)
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Appends one row; a new name adds a column, and a file that somebody removed begins anew."""
+        """Appends one row; a new name adds a column, and a removed file begins anew."""
         new = [name for name in row if name not in self._columns]
         if new or not self._path.exists():
             _, rows = _read_rows(self._path, math.inf)
@@ -108,7 +108,7 @@ def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]
 
 
 class TensorBoardLog(MetricsLog):
-    """TensorBoard events where tensorboardX is installed, otherwise nothing.
+    """TensorBoard events if tensorboardX is installed, otherwise nothing.
 
     TensorBoard's writer has a thread that dies if the disk is full, and the training would wait for it for ever.
     """

@@ -1,4 +1,4 @@
-"""Policies: whatever acts for a team, and the trained ones, which are saved, loaded and exchanged."""
+"""Policies: the protocol of what acts for a team, and trained policies, which are saved, loaded and exchanged."""
 
 import dataclasses
 import functools

@@ -93,7 +93,7 @@ def slab(center: Place, size: Place, color: Color) -> Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Ground:
-    """What the ground of a scene, and whatever stands on it, looks like."""
+    """Looks of the ground of a scene and of what stands on it."""
 
     color: Color = MEADOW  # colour of the plane
     shapes: tuple[Shape, ...] = ()  # what is painted on it or stands on it
