@@ -2,7 +2,7 @@
 
     python examples/brax_ppo.py --csv brax_ppo.csv
 
-needs `pip install 'mqe-jax[brax]'`.
+needs `pip install -e '.[brax]'`, in the repository's folder.
 """
 
 import argparse

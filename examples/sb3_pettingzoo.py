@@ -1,6 +1,6 @@
 """Trains Climb on Seesaw with Stable-Baselines3's PPO, one policy for all agents, through PettingZoo and SuperSuit.
 
-    pip install 'mqe-jax[pettingzoo]' stable-baselines3 supersuit
+    pip install -e '.[pettingzoo]' stable-baselines3 supersuit
     python examples/sb3_pettingzoo.py --csv sb3.csv
 
 SuperSuit steps environments sequentially: the example demonstrates compatibility, not speed.

@@ -1,6 +1,6 @@
 """Trains a task with TorchRL's multi-agent PPO, a central critic and shared parameters, through PettingZoo.
 
-    pip install 'mqe-jax[pettingzoo]' torchrl
+    pip install -e '.[pettingzoo]' torchrl
     python examples/torchrl_mappo.py --csv torchrl.csv
     python examples/torchrl_mappo.py --task go1tug --opponent idle
 
