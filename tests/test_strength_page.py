@@ -66,6 +66,14 @@ def test_mixed_teams_of_a_page_are_those_of_their_rates(task: str) -> None:
     assert len(found["policies"]) == 5 and all(zoo.card(name).mode == "sampled" for name in shipped)
 
 
+def test_every_file_has_its_command_date_and_hardware() -> None:
+    about = json.loads((strength_page.ROOT / "results" / "measurements.json").read_text("utf-8"))["strength/data"]
+    assert about["date"] and about["columns"] == ["files", "command", "hardware"]
+    for file in filter(Path.is_file, strength_page.DATA.iterdir()):
+        (row,) = (row for row in about["rows"] if file.match(row[0]))
+        assert row[1].startswith("mqe sweep configs/strength.yaml --part ") and row[2], file.name
+
+
 def test_every_match_has_best_responses_of_two_seeds() -> None:
     kinds = [(row["task"], row["seed"], row["from"]) for row in strength_page.rows("exploitability")]
     for task in strength_page.MATCHES:

@@ -1,4 +1,4 @@
-"""Fills tables of docs/results/strength.md, mates.md and skills.md and draws their pictures from results/strength.
+"""Fills tables of pages in docs/results and draws their pictures from results/strength.
 
 `python tools/strength_page.py` reads the rates that `mqe sweep configs/strength.yaml --part PART` measured, as
 results/strength/PART.csv, mixed teams in crossplay_TASK.json and pool_TASK.json, best responses in exploitability.csv
@@ -20,14 +20,16 @@ from paper_page import filled, reduced
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
-from mqe_jax.policies import zoo
 from mqe_jax.study import runs
 from mqe_jax.train.evaluate import Rate
 
 ROOT = Path(__file__).parents[1]
 DATA, PAGES = ROOT / "results" / "strength", ROOT / "docs" / "results"
 SECTIONS = {
-    "strength.md": ("cooperative", "matches", "population", "exploitability", "robustness"),
+    "strength.md": ("strength",),
+    "population.md": ("population",),
+    "exploitability.md": ("exploitability",),
+    "robustness.md": ("robustness",),
     "mates.md": ("mates", "pools"),
     "skills.md": ("walk",),
 }
@@ -70,14 +72,11 @@ def rate(row: dict[str, str]) -> Rate:
     return Rate(float(row["value"]), float(row["low"]), float(row["high"]))
 
 
-def rates(part: str, by: str = "variant") -> Rates:
-    """Returns the rates of a part of the sweep, none if it is not measured; `by` is the column that names variants.
-
-    By actions, policies that are not trained keep their variant's name.
-    """
+def rates(part: str) -> Rates:
+    """Returns the rates of a part of the sweep; the result is empty if it is not measured."""
     if not (DATA / f"{part}.csv").is_file():
         return {}
-    return {(row["task"], row[by] or row["variant"], row["rate"]): rate(row) for row in rows(part)}
+    return {(row["task"], row["variant"], row["rate"]): rate(row) for row in rows(part)}
 
 
 def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
@@ -86,26 +85,20 @@ def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     return "\n".join((first, "|" + "---|" * len(head), *others))
 
 
-def cooperative(found: Rates) -> str:
-    """Returns the table of success and of what ends episodes early; `found` has rates by actions."""
-    body = []
-    for task in COOPERATIVE:
-        actions = "mean" if zoo.card(task).mode == "deterministic" else "sampled"
-        early = sum(found[task, actions, f"ending/{name}"].value for name in ("fall", "collision"))
-        success = found[task, actions, "success_rate"]
-        body.append([f"`{task}`", actions, success.percent, Rate.of(early, EPISODES).percent])
-    return table(("task", "actions", "success", "falls and collisions"), body)
-
-
 def against(found: Rates, task: str, opponent: str) -> tuple[Rate, Rate]:
     """Returns wins against an opponent and losses to it."""
     return found[task, opponent, "win_rate"], found[task, opponent, "loss_rate"]
 
 
-def matches(found: Rates) -> str:
-    """Returns the table of wins and losses against the scripted team."""
-    body = [[f"`{task}`", *(each.percent for each in against(found, task, "scripted"))] for task in MATCHES]
-    return table(("match", "wins", "losses"), body)
+def strength(alone: Rates, met: Rates) -> str:
+    """Returns the table of success, or of wins against the scripted team, and of what else episodes end with."""
+    body = []
+    for task in COOPERATIVE:
+        early = sum(alone[task, "shipped", f"ending/{name}"].value for name in ("fall", "collision"))
+        found = alone[task, "shipped", "success_rate"], Rate.of(early, EPISODES)
+        body.append([f"`{task}`", *(each.percent for each in found)])
+    body += [[f"`{task}`", *(each.percent for each in against(met, task, "scripted"))] for task in MATCHES]
+    return table(("task", "success or wins", "falls and collisions, or losses"), body)
 
 
 def members(found: Rates, task: str) -> dict[str, list[Rate]]:
@@ -292,8 +285,7 @@ def draw_heat(found: Rates) -> bytes:
 def tables() -> dict[str, str]:
     """Returns the tables of the pages by section."""
     return {
-        "cooperative": cooperative(rates("cooperative", by="actions")),
-        "matches": matches(rates("matches")),
+        "strength": strength(rates("cooperative"), rates("matches")),
         "population": population(rates("population")),
         "exploitability": exploitability(),
         "robustness": robustness(robust_rates()),
@@ -305,17 +297,14 @@ def tables() -> dict[str, str]:
 
 def pictures() -> dict[str, bytes]:
     """Returns the pictures by file name."""
-    success = {key[:2]: value for key, value in rates("cooperative", by="actions").items() if key[2] == "success_rate"}
-    teams = {
-        task: {each: (success[task, each],) for each in ("sampled", "mean", "scripted") if (task, each) in success}
-        for task in COOPERATIVE
+    alone, met, fixed = rates("cooperative"), rates("matches"), rates("population")
+    teams: dict[str, dict[str, Sequence[Rate]]] = {
+        task: {each: (alone[task, each, "success_rate"],) for each in ("shipped", "scripted")} for task in COOPERATIVE
     }
-    met, fixed = rates("matches"), rates("population")
-    opponents = {t: {each: against(met, t, each) for each in ("scripted", "idle", "random", "copy")} for t in MATCHES}
+    teams |= {t: {each: against(met, t, each) for each in ("scripted", "idle", "random", "copy")} for t in MATCHES}
     label = "wins (blue), draws (white) and losses (red), %"
     return {
-        "success.png": draw_rates(teams, "success, %"),
-        "wins.png": draw_rates(opponents, label),
+        "strength.png": draw_rates(teams, f"success, or {label}"),
         "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
         "mates.png": draw_rates({task: drawn_mates(task) for task in COOPERATIVE}, "success, %"),
         "robustness.png": draw_heat(robust_rates()),
