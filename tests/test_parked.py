@@ -133,6 +133,13 @@ def test_a_frozen_robot_is_observed_as_if_it_took_no_part(task: str) -> None:
     assert not late[~np.asarray(states.active)].any() and (late.sum(axis=1) == 1).mean() > 0.9
 
 
+@pytest.mark.parametrize("params", [{"fewest_agents": 2}, {"num_agents": 1, "fewest_sheep": 3}])
+def test_teams_of_one_observe_entities_in_scenes_that_vary(params: dict[str, int]) -> None:
+    env = make(BALL if "fewest_agents" in params else SHEEP, impl="c", num_envs=1, **params)
+    state = jax.eval_shape(lambda key: env.with_observations(env.begin(key), [ENTITIES]), jax.random.PRNGKey(0))
+    assert state.groups[ENTITIES].shape == (env.num_agents, env.group_sizes[ENTITIES])
+
+
 @pytest.mark.parametrize("task", [BALL, SHEEP])
 def test_pictures_show_those_who_take_part(task: str) -> None:
     env, data = sized(task, True), begun(task).data

@@ -174,10 +174,14 @@ def _poses(env: Any, agents: int) -> np.ndarray:
 
 
 def robots_there(teams: Sequence[Sequence[int]], active: jax.Array) -> dict[str, jax.Array]:
-    """Returns who is there of the blocks of each agent's teammates and opponents (A, count) bool, in their order."""
+    """Returns who is there of the blocks of each agent's teammates and opponents (A, count) bool, in their order.
+
+    A block without anybody is left out.
+    """
     mates = [[other for other in team if other != agent] for team in teams for agent in team]
     rivals = [[other for rival in teams if rival is not team for other in rival] for team in teams for _ in team]
-    return {"teammate": active[np.array(mates, int)], "opponents": active[np.array(rivals, int)]}
+    others = {"teammate": np.array(mates, int), "opponents": np.array(rivals, int)}
+    return {name: active[agents] for name, agents in others.items() if agents.size}
 
 
 def hide(layout: ObservationLayout, obs: jax.Array, there: Mapping[str, jax.Array]) -> jax.Array:
