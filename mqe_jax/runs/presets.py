@@ -31,16 +31,13 @@ def preset(algorithm: str) -> dict[str, Any]:
 def named_config(name: str, task: str) -> TrainConfig:
     """Returns the settings of a file, or of a shipped name; `league` and `sizes` have changes of some tasks."""
     shipped = ["demo", "league", "sizes"]
-    shipped += [part.replace(task, "sizes") for part in _parts("sizes") if part.startswith(f"{task}/")]
     shipped += [f"{file}/{part}" for file in ("paper", "tuned") for part in sorted(_parts(file)) if part != "common"]
     path, allowed = Path(check("config", name, PathText)), f"a YAML file, or one of {', '.join(shipped)}"
     if name == "demo":
         path = CONFIG_FOLDER / "demo.yaml"
-    elif name in shipped and name.startswith("sizes"):
-        parts, config = _parts("sizes"), named_config(default_name(task), task)
-        for part in ("common", task, name.replace("sizes", task)):
-            config = override(config, parts.get(part, {}))
-        return config
+    elif name == "sizes":
+        usual = override(named_config(default_name(task), task), _parts(name)["common"])
+        return override(usual, _parts(name).get(task, {}))
     elif name in shipped:
         file, _, part = name.partition("/")
         common = override(TrainConfig(), _parts(file)["common"])
