@@ -28,7 +28,7 @@ EPISODES, SECONDS, AFTER, FPS = 48, 4.4, 1.2, 10.0  # AFTER: duration shown afte
 SIZE, SMALL, TILE, COLUMNS = (640, 360), (480, 270), (240, 135), 4  # SMALL: of clips with many moving bodies
 SIZES: dict[str, tuple[str, dict[str, Any]]] = {
     "gate-8": ("go1gate", {"num_agents": 8, "episode_length": 60.0}),
-    "sheep-30": ("go1sheep-hard", {"num_agents": 4, "num_sheep": 30, "episode_length": 45.0}),
+    "sheep-30": ("go1sheep-hard", {"num_agents": 4, "num_sheep": 30, "episode_length": 25.0}),
     "pushbox-6": ("go1pushbox", {"num_agents": 6, "episode_length": 30.0}),
     "football-5vs5": ("go1football-1vs1", {"num_agents": 10}),
 }
