@@ -228,11 +228,13 @@ def test_bounds_of_tracks_payloads_and_settings() -> None:
 
 def test_one_agent_of_four_is_frozen() -> None:
     env = made("go1football-2vs2")
-    draw = jax.jit(jax.vmap(env._sample_frozen_steps, (0, None)))
-    keys = jax.random.split(KEY, 400)
-    assert not np.asarray(draw(keys, jnp.float32(0.0))).any()
-    frozen = np.asarray(draw(keys, jnp.float32(1.0))) > 0
+    draw = jax.jit(jax.vmap(env._sample_frozen_steps, (0, None, None)))
+    keys, active = jax.random.split(KEY, 400), jnp.ones(4, bool)
+    assert not np.asarray(draw(keys, jnp.float32(0.0), active)).any()
+    frozen = np.asarray(draw(keys, jnp.float32(1.0), active)) > 0
     assert frozen.sum(axis=1).max() == 1 and np.all(np.abs(frozen.mean(axis=0) - 0.25) < 0.08)
+    some = np.asarray(draw(keys, jnp.float32(1.0), active.at[1].set(False))) > 0
+    assert some.sum(axis=1).max() == 1 and some.any(axis=0).tolist() == [True, False, True, True]
 
 
 def test_constant_observations_are_divided_by_a_hundredth() -> None:
