@@ -114,18 +114,19 @@ def test_nothing_that_a_parked_robot_is_or_does_changes_anything_for_the_others(
 
 
 @pytest.mark.parametrize("task", [BALL, SHEEP])
-def test_a_frozen_robot_is_observed_as_if_it_took_no_part(task: str) -> None:
+def test_mates_of_a_frozen_robot_observe_a_smaller_team(task: str) -> None:
     env, start, agent = sized(task, True), begun(task), PLACES[task][1]
     frozen = dataclasses.replace(start, frozen_steps=jnp.zeros_like(start.frozen_steps).at[agent].set(2))
     absent = dataclasses.replace(start, active=start.active.at[agent].set(False))
     look = jax.jit(lambda state: env.with_observations(state, [ENTITIES]))
-    (hidden, without, plain) = (look(state) for state in (frozen, absent, start))
-    for seen, other, before in (
-        (hidden.obs, without.obs, plain.obs),
-        (*(x.groups[ENTITIES] for x in (hidden, without, plain)),),
-    ):
-        np.testing.assert_array_equal(seen, other)
-        assert not seen[agent].any() and np.any(np.asarray(seen != before)[PLACES[task][0]])
+    hidden, without, plain = (look(state) for state in (frozen, absent, start))
+    mates = np.array(env.teams[0])
+    np.testing.assert_array_equal(hidden.obs[mates], without.obs[mates])
+    assert not hidden.obs[agent].any() and np.any(hidden.obs[mates[0]] != plain.obs[mates[0]])
+    np.testing.assert_array_equal(hidden.groups[ENTITIES][mates], without.groups[ENTITIES][mates])
+    np.testing.assert_array_equal(np.delete(hidden.obs, mates, axis=0), np.delete(plain.obs, mates, axis=0))
+    active = [place for place in PLACES[task] if place in env.teams[0] and place != agent]
+    assert np.asarray(hidden.groups[ENTITIES])[active, 0].tolist() == ([-1.0, 1.0] if len(active) > 1 else [0.0])
     later = look(dataclasses.replace(frozen, step=frozen.step + 2))
     np.testing.assert_array_equal(later.groups[ENTITIES], plain.groups[ENTITIES])
     states = resets(env)(jax.random.split(jax.random.PRNGKey(1), 40), jnp.ones(40))

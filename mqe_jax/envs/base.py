@@ -377,7 +377,7 @@ class QuadrupedEnv(Task[S, P]):
     def _sample_frozen_steps(self, key: jax.Array, assistance: jax.Array, active: jax.Array) -> jax.Array:
         agent_key, time_key = jax.random.split(key)
         steps = assistance * self.params.frozen_time / self.dt * jax.random.uniform(time_key, ())
-        number = 1 + jax.random.randint(agent_key, (), 0, self.num_agents) % jnp.sum(active)
+        number = 1 + jax.random.randint(agent_key, (), 0, jnp.sum(active))
         return jnp.where(active & (jnp.cumsum(active) == number), steps, 0.0).astype(jnp.int32)
 
     def check_state(self, state: State[S]) -> None:

@@ -173,15 +173,15 @@ def _poses(env: Any, agents: int) -> np.ndarray:
     return np.array(other.spawn_poses())[:agents]
 
 
-def robots_there(teams: Sequence[Sequence[int]], active: jax.Array) -> dict[str, jax.Array]:
+def robots_there(teams: Sequence[Sequence[int]], mates: jax.Array, opponents: jax.Array) -> dict[str, jax.Array]:
     """Returns who is there of the blocks of each agent's teammates and opponents (A, count) bool, in their order.
 
-    A block without anybody is left out.
+    `mates` and `opponents` say which agents are there as such (A,); a block without anybody is left out.
     """
-    mates = [[other for other in team if other != agent] for team in teams for agent in team]
-    rivals = [[other for rival in teams if rival is not team for other in rival] for team in teams for _ in team]
-    others = {"teammate": np.array(mates, int), "opponents": np.array(rivals, int)}
-    return {name: active[agents] for name, agents in others.items() if agents.size}
+    own = np.array([[other for other in team if other != agent] for team in teams for agent in team], int)
+    others = [[other for rival in teams if rival is not team for other in rival] for team in teams for _ in team]
+    found = {"teammate": (mates, own), "opponents": (opponents, np.array(others, int))}
+    return {name: there[agents] for name, (there, agents) in found.items() if agents.size}
 
 
 def hide(layout: ObservationLayout, obs: jax.Array, there: Mapping[str, jax.Array]) -> jax.Array:
@@ -225,10 +225,10 @@ def observe_entities(
 
     `there` says by block which entities are there (A, count) bool, by default all; a mask of the layout counts too.
     """
-    agents = len(active)
-    place = np.concatenate([np.arange(len(team)) for team in teams])
-    last = jnp.concatenate([jnp.full(len(team), jnp.sum(active[np.array(team)]) - 1) for team in teams])
-    own = jnp.where(last > 0, 2.0 * place / jnp.maximum(last, 1) - 1.0, 0.0)
+    agents, members = len(active), [active[np.array(team)] for team in teams]
+    place = jnp.concatenate([jnp.cumsum(team) - 1 for team in members])  # among the active ones
+    last = jnp.concatenate([jnp.full(len(team), jnp.sum(team) - 1) for team in members])
+    own = jnp.where(active & (last > 0), 2.0 * place / jnp.maximum(last, 1) - 1.0, 0.0)
     found = {_PLACE.name: own[:, None]}
     for block in layout.blocks:
         if (of := block.entities) is not None:

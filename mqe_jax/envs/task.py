@@ -151,11 +151,14 @@ class Task(Sensing, Generic[S, P]):
 
     def there(self, state: State[S]) -> dict[str, jax.Array]:
         """Returns which entities of a block take part (A, count) bool, by the block's name; of other blocks all do."""
-        return robots_there(self.teams, self.observed(state))
+        return robots_there(self.teams, self.observed(state), state.active)
 
     def observed(self, state: State[S]) -> jax.Array:
-        """Returns which agents are observed (A,) bool: the active ones; where their number varies, not the frozen."""
-        return state.active & (state.step >= state.frozen_steps) if self.varies else state.active
+        """Returns which agents observe and are observed by teammates (A,) bool: the active ones, without those that are
+        frozen where the number of robots varies.
+        """
+        varies = self.params.fewest_agents is not None
+        return state.active & (state.step >= state.frozen_steps) if varies else state.active
 
     @property
     def action_space(self) -> Box:

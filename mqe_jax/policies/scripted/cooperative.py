@@ -84,7 +84,7 @@ def _sides(obs: Observation) -> np.ndarray | jax.Array:
         place = np.arange(agents) - (agents - 1) / 2
         return (2 * place / max(agents - 1, 1)).astype(np.float32)[:, None]
     last = jnp.sum(obs["active"]) - 1
-    return ((2.0 * np.arange(agents) - last) / jnp.maximum(last, 1))[:, None]
+    return ((2.0 * (jnp.cumsum(obs["active"]) - 1) - last) / jnp.maximum(last, 1))[:, None]
 
 
 def _apart(position: jax.Array, goal: jax.Array) -> jax.Array:
