@@ -141,6 +141,16 @@ def test_teams_of_one_observe_entities_in_scenes_that_vary(params: dict[str, int
     assert state.groups[ENTITIES].shape == (env.num_agents, env.group_sizes[ENTITIES])
 
 
+@pytest.mark.parametrize("task", ["go1gate", "go1pushbox", "go1wrestling"])
+def test_a_policy_of_entities_acts_in_another_size(task: str, tmp_path: Path) -> None:
+    envs = [make(task, impl="c", control="position", num_envs=1, num_agents=number) for number in (4, 2)]
+    save_policy(tmp_path, policy(task, envs[0]))
+    team = len(envs[1].teams[0])
+    loaded: Any = load_policy(tmp_path, envs[1])
+    acted = loaded.act(jnp.ones((team, envs[1].group_sizes[ENTITIES])), loaded.initial_memory(None), None)[0]
+    assert acted.shape == (team, envs[1].action_size)
+
+
 @pytest.mark.parametrize("task", [BALL, SHEEP])
 def test_pictures_show_those_who_take_part(task: str) -> None:
     env, data = sized(task, True), begun(task).data

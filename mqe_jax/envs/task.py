@@ -175,10 +175,19 @@ class Task(Sensing, Generic[S, P]):
         raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
 
     @property
+    def sized_layout(self) -> ObservationLayout:
+        """Blocks of which the group `entities` consists, at every size alike but for the number of entities."""
+        return self.observation_layout
+
+    def observe_sized(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
+        """Returns the blocks of `sized_layout` by name (A, width)."""
+        return self.observe(state, robot_state)
+
+    @property
     def groups(self) -> Mapping[str, ObservationLayout]:
         """Layouts of further groups of observations by name, which are computed if a policy or a critic names them."""
         sensed = {ONBOARD: ObservationLayout(self.suite.blocks)} if self.params.senses else {}
-        sized = {ENTITIES: entity_layout(self.observation_layout)} if self.variable_num_agents else {}
+        sized = {ENTITIES: entity_layout(self.sized_layout)} if self.variable_num_agents else {}
         return {"proprioception": PROPRIOCEPTION, **sensed, **sized}
 
     @property
@@ -197,8 +206,8 @@ class Task(Sensing, Generic[S, P]):
     def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of one of `groups` by name (A, width)."""
         if name == ENTITIES:
-            blocks, there = self.observe(state, robot_state), self.there(state) if self.varies else {}
-            return observe_entities(self.observation_layout, blocks, there, self.teams, self.observed(state))
+            blocks, there = self.observe_sized(state, robot_state), self.there(state) if self.varies else {}
+            return observe_entities(self.sized_layout, blocks, there, self.teams, self.observed(state))
         sensed = jax.tree.map(lambda x: x[: self.num_agents], robot_state.proprioception)
         joints = sensed.joint_position - self.robot.default_joints
         return {"gravity": sensed.gravity_b, "joint_position": joints, "joint_velocity": sensed.joint_velocity}

@@ -148,20 +148,25 @@ class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        duel = super().observation_layout
-        return duel if self.num_agents == 2 else ObservationLayout(self.teams_blocks(masked=True))
+        return super().observation_layout if self.num_agents == 2 else self.sized_layout
 
     def observe(self, state: State[jax.Array], robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (A, width), each in its agent's own frame."""
-        if self.num_agents == 2:
-            return super().observe(state, robot_state)
+        duel = self.num_agents == 2
+        return super().observe(state, robot_state) if duel else self.observe_sized(state, robot_state)
+
+    @property
+    def sized_layout(self) -> ObservationLayout:
+        return ObservationLayout(self.teams_blocks(masked=True))
+
+    def observe_sized(self, state: State[jax.Array], robot_state: RobotState) -> dict[str, jax.Array]:
         blocks, agents = self.observe_teams(robot_state), self.num_agents
         teams = self.acting(state).reshape(2, -1)
         there = {
             "teammate": jax.vmap(others)(teams[..., None]).reshape(agents, -1),
             "opponents": teams[::-1][self.team_of],
         }
-        masked = {name: by_entity(blocks[name].reshape(agents, -1, 6), there[name]) for name in there}
+        masked = {name: by_entity(blocks[name].reshape(agents, -1, 6), there[name]) for name in there if name in blocks}
         return {**blocks, **masked}
 
     def rewards(
