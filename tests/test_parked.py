@@ -135,7 +135,7 @@ def test_mates_of_a_frozen_robot_observe_a_smaller_team(task: str) -> None:
 
 
 @pytest.mark.parametrize("params", [{"fewest_agents": 2}, {"num_agents": 1, "fewest_sheep": 3}])
-def test_teams_of_one_observe_entities_in_scenes_that_vary(params: dict[str, int]) -> None:
+def test_teams_of_one_observe_entities_in_scenes_that_vary(params: dict[str, Any]) -> None:
     env = make(BALL if "fewest_agents" in params else SHEEP, impl="c", num_envs=1, **params)
     state = jax.eval_shape(lambda key: env.with_observations(env.begin(key), [ENTITIES]), jax.random.PRNGKey(0))
     assert state.groups[ENTITIES].shape == (env.num_agents, env.group_sizes[ENTITIES])
