@@ -1,6 +1,7 @@
 """The command line: output, streams, settings, run folders and policies."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -256,5 +257,7 @@ def test_the_demo_resumes_only_what_has_begun(capfd: pytest.CaptureFixture[str],
     Path("small.yaml").write_text(f"{{{small}, network: {{recurrent: false}}}}")
     for _ in range(2):
         assert cli.main(["demo", "--run-dir", "run", "--config", "small.yaml", "--episodes", "4"]) == 0
-        assert "no checkpoint" not in capfd.readouterr().err
+        said = capfd.readouterr()
+        assert "no checkpoint" not in said.err
+        assert re.search(r"after training:  both robots through [\d.]+% \([\d.]+ to [\d.]+%\)", said.out)
     assert json.loads(Path("run/evaluation.json").read_text())["after"]["episodes"] == 4

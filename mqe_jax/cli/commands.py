@@ -123,12 +123,15 @@ class Zoo:
 
 def _print_card(task: str, card: Any, plain: dict[str, Any], long: bool) -> None:
     """Prints a policy's card: its rates, skill and training; with `long` all fields."""
+    from mqe_jax.train.evaluate import Rate
+
     shown = {"task": task}
     for name, found in sorted(card.results.items(), reverse=True):  # wins first
         sides = {"both": ", both sides", "first": ", first side"}.get(found.sides or "", "")
         shown[name] = f"{found.rate}, {found.episodes} episodes{sides}"
     if long:
-        shown |= {f"ends by {name}": f"{100 * share:.1f}%" for name, share in card.endings.items()}
+        episodes = card.results["success" if "success" in card.results else "win/scripted"].episodes
+        shown |= {f"ends by {name}": str(Rate.of(share, episodes)) for name, share in card.endings.items()}
     ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in plain["commands"].items())
     shown |= {"skill": f"{plain['skill']}: {', '.join(ranges)}", "trained": card.date, "command": card.command}
     if long:

@@ -15,6 +15,7 @@ from mqe_jax.core.literal import echo
 from mqe_jax.runs.build import base_config, for_task, make_env
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
+from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import policy_of
@@ -65,8 +66,8 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
 
 
 def _summary(result: Mapping[str, Any]) -> str:
-    parts = [f"both robots through {result['success_rate']:.0%}"]
-    if "success/one" in result:
-        parts.append(f"at least one {result['success/one']:.0%}")
+    named = {"both robots through": "success_rate", "at least one": "success/one"}
+    rates = {text: Rate.of(result[name], result["episodes"]) for text, name in named.items() if name in result}
+    parts = [f"{text} {rate}" for text, rate in rates.items()]
     parts.append(f"average step reward {result['average_step_reward']:.3f}")
     return f"{', '.join(parts)} ({result['episodes']} episodes)"
