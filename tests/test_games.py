@@ -164,6 +164,7 @@ def test_estimates_of_a_match_equal_a_recomputation_with_the_same_draws(
     samples = [matrix(x / x.sum(axis=-1, keepdims=True) * more.sum(axis=-1, keepdims=True)) for x in draws]
     others = [[j % count for j in range(i + 1, i + count)] for i in range(count)]
     drawn = [[[others[i][k] for k in choice[i]] for i in range(count)] for choice in chosen]
+    check(found.payoff, whole, samples)
     mean = lambda table, those: [table[i, those[i]].mean() for i in range(count)]  # noqa: E731
     check(found.mean, mean(whole, others), [mean(*each) for each in zip(samples, drawn, strict=True)])
     lowest = lambda table: [min(table[i, j] for j in others[i]) for i in range(count)]  # noqa: E731
