@@ -110,7 +110,10 @@ def test_the_smallest_lead_counts_losses(data: Path) -> None:
     assert row[3].startswith("-25.0 (-36.") and row[4] == "lost"
 
 
-RESPONSES = {"scratch": {"win": 0.5, "draw": 0.25, "loss": 0.25}, "champion": {"win": 0.75, "draw": 0.25, "loss": 0.0}}
+RESPONSES = {
+    "scratch": {"sampled": (0.5, 0.25, 0.25)},
+    "champion": {"sampled": (0.75, 0.25, 0.0), "mean": (1.0, 0.0, 0.0)},
+}
 
 
 def save(folder: Path, part: str, task: str, result: Any) -> None:
@@ -132,15 +135,20 @@ def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     save(tmp_path, "pools", "go1seesaw", {"start": "before", **mixed})
     save(tmp_path, "oracle", "go1tug", {"rounds": []})
     chosen = {
-        f"runs/go1tug/default+{x}/seed20": {n: {"value": v} for n, v in each.items()} for x, each in RESPONSES.items()
+        f"runs/go1tug/default+{start}/seed20": {
+            actions: {name: {"value": share} for name, share in zip(("win", "draw", "loss"), shares, strict=True)}
+            for actions, shares in each.items()
+        }
+        for start, each in RESPONSES.items()
     }
     save(tmp_path, "exploitability", "go1tug", {"episodes": 512, "selection": chosen})
     strength_page.copy_rates(tmp_path)
     others = [row for row in strength_page.rows("exploitability") if row["task"] != "go1tug"]
     assert others == [row for row in responses if row["task"] != "go1tug"]
-    scratch, champion = (row for row in strength_page.rows("exploitability") if row["task"] == "go1tug")
+    scratch, champion, mean = (row for row in strength_page.rows("exploitability") if row["task"] == "go1tug")
     assert (scratch["from"], scratch["seed"], scratch["wins"], scratch["value"]) == ("scratch", "20", "0.5", "0.25")
     assert champion["from"] == "champion" and float(champion["value"]) == 0.75
+    assert (champion["actions"], mean["actions"], mean["value"]) == ("sampled", "mean", "1")
     assert float(champion["low"]) < 0.75 < float(champion["high"]) <= 1.0
     assert strength_page.published("oracle") == games | {"go1tug": {"task": "go1tug", "rounds": []}}
     assert strength_page.published("crossplay_go1gate") == {"task": "go1gate", **mixed}

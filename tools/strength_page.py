@@ -316,12 +316,13 @@ def leads(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns rows of how all best responses fare in the episodes that choose one, from results of `mqe exploit`."""
     body: list[dict[str, Any]] = []
     for result in found:
-        for run, rates in result["selection"].items():
+        for run, by_actions in result["selection"].items():
             (cell, seed), episodes = Path(run).parts[-2:], result["episodes"]
-            win, draw, loss = (rates[name]["value"] for name in ("win", "draw", "loss"))
             own = {"task": result["task"], "from": cell.split("+")[1], "seed": seed.removeprefix("seed")}
-            own |= {"actions": "sampled", "episodes": episodes, "wins": win, "draws": draw, "losses": loss}
-            body.append(own | lead(Rate.of(win, episodes), Rate.of(loss, episodes), episodes)._asdict())
+            for actions, rates in by_actions.items():
+                win, draw, loss = (rates[name]["value"] for name in ("win", "draw", "loss"))
+                counts = {"actions": actions, "episodes": episodes, "wins": win, "draws": draw, "losses": loss}
+                body.append(own | counts | lead(Rate.of(win, episodes), Rate.of(loss, episodes), episodes)._asdict())
     return body
 
 
