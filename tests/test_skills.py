@@ -13,12 +13,13 @@ from mqe_jax import VectorEnv, cli, evaluate, learn, make
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import observations
-from mqe_jax.export.task import TaskFunctions
+from mqe_jax.export.task import TaskFunctions, readings_function
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.policies import load_as, load_policy
 from mqe_jax.policies.translated import Translated
 from mqe_jax.policies.zoo import population
+from mqe_jax.runs.build import players
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import agile
@@ -27,6 +28,7 @@ from mqe_jax.skills.choice import HOLD
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.policy import TrainedPolicy, save_policy
+from mqe_jax.view.session import Session
 from mqe_jax.walk_policy import WalkPolicy
 from tests.inputs import refuses
 
@@ -313,6 +315,22 @@ def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     team = TeamEnv(match, policies["agile"])
     state = jax.jit(team.step)(jax.jit(team.reset)(jax.random.PRNGKey(0)), jnp.zeros((1, 4)))
     np.testing.assert_array_equal(state.control.skill["acting"], [0, 1])
+
+
+def test_policies_of_two_skills_meet_in_the_viewer(policies: Any, match: Any) -> None:
+    playing = players(match, policies["agile"], policies["walk"], num_envs=4)
+    session = Session(match, playing.batch, playing.policy)
+    session.advance()
+    np.testing.assert_array_equal(session.state.control.skill["acting"], [[1, 0]] * 4)
+
+
+def test_policies_of_two_skills_meet_on_the_page(policies: Any, match: Any) -> None:
+    chosen = []
+    for name in BOTH:
+        act, shapes = readings_function(load_as("policy", policies[name], match), match.observation_size)
+        (action,) = jax.jit(act)({each: jnp.zeros(shape) for each, shape in shapes.items()})["action"]
+        chosen.append(float(action[-1]))
+    assert chosen == [-0.5, 0.5]
 
 
 @pytest.mark.soak
