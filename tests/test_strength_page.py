@@ -74,11 +74,16 @@ def test_every_file_has_its_command_date_and_hardware() -> None:
         assert row[1].startswith("mqe sweep configs/strength.yaml --part ") and row[2], file.name
 
 
-def test_every_match_has_best_responses_of_two_seeds() -> None:
-    kinds = [(row["task"], row["seed"], row["from"]) for row in strength_page.rows("exploitability")]
-    for task in strength_page.MATCHES:
-        own = [kind[1:] for kind in kinds if kind[0] == task]
-        assert len(own) == 4 and len({seed for seed, _ in own}) == 2
+def test_every_match_has_best_responses_of_two_seeds_and_the_page_shows_the_larger_leads() -> None:
+    found, shown = strength_page.rows("exploitability"), lines(strength_page.tables()["exploitability"])
+    for task, row in zip(strength_page.MATCHES, shown, strict=True):
+        own = [each for each in found if each["task"] == task]
+        assert len({(each["seed"], each["from"], each["actions"]) for each in own}) == len(own)
+        assert sum(each["actions"] == "sampled" for each in own) == 4
+        seeds = sorted({each["seed"] for each in own})
+        best = [max((each for each in own if each["seed"] == seed), key=lambda x: float(x["value"])) for seed in seeds]
+        leads = [Rate(*(float(each[name]) for name in Rate._fields)).percent for each in best]
+        assert row == [f"`{task}`", *(f"{lead} {each['actions']}" for lead, each in zip(leads, best, strict=True))]
 
 
 def test_a_match_has_a_row_once_all_conditions_are_measured(data: Path) -> None:
@@ -106,7 +111,7 @@ def test_the_smallest_lead_counts_losses(data: Path) -> None:
         found |= {(task, "plain", name): value for name, value in of.items()}
     write(data / "population.csv", found)
     row = lines(strength_page.tables()["population"])[0]
-    assert row[:3] == ["`go1tug`", Rate.of(0.15, 256).percent, Rate.of(0.25, 256).percent]
+    assert row[:3] == ["`go1tug`", *(Rate.of(value, 256).percent for value in (0.15, 0.0))]
     assert row[3].startswith("-25.0 (-36.") and row[4] == "lost"
 
 

@@ -118,25 +118,27 @@ def lead(win: Rate, loss: Rate, episodes: int) -> Rate:
 
 
 def population(found: Rates) -> str:
-    """Returns the table of mean wins and losses against the population, and of the smallest lead."""
+    """Returns the table of mean and lowest wins against the population, and of the smallest lead."""
     body = []
     for task in MATCHES:
-        leads = {name: lead(win, loss, MEMBER_EPISODES) for name, (win, loss) in members(found, task).items()}
+        every = members(found, task)
+        leads = {name: lead(win, loss, MEMBER_EPISODES) for name, (win, loss) in every.items()}
         worst = min(leads, key=lambda name: leads[name].value)
-        means = [each.percent for each in against(found, task, "plain")]
-        body.append([f"`{task}`", *means, leads[worst].percent, worst])
-    return table(("match", "mean wins", "mean losses", "smallest lead, points", "against"), body)
+        shown = [found[task, "plain", "win_rate"], min(win for win, _ in every.values()), leads[worst]]
+        body.append([f"`{task}`", *(each.percent for each in shown), worst])
+    return table(("match", "mean wins", "lowest wins", "smallest lead, points", "against"), body)
 
 
 def exploitability() -> str:
-    """Returns the table of the larger lead of the two best responses of each seed."""
+    """Returns the table of the largest lead of each seed's best responses, with its actions."""
     body = []
     for task in MATCHES:
-        by_seed: dict[str, list[Rate]] = {}
+        by_seed: dict[str, list[tuple[Rate, str]]] = {}
         for row in rows("exploitability"):
             if row["task"] == task:
-                by_seed.setdefault(row["seed"], []).append(rate(row))
-        body.append([f"`{task}`", *(max(by_seed[seed]).percent for seed in sorted(by_seed))])
+                by_seed.setdefault(row["seed"], []).append((rate(row), row["actions"]))
+        largest = [max(by_seed[seed]) for seed in sorted(by_seed)]
+        body.append([f"`{task}`", *(f"{lead.percent} {actions}" for lead, actions in largest)])
     return table(("match", "lead, first seed", "lead, second seed"), body)
 
 
@@ -242,8 +244,8 @@ def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -
 
 
 def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
-    """Returns a picture of each best response's wins minus losses."""
-    figure = Figure((7.6, 3.0), dpi=105, layout="constrained")
+    """Returns a picture of each best response's wins minus losses, with sampled and with mean actions."""
+    figure = Figure((7.6, 3.8), dpi=105, layout="constrained")
     axes = figure.subplots()
     for place, task in enumerate(MATCHES):
         own = [row for row in data if row["task"] == task]
@@ -251,13 +253,15 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
             y = place + 0.7 * (i / max(len(own) - 1, 1) - 0.5)
             color = BLUE if row["from"] == "scratch" else RED
             axes.plot([100 * float(row["low"]), 100 * float(row["high"])], [y, y], color=color, lw=2)
-            axes.plot([100 * float(row["value"])], [y], "o", color=color, ms=4)
+            face = "white" if row["actions"] == "mean" else color
+            axes.plot([100 * float(row["value"])], [y], "o", color=color, mfc=face, ms=4)
     axes.axvline(0, color=INK, lw=0.8)
     axes.set_yticks(range(len(MATCHES)), MATCHES, fontsize=8)
     axes.set(ylim=(len(MATCHES) - 0.5, -0.5), xlim=(-60, 105))
     axes.set_xlabel("wins minus losses of the best response, points", fontsize=9, color=INK)
     for color, text in ((BLUE, "trained from scratch"), (RED, "trained from the team itself")):
         axes.plot([], [], "o-", color=color, label=text)
+    axes.plot([], [], "o", color=INK, mfc="white", label="mean actions (filled: sampled)")
     axes.legend(fontsize=8, frameon=False, loc="lower right")
     axes.spines[["top", "right"]].set_visible(False)
     return drawn(figure)
