@@ -48,7 +48,7 @@ CONDITIONS = {
     "noise": "noise",
     "go2": "Go2",
 }
-INK, BLUE, RED = "#23252b", "#4f86e0", "#b5316f"
+INK, BLUE, RED, GREY = "#23252b", "#4f86e0", "#b5316f", "#e3e5ea"
 
 Rates = dict[tuple[str, str, str], Rate]
 """Rates by task, variant and name."""
@@ -229,6 +229,7 @@ def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -
     axes = figure.subplots(-(-len(groups) // 2), 2, sharex=True, squeeze=False)
     for each, (title, values) in zip(axes.ravel(), groups.items(), strict=True):
         for i, pair in enumerate(values.values()):
+            each.barh(i, 100 * (len(pair) > 1), height=0.62, color=GREY)
             for value, start, way, color in zip(pair, (0, 100), (100, -100), (BLUE, RED), strict=False):
                 each.barh(i, way * value.value, left=start, height=0.62, color=color)
                 ends = [start + way * bound for bound in (value.low, value.high)]
@@ -305,8 +306,8 @@ def pictures() -> dict[str, bytes]:
     teams: dict[str, dict[str, Sequence[Rate]]] = {
         task: {each: (alone[task, each, "success_rate"],) for each in ("shipped", "scripted")} for task in COOPERATIVE
     }
-    teams |= {t: {each: against(met, t, each) for each in ("scripted", "idle", "random", "copy")} for t in MATCHES}
-    label = "wins (blue), draws (white) and losses (red), %"
+    teams |= {t: {f"vs {x}": against(met, t, x) for x in ("scripted", "idle", "random", "copy")} for t in MATCHES}
+    label = "wins (blue), draws (grey) and losses (red), %"
     return {
         "strength.png": draw_rates(teams, f"success, or {label}"),
         "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
