@@ -237,8 +237,8 @@ class QuadrupedEnv(Task[S, P]):
         """Advances one environment by one environment step with actions (A, action_size), clipped to [-1, 1].
 
         An episode that has ended continues unless it is reset (see `VectorEnv`). InputError for a state of another task
-        or of a batch, and for an action of another shape or dtype, or that is not finite; in compiled code the latter
-        ends the episode as diverged.
+        or of a batch, and for an action of another shape or dtype, or that is not finite. In compiled code an action
+        that is not finite ends the episode as diverged.
         """
         return with_final(self.with_observations(self.advance(state, action)))
 

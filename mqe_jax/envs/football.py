@@ -57,7 +57,7 @@ class FootballParams(TaskParams):
     """Half-width of the uniform noise on the ball's position at reset, m."""
     head_start: Fraction = 0.0
     """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a match that of a team
-    drawn at random, and the robots that attack it as far forward, so that agents first learn to score from near.
+    drawn at random. The robots that attack it start as far forward, so that agents first learn to score from near.
     Inactive at assistance 0."""
 
     def __post_init__(self) -> None:

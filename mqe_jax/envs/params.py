@@ -97,8 +97,8 @@ class TaskParams:
     solver_iterations: Iterations = 4
     """Maximum solver iterations per physics step."""
     sparse_solver: bool | None = None
-    """Whether the solver on Warp skips the zeros between robots that do not touch, with the same result to rounding; if
-    None, in scenes with more than 80 degrees of freedom, 18 of them per robot. The other engines ignore it."""
+    """Whether the solver on Warp skips the zeros between robots that do not touch, with the same result to rounding.
+    None: in scenes with more than 80 degrees of freedom, 18 of them per robot. The other engines ignore it."""
     contacts: Literal["full", "minimal"] = "full"
     """Set of the robots' collision geoms: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
     and disables limb collisions."""

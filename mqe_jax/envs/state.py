@@ -65,7 +65,7 @@ class State(EnvironmentState, Generic[S]):
     """State of one environment with A agents, R robots and G anchors.
 
     Its metrics include `average_step_reward`, `collision`, `diverged` and `overflow` (1 where the physics engine may
-    have dropped contacts or constraints in any physics step of this step); its outcome has the `ENDINGS`.
+    have dropped contacts or constraints in any physics step of this step). Its outcome has the `ENDINGS`.
 
     Example:
         ```python

@@ -11,8 +11,8 @@ from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, posed, shown_ba
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
-"""Names of the views. follow: tracks robots, objects and the goal from the direction in which they are seen best; near:
-the same, fixed; scene: fixed, whole scene; side: tracks the first robot from its side."""
+"""Names of the views. follow: tracks robots, objects and the goal from the direction in which they are seen best. near:
+the same, fixed. scene: fixed, whole scene. side: tracks the first robot from its side."""
 
 _MARGIN = np.array([0.4, 0.4, 0.25])  # around a robot's trunk, m
 _SMOOTHING = 0.6  # duration over which a following camera is averaged, s
