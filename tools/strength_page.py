@@ -30,7 +30,8 @@ SECTIONS = {
     "population.md": ("population",),
     "exploitability.md": ("exploitability",),
     "robustness.md": ("robustness",),
-    "mates.md": ("mates", "pools"),
+    "mates.md": ("mates",),
+    "pools.md": ("pools",),
     "skills.md": ("walk",),
 }
 """Filled sections of each page."""
