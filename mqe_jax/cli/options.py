@@ -124,8 +124,8 @@ def print_columns(columns: Mapping[str, Sequence[str]], left: int) -> None:
 def standard_output(*, reserved: bool) -> Iterator[TextIO]:
     """Yields a file that writes to standard output.
 
-    With `reserved`, all other standard output, also of C code, goes to standard
-    error, so that the `--json` object is the only output.
+    With `reserved`, all other standard output, also of C code, goes to standard error: the `--json` object is the only
+    output.
     """
     if not reserved:
         yield sys.stdout

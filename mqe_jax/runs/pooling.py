@@ -10,7 +10,7 @@ from mqe_jax.core.limits import Candidates
 from mqe_jax.core.settings import FrozenMapping, PathText, build, check_arguments
 from mqe_jax.envs.registry import task_id
 from mqe_jax.runs.playing import tournament
-from mqe_jax.runs.sweeping import trained
+from mqe_jax.runs.sweeping import train_runs
 from mqe_jax.study.sweep import Sweep
 
 
@@ -52,6 +52,6 @@ def pool_of_mates(
     """
     own = {**settings, "start": start, "mates": [*mates], "total_steps": total_steps}
     plan = build(Sweep, {"tasks": [task_id(task)], "algorithms": ["default"], "seeds": [0], "settings": own})
-    (run,) = trained(plan, Path(folder), "pool.yaml", impl)
+    (run,) = train_runs(plan, Path(folder), "pool.yaml", impl)
     mixed = tournament(task, [str(run), start, *others], impl=impl, episodes=episodes)
     return {"start": start, "mates": [*mates], **mixed.to_dict()}

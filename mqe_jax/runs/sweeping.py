@@ -105,7 +105,7 @@ def sweep(
     return {"left": _estimate(folder, left), "report": [str(file) for file in files]}
 
 
-def trained(plan: Sweep, folder: Path, file: str, impl: str) -> list[Path]:
+def train_runs(plan: Sweep, folder: Path, file: str, impl: str) -> list[Path]:
     """Trains all runs of a sweep, which it writes into a file of its folder, and returns theirs, cell by cell.
 
     InputError if trainings failed or are left to other processes.
