@@ -115,7 +115,7 @@ LONG: dict[str, dict[str, Any]] = {
     "train_skill": {"config": override(AGILE, WALKERS)},
     "evaluate_skill": {"episodes": 4},
 }
-SLOW = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_team", "export/policy")
+SLOW = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_team", "export/policy", "export/site")
 
 
 @pytest.mark.usefixtures("small")
@@ -132,6 +132,8 @@ def test_examples_of_docstrings_run(module: str, monkeypatch: pytest.MonkeyPatch
     Path("few.yaml").write_text("{num_envs: 8, rollout_steps: 16, ppo: {epochs: 1}, network: {hidden_sizes: [8]}}")
     for name, few in LONG.items():
         monkeypatch.setattr(mqe_jax, name, functools.partial(getattr(mqe_jax, name), **few))
+    if module == "export/site":  # without npm
+        monkeypatch.setattr("mqe_jax.export.site.add_libraries", lambda *_: None)
     if module == "export/robot_team":
         assert cli.main(["export", "go1gate", "--per-robot", "--onnx", "gate.onnx"]) == 0
     for example in re.findall(r"^ +```python\n(.*?)^ +```", SOURCES[module], re.DOTALL | re.MULTILINE):
@@ -140,6 +142,12 @@ def test_examples_of_docstrings_run(module: str, monkeypatch: pytest.MonkeyPatch
 
 def test_everything_that_the_package_exports_has_an_example() -> None:
     assert [name for name in mqe_jax.__all__ if "```python" not in getattr(mqe_jax, name).__doc__] == []
+
+
+def test_every_reference_page_has_an_example() -> None:
+    modules = [name.replace(".", "/") for name in re.findall(r"reference/(\S+)\.md", read("mkdocs.yml"))]
+    found = [SOURCES[name] if name in SOURCES else SOURCES[f"{name}/__init__"] for name in modules]
+    assert [name for name, source in zip(modules, found, strict=True) if "```python" not in source] == []
 
 
 def commands(text: str) -> list[list[str]]:

@@ -93,6 +93,15 @@ def write_site(
     `sources` are tasks, also with sizes (`TASK:num_agents=4,num_sheep=30`), run folders and policy files, by default
     all tasks that have a policy and those of `LARGER`. `libraries` is a folder of the browser libraries' files, by
     default fetched with npm. `say` receives what is done next, in a line.
+
+    Example:
+        ```python
+        from pathlib import Path
+
+        from mqe_jax.export.site import write_site
+
+        write_site(["go1gate"], Path("page"))
+        ```
     """
     found = entries(sources)
     say("adding the browser libraries")

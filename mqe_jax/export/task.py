@@ -46,6 +46,16 @@ class TaskFunctions:
     """The functions of a task, of one environment; domain randomisation is not part of them.
 
     InputError for another control mode than `command`, or an actuator network.
+
+    Example:
+        ```python
+        from mqe_jax.export.task import TaskFunctions
+        from mqe_jax.export.translate import translate
+
+        functions = TaskFunctions(mqe_jax.make("go1gate"))
+        graph = translate(functions.control, functions.control_inputs, "control")
+        print([output.name for output in graph.graph.output])
+        ```
     """
 
     def __init__(self, env: QuadrupedEnv) -> None:

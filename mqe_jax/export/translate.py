@@ -39,7 +39,7 @@ REPLACED: dict[str, Callable[..., jax.Array]] = {
 def translate(
     function: Function, inputs: Mapping[str, Sequence[int]], name: str, properties: Mapping[str, str] | None = None
 ) -> onnx.ModelProto:
-    """Returns the graph of a function of float32 arrays, evaluate_batch over a leading axis N.
+    """Returns the graph of a function of float32 arrays, batched over a leading axis N.
 
     Arrays that the function closes over become constants; `inputs` are the shapes of its inputs by name, without N, and
     `properties` the metadata of the model. InputError for an operation that jax2onnx cannot translate.

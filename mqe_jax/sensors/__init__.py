@@ -21,7 +21,30 @@ from mqe_jax.sensors.scene import SensedScene, Snapshot
 
 @record
 class Sensor:
-    """Base of all sensors: functions of one environment, for all its agents."""
+    """Base of all sensors: functions of one environment, for all its agents.
+
+    Example:
+        ```python
+        from typing import Literal
+
+        from mqe_jax.core.blocks import Block
+        from mqe_jax.core.settings import record
+        from mqe_jax.sensors import Sensor, register
+
+        @register
+        @record
+        class Altimeter(Sensor):
+            name: Literal["altimeter"] = "altimeter"
+
+            def layout(self, scene):
+                return (Block("height", 1, "of the trunk, m"),)
+
+            def observe(self, scene, snapshot, memory, key):
+                return {"height": snapshot.height[:, None]}, memory
+
+        print(mqe_jax.make("go1gate", senses=["altimeter"]).groups["onboard"])
+        ```
+    """
 
     engines: ClassVar[tuple[str, ...]] = ()
     """Engines on which it works; empty: all."""

@@ -189,6 +189,17 @@ def reach(scene: SensedScene, snapshot: Snapshot, direction: jax.Array, limit: f
     """Returns how far each agent's rays get from its trunk's centre (A, N), m, at most `limit`.
 
     `direction` (A, N, 2) has unit vectors in the frame of `Snapshot.places`.
+
+    Example:
+        ```python
+        from mqe_jax.sensors.scene import reach
+
+        env = mqe_jax.make("go1gate", senses=["lidar"])
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+        snapshot = env.snapshot(state, env.read(state.data))
+        along_x = jax.numpy.tile(jax.numpy.array([1.0, 0.0]), (2, 1, 1))
+        print(reach(env.suite.scene, snapshot, along_x, limit=5.0))  # (2, 1): one ray of each agent
+        ```
     """
 
     def read(origin: jax.Array, direction: jax.Array, radius: jax.Array) -> jax.Array:

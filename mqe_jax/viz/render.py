@@ -180,6 +180,18 @@ def render_episode(
     for a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the
     middle). A legend tells the teams' colours.
     Without GL, the packages required for 3-D rendering are printed to standard error.
+
+    Example:
+        ```python
+        from pathlib import Path
+
+        from mqe_jax.viz.recording import record_episodes
+        from mqe_jax.viz.render import render_episode
+
+        env = mqe_jax.make("go1gate")
+        (episode,) = record_episodes(env, mqe_jax.load_policy("go1gate", env), jax.random.PRNGKey(0), seconds=3)
+        render_episode(env, episode, Path("gate.png"), at=2.0)
+        ```
     """
     path = check_output(Path(path), fps=fps, speed=speed, at=at)
     _check_fits(env, episode)
