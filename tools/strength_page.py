@@ -39,7 +39,7 @@ COOPERATIVE = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pus
 MATCHES = ("go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
 POOLS = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1football-defender")
 PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
-EPISODES, MEMBER_EPISODES = 512, 256
+MEMBER_EPISODES = 256
 CONDITIONS = {
     "usual": "usual",
     "slippery": "friction",
@@ -92,14 +92,13 @@ def against(found: Rates, task: str, opponent: str) -> tuple[Rate, Rate]:
 
 
 def strength(alone: Rates, met: Rates) -> str:
-    """Returns the table of success, or of wins against the scripted team, and of what else episodes end with."""
-    body = []
-    for task in COOPERATIVE:
-        early = sum(alone[task, "shipped", f"ending/{name}"].value for name in ("fall", "collision"))
-        found = alone[task, "shipped", "success_rate"], Rate.of(early, EPISODES)
-        body.append([f"`{task}`", *(each.percent for each in found)])
+    """Returns the table of success, in matches of wins against each other, of shipped and scripted teams."""
+    body = [
+        [f"`{task}`", *(alone[task, each, "success_rate"].percent for each in ("shipped", "scripted"))]
+        for task in COOPERATIVE
+    ]
     body += [[f"`{task}`", *(each.percent for each in against(met, task, "scripted"))] for task in MATCHES]
-    return table(("task", "success or wins", "falls and collisions, or losses"), body)
+    return table(("task", "shipped team, %", "scripted team, %"), body)
 
 
 def members(found: Rates, task: str) -> dict[str, list[Rate]]:
