@@ -4,9 +4,6 @@
 the same bytes.
 """
 
-import csv
-import gzip
-import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +12,22 @@ from typing import TypeAlias
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from charts import (
+    BLUE,
+    FAINT,
+    GREEN,
+    GREY,
+    INK,
+    LINE,
+    ORANGE,
+    VIOLET,
+    WIDTH,
+    curves,
+    levers,
+    performance,
+    sizes,
+    students,
+)
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
@@ -26,9 +39,6 @@ from mqe_jax.runs.build import base_config
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "drawings"
-WIDTH = 640  # px, of every drawing; a phone shows it at half the size
-INK, FAINT, LINE = "#23252b", "#5f6672", "#8a93a3"
-BLUE, ORANGE, GREEN, VIOLET, GREY = "#2f7fd6", "#d9731a", "#2e8b57", "#7a55c7", "#6b7280"
 
 Size: TypeAlias = tuple[float, float]
 Point: TypeAlias = Size | np.ndarray
@@ -262,125 +272,9 @@ def league() -> Figure:
     return figure
 
 
-def curves() -> Figure:
-    """Success in evaluations during trainings with tuned settings, but `network.openrl_layers: false`."""
-    with gzip.open(ROOT / "results" / "paper" / "evaluations.csv.gz", "rt", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if (row["variant"], row["kind"]) == ("tuned", "training")]
-    return _curves(
-        rows,
-        "sampled/success_rate",
-        {"go1gate": "Narrow Gate, plain layers", "go1pushbox": "Push Box, plain layers"},
-        2.8,
-        (0, 102),
-    )
-
-
-def students() -> Figure:
-    """Success of training episodes while teams with sensors imitate the shipped ones: results/students.csv."""
-    with open(ROOT / "results" / "students.csv", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    titles = {
-        "go1gate": "Narrow Gate",
-        "go1seesaw": "Seesaw",
-        "go1sheep-easy": "Sheep Dog, one",
-        "go1sheep-hard": "Sheep Dog, nine",
-        "go1pushbox": "Push Box",
-        "go1football-defender": "Football, 2 vs 1",
-    }
-    return _curves(rows, "success", titles, 4.6, (70, 101))
-
-
-def _curves(
-    rows: Sequence[dict[str, str]], rate: str, titles: dict[str, str], height: float, limits: tuple[float, float]
-) -> Figure:
-    """Draws a rate of each task over its environment steps: each seed and their mean."""
-    figure, columns = Figure((WIDTH / 100, height), layout="constrained"), min(3, len(titles))
-    panels = figure.subplots(-(-len(titles) // columns), columns, sharex=True, sharey=True, squeeze=False)
-    for axes, (task, title) in zip(panels.flat, titles.items(), strict=True):
-        own = [row for row in rows if row["task"] == task]
-        table: dict[float, list[float]] = {}
-        for seed in sorted({row["seed"] for row in own}):
-            points = [(float(x["env_steps"]) / 1e6, 100 * float(x[rate])) for x in own if x["seed"] == seed]
-            axes.plot(*zip(*points, strict=True), color=BLUE, alpha=0.35, lw=1.2)
-            for step, success in points:
-                table.setdefault(step, []).append(success)
-        axes.plot([*table], [np.mean(values) for values in table.values()], color=BLUE, lw=2.4)
-        axes.set_title(title, fontsize=12, color=INK, loc="left", weight="bold")
-        axes.set(xlim=(0, None), ylim=limits)
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.supxlabel("environment steps, millions", fontsize=10.5)
-    figure.supylabel("success, % of the episodes", fontsize=10.5)
-    panels.flat[-1].plot([], [], color=BLUE, alpha=0.35, lw=1.2, label="one seed")
-    panels.flat[-1].plot([], [], color=BLUE, lw=2.4, label="mean of three")
-    panels.flat[-1].legend(loc="lower right", frameon=False, fontsize=10)
-    return figure
-
-
-def levers() -> Figure:
-    """Rates with and without each setting, with their intervals: results/levers.csv."""
-    with (ROOT / "results" / "levers.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    figure = Figure((WIDTH / 100, 2.7), layout="constrained")
-    axes = figure.subplots()
-    for place, row in enumerate(rows):
-        for end, color, shift in (("", BLUE, -0.15), ("_without", ORANGE, 0.15)):
-            value, low, high = (float(row[f"{name}{end}"]) for name in ("rate", "low", "high"))
-            axes.plot([low, high], [place + shift] * 2, color=color, lw=2.5, solid_capstyle="round")
-            axes.plot(value, place + shift, "o", color=color, ms=5)
-    axes.set_yticks(range(len(rows)), [f"{row['task']}: {row['lever']}" for row in rows], fontsize=9.5)
-    axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5))
-    axes.set_xlabel("success, or wins, %", fontsize=10.5)
-    axes.grid(axis="x", alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    for color, label in ((BLUE, "with, worst seed"), (ORANGE, "without, best seed")):
-        axes.plot([], [], "o-", color=color, label=label)
-    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=10)
-    return figure
-
-
-def sizes() -> Figure:
-    """Robot steps/s: by engine against the number of robots, and on Warp against the number of environments."""
-    entries = json.loads((ROOT / "results" / "measurements.json").read_text(encoding="utf-8"))
-    rates: dict[tuple[str, int, int], list[float]] = {}  # by engine and task, number of robots, number of environments
-    for row in (row for name in ("c", "mjx", "warp") for row in entries[f"sizes/{name}"]["rows"]):
-        kind, robots, sparse = f"{row['impl']} {row['task']}", row["num_agents"], row.get("sparse_solver", False)
-        default = sparse == (row["impl"] == "warp" and robots > 4)
-        for case in [kind] * default + [f"{kind} false"] * (row.get("sparse_solver") is False):
-            rates.setdefault((case, robots, row["num_envs"]), []).append(robots * row["env_steps_per_s"])
-    football = "go1football-1vs1"
-    engines = {
-        (f"warp {football}", 2048): ("Warp, football", VIOLET),
-        ("warp go1gate", 2048): ("Warp, gate", GREEN),
-        (f"c {football}", 64): ("C, football", BLUE),
-        (f"jax {football}", 4): ("MJX, football", ORANGE),
-    }
-    colors = {2: GREY, 16: VIOLET, 64: INK}
-    sized = {(f"warp {football}", number): (f"{number} robots", color) for number, color in colors.items()}
-    figure = Figure((WIDTH / 100, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    for axes, varied, title, lines in ((left, 1, "robots", engines), (right, 2, "environments on Warp", sized)):
-        for (kind, fixed), (label, color) in lines.items():
-            for case, style in ((f"{kind} false", "o--"), (kind, "o-")):
-                own = {x[varied]: rate for x, rate in sorted(rates.items()) if (x[0], x[3 - varied]) == (case, fixed)}
-                look = {"color": color, "ms": 4, "label": label if case == kind else None}
-                axes.plot([*own], [np.median(values) for values in own.values()], style, **look)
-        axes.set(xscale="log", yscale="log")
-        axes.set_xlabel(title, fontsize=10.5)
-        ticks = sorted({x[varied] for x in rates if varied == 1 or x[:2] == (f"warp {football}", 2)})
-        axes.set_xticks(ticks, [str(tick) for tick in ticks], fontsize=9)
-        axes.minorticks_off()
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-    right.plot([], [], "--", color=FAINT, label="sparse_solver=false")
-    left.legend(loc=(0.03, 0.42), frameon=False, fontsize=10)
-    right.legend(loc="lower right", frameon=False, fontsize=10)
-    left.set_ylabel("robot steps/s", fontsize=10.5)
-    return figure
-
-
 DRAWINGS: dict[str, Callable[[], Figure]] = {
-    each.__name__: each for each in (architecture, observation, match_frames, league, curves, students, levers, sizes)
+    each.__name__: each
+    for each in (architecture, observation, match_frames, league, curves, students, levers, sizes, performance)
 }
 
 

@@ -1,0 +1,168 @@
+"""Charts of docs/drawings, drawn from results/ by tools/drawings.py."""
+
+import csv
+import gzip
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+RESULTS = Path(__file__).parents[1] / "results"
+WIDTH = 640  # px, of every drawing; a phone shows it at half the size
+INK, FAINT, LINE = "#23252b", "#5f6672", "#8a93a3"
+BLUE, ORANGE, GREEN, VIOLET, GREY = "#2f7fd6", "#d9731a", "#2e8b57", "#7a55c7", "#6b7280"
+
+
+def curves() -> Figure:
+    """Success in evaluations during trainings with tuned settings, but `network.openrl_layers: false`."""
+    with gzip.open(RESULTS / "paper" / "evaluations.csv.gz", "rt", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if (row["variant"], row["kind"]) == ("tuned", "training")]
+    return _curves(
+        rows,
+        "sampled/success_rate",
+        {"go1gate": "Narrow Gate, plain layers", "go1pushbox": "Push Box, plain layers"},
+        2.8,
+        (0, 102),
+    )
+
+
+def students() -> Figure:
+    """Success of training episodes while teams with sensors imitate the shipped ones: results/students.csv."""
+    with open(RESULTS / "students.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    titles = {
+        "go1gate": "Narrow Gate",
+        "go1seesaw": "Seesaw",
+        "go1sheep-easy": "Sheep Dog, one",
+        "go1sheep-hard": "Sheep Dog, nine",
+        "go1pushbox": "Push Box",
+        "go1football-defender": "Football, 2 vs 1",
+    }
+    return _curves(rows, "success", titles, 4.6, (70, 101))
+
+
+def _curves(
+    rows: Sequence[dict[str, str]], rate: str, titles: dict[str, str], height: float, limits: tuple[float, float]
+) -> Figure:
+    """Draws a rate of each task over its environment steps: each seed and their mean."""
+    figure, columns = Figure((WIDTH / 100, height), layout="constrained"), min(3, len(titles))
+    panels = figure.subplots(-(-len(titles) // columns), columns, sharex=True, sharey=True, squeeze=False)
+    for axes, (task, title) in zip(panels.flat, titles.items(), strict=True):
+        own = [row for row in rows if row["task"] == task]
+        table: dict[float, list[float]] = {}
+        for seed in sorted({row["seed"] for row in own}):
+            points = [(float(x["env_steps"]) / 1e6, 100 * float(x[rate])) for x in own if x["seed"] == seed]
+            axes.plot(*zip(*points, strict=True), color=BLUE, alpha=0.35, lw=1.2)
+            for step, success in points:
+                table.setdefault(step, []).append(success)
+        axes.plot([*table], [np.mean(values) for values in table.values()], color=BLUE, lw=2.4)
+        axes.set_title(title, fontsize=12, color=INK, loc="left", weight="bold")
+        axes.set(xlim=(0, None), ylim=limits)
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel("environment steps, millions", fontsize=10.5)
+    figure.supylabel("success, % of the episodes", fontsize=10.5)
+    panels.flat[-1].plot([], [], color=BLUE, alpha=0.35, lw=1.2, label="one seed")
+    panels.flat[-1].plot([], [], color=BLUE, lw=2.4, label="mean of three")
+    panels.flat[-1].legend(loc="lower right", frameon=False, fontsize=10)
+    return figure
+
+
+def levers() -> Figure:
+    """Rates with and without each setting, with their intervals: results/levers.csv."""
+    with (RESULTS / "levers.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    figure = Figure((WIDTH / 100, 2.7), layout="constrained")
+    axes = figure.subplots()
+    for place, row in enumerate(rows):
+        for end, color, shift in (("", BLUE, -0.15), ("_without", ORANGE, 0.15)):
+            value, low, high = (float(row[f"{name}{end}"]) for name in ("rate", "low", "high"))
+            axes.plot([low, high], [place + shift] * 2, color=color, lw=2.5, solid_capstyle="round")
+            axes.plot(value, place + shift, "o", color=color, ms=5)
+    axes.set_yticks(range(len(rows)), [f"{row['task']}: {row['lever']}" for row in rows], fontsize=9.5)
+    axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5))
+    axes.set_xlabel("success, or wins, %", fontsize=10.5)
+    axes.grid(axis="x", alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    for color, label in ((BLUE, "with, worst seed"), (ORANGE, "without, best seed")):
+        axes.plot([], [], "o-", color=color, label=label)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=10)
+    return figure
+
+
+def sizes() -> Figure:
+    """Robot steps/s: by engine against the number of robots, and on Warp against the number of environments."""
+    entries = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))
+    rates: dict[tuple[str, int, int], list[float]] = {}  # by engine and task, number of robots, number of environments
+    for row in (row for name in ("c", "mjx", "warp") for row in entries[f"sizes/{name}"]["rows"]):
+        kind, robots, sparse = f"{row['impl']} {row['task']}", row["num_agents"], row.get("sparse_solver", False)
+        default = sparse == (row["impl"] == "warp" and robots > 4)
+        for case in [kind] * default + [f"{kind} false"] * (row.get("sparse_solver") is False):
+            rates.setdefault((case, robots, row["num_envs"]), []).append(robots * row["env_steps_per_s"])
+    football = "go1football-1vs1"
+    engines = {
+        (f"warp {football}", 2048): ("Warp, football", VIOLET),
+        ("warp go1gate", 2048): ("Warp, gate", GREEN),
+        (f"c {football}", 64): ("C, football", BLUE),
+        (f"jax {football}", 4): ("MJX, football", ORANGE),
+    }
+    colors = {2: GREY, 16: VIOLET, 64: INK}
+    sized = {(f"warp {football}", number): (f"{number} robots", color) for number, color in colors.items()}
+    figure = Figure((WIDTH / 100, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axes, varied, title, lines in ((left, 1, "robots", engines), (right, 2, "environments on Warp", sized)):
+        for (kind, fixed), (label, color) in lines.items():
+            for case, style in ((f"{kind} false", "o--"), (kind, "o-")):
+                own = {x[varied]: rate for x, rate in sorted(rates.items()) if (x[0], x[3 - varied]) == (case, fixed)}
+                look = {"color": color, "ms": 4, "label": label if case == kind else None}
+                axes.plot([*own], [np.median(values) for values in own.values()], style, **look)
+        axes.set(xscale="log", yscale="log")
+        axes.set_xlabel(title, fontsize=10.5)
+        ticks = sorted({x[varied] for x in rates if varied == 1 or x[:2] == (f"warp {football}", 2)})
+        axes.set_xticks(ticks, [str(tick) for tick in ticks], fontsize=9)
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    right.plot([], [], "--", color=FAINT, label="sparse_solver=false")
+    left.legend(loc=(0.03, 0.42), frameon=False, fontsize=10)
+    right.legend(loc="lower right", frameon=False, fontsize=10)
+    left.set_ylabel("robot steps/s", fontsize=10.5)
+    return figure
+
+
+def performance() -> Figure:
+    """Environment steps/s of Narrow Gate by hardware and engine, with the slowest and the fastest call."""
+    entries = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))
+    bench = entries["bench_idle"]["rows"][:3]  # the fourth row is another skill
+    warp = [(row["num_envs"], *(row[x] for x in ("env_steps_per_s", "slowest", "fastest"))) for row in bench]
+    rows = [row for row in entries["bench_h100"] if row["impl"] == "jax"]
+    mjx = sorted((int(row["num_envs"]), *[float(row["env_steps_per_s"])] * 3) for row in rows)
+    cores = [(environments, *[rate] * 3) for environments, rate, _ in entries["bench_c16"]["sizes"]]
+    two = entries["skills/speed"]["c, 2 CPU cores, 8 interleaved timings"]["walk"]
+    lines = (  # label, colour, values, offset of the label from the last point, its alignment
+        ("Warp, NVIDIA H200", VIOLET, warp, (4, 14), "right"),
+        ("MJX, NVIDIA H100", ORANGE, mjx, (4, 14), "right"),
+        ("C, 16 CPU cores", BLUE, cores, (10, 0), "left"),
+        ("C, 2 CPU cores", GREEN, [(256, np.median(two), min(two), max(two))], (-6, -18), "left"),
+        ("Isaac Gym, RTX 3090 (paper)", INK, [(500, 18300, 18300, 18300)], (10, 0), "left"),
+    )
+    figure = Figure((WIDTH / 100, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for label, color, points, shift, side in lines:
+        environments, rates, slowest, fastest = zip(*points, strict=True)
+        axes.vlines(environments, slowest, fastest, color=color, lw=5, alpha=0.35)
+        axes.plot(environments, rates, "o-", color=color, lw=2.2, ms=7)
+        at = (environments[-1], rates[-1])
+        look = {"ha": side, "va": "center", "weight": "bold", "fontsize": 13, "color": color}
+        axes.annotate(label, at, shift, textcoords="offset points", **look)
+    axes.set(xscale="log", yscale="log", xlim=(215, 5000), ylim=(9e3, 1.6e6))
+    axes.set_xticks(ticks := [256, 512, 1024, 2048, 4096], [str(tick) for tick in ticks], fontsize=13)
+    axes.set_yticks(ticks := [10_000, 100_000, 1_000_000], [f"{tick:,}" for tick in ticks], fontsize=13)
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel("environments", fontsize=13)
+    axes.set_ylabel("environment steps/s", fontsize=13)
+    return figure
