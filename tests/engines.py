@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from tyro.conf import Positional
 
-from mqe_jax.envs import PLANNERS, TASKS, State, VectorEnv, make
+from mqe_jax.envs import SCRIPTED, TASKS, State, VectorEnv, make
 from mqe_jax.physics import robots
 from mqe_jax.physics.engines import STATE_FIELDS
 from mqe_jax.policies.scripted import scripted_policy
@@ -65,7 +65,7 @@ def played(task: str, num_envs: int, seed: int = 0) -> dict[str, np.ndarray]:
     Of each environment's first `PLAY` steps, the one in which objects move fastest and robots touch most.
     """
     env: Any = make(task, impl="c", num_envs=num_envs)
-    vector_env, plan = VectorEnv(env, num_envs), jax.vmap(scripted_policy(env) if task in PLANNERS else ahead)
+    vector_env, plan = VectorEnv(env, num_envs), jax.vmap(scripted_policy(env) if task in SCRIPTED else ahead)
     robots = np.concatenate([env.index.base_qvel, env.index.joint_qvel], axis=1).ravel()
     rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
 

@@ -25,8 +25,8 @@ from mqe_jax import cli
 from mqe_jax.cli import demo
 from mqe_jax.cli.arguments import COMMANDS, parse
 from mqe_jax.core.settings import override
-from mqe_jax.envs import PLANNERS, TASKS, QuadrupedEnv, VectorEnv, make
-from mqe_jax.envs.registry import NAMED_PLANNERS
+from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs.registry import NAMED_SCRIPTED
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.runs import build
 from mqe_jax.train.config import TrainConfig
@@ -128,7 +128,7 @@ SLOW = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_tea
     ],
 )
 def test_examples_of_docstrings_run(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(NAMED_PLANNERS, "go1tug", {})  # one of them registers a policy
+    monkeypatch.setitem(NAMED_SCRIPTED, "go1tug", {})  # one of them registers a policy
     Path("few.yaml").write_text("{num_envs: 8, rollout_steps: 16, ppo: {epochs: 1}, network: {hidden_sizes: [8]}}")
     for name, few in LONG.items():
         monkeypatch.setattr(mqe_jax, name, functools.partial(getattr(mqe_jax, name), **few))
@@ -263,7 +263,7 @@ def example(script_folder: None) -> Any:
     """The module of the guide to a new task; its registrations are removed afterwards."""
     module = importlib.import_module("new_task")
     yield module
-    del sys.modules["new_task"], TASKS["go1catch"], PLANNERS["go1catch"]
+    del sys.modules["new_task"], TASKS["go1catch"], SCRIPTED["go1catch"]
 
 
 def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: Any) -> None:

@@ -25,7 +25,7 @@ from mqe_jax.core import limits, memory
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, check, load_yaml, override
 from mqe_jax.envs import TASKS, QuadrupedEnv, VectorEnv, make, register_task
-from mqe_jax.envs.registry import register_planner
+from mqe_jax.envs.registry import register_scripted
 from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
@@ -171,9 +171,9 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("episodes: ", lambda x, v: mqe_jax.exploitability("go1tug", "idle", "a", episodes=v), (None, 3, 0, "x")),
     ("polic", lambda x, v: mqe_jax.double_oracle("go1tug", v, "a"), (None, 3, [], ["x"], ["go1tug"] * 2, ["idle"])),
     ("rounds: ", lambda x, v: mqe_jax.double_oracle("go1tug", ["go1tug"], "a", rounds=v), (None, 0, "x")),
-    ("planner: ", lambda x, v: register_task(TASKS["go1gate"], v), (3, "x")),
-    ("planner: ", lambda x, v: register_planner("go1gate", "mine", v), (None, 3, "x")),
-    ("name: ", lambda x, v: register_planner("go1gate", v, lambda obs: obs["base"]), (None, 3, "")),
+    ("scripted: ", lambda x, v: register_task(TASKS["go1gate"], v), (3, "x")),
+    ("policy: ", lambda x, v: register_scripted("go1gate", "mine", v), (None, 3, "x")),
+    ("name: ", lambda x, v: register_scripted("go1gate", v, lambda obs: obs["base"]), (None, 3, "")),
     ("num_envs: ", lambda x, v: mqe_jax.bench("go1gate", num_envs=v), (None, 0, "x")),
     ("skill: ", lambda x, v: mqe_jax.train_skill(v, "runs/a"), (None, 3, "walc")),
     ("scenario", lambda x, v: mqe_jax.evaluate_skill("walk", scenarios=v), (3, ["flatt"], [3])),

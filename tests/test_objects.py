@@ -155,7 +155,7 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
     ("task", "share"),
     [("go1gate", 0.9), *(pytest.param(task, 0.6, marks=pytest.mark.soak) for task in ("go1sheep-hard", "go1seesaw"))],
 )
-def test_the_planner_wins(task: str, share: float) -> None:
+def test_the_scripted_policy_wins(task: str, share: float) -> None:
     from mqe_jax.train.evaluate import evaluate_batch
 
     batch = VectorEnv(make(task, impl="c", num_envs=16), 16)

@@ -23,7 +23,7 @@ from viewer import open_page
 
 from mqe_jax import cli
 from mqe_jax.core.errors import InputError
-from mqe_jax.envs import PLANNERS
+from mqe_jax.envs import SCRIPTED
 from mqe_jax.export import libraries
 from tests.inputs import refuses
 
@@ -118,7 +118,7 @@ def test_graphs_agree_with_the_environment_in_an_episode(built: SimpleNamespace)
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("task", [*PLANNERS, *LARGER])
+@pytest.mark.parametrize("task", [*SCRIPTED, *LARGER])
 def test_graphs_of_every_task_agree_in_a_long_episode(task: str, tmp_path: Path) -> None:
     assert "terminated" in check_graphs(write(task, tmp_path), 200)
 

@@ -16,13 +16,13 @@ from mqe_jax import cli, skills
 from mqe_jax.cli.commands import Eval
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import override
-from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
-from mqe_jax.envs.registry import NAMED_PLANNERS, register_planner
+from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
+from mqe_jax.envs.registry import NAMED_SCRIPTED, register_scripted
 from mqe_jax.envs.state import ENDINGS
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.policies import BothTeams, SimplePolicy, load_policy, parameters_for, zoo
-from mqe_jax.policies.scripted import planner_of
+from mqe_jax.policies.scripted import find_scripted
 from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.policies.scripted.matches import plan_tug
 from mqe_jax.runs.build import players
@@ -208,25 +208,25 @@ def test_the_climber_enters_the_plank_centred_and_leaves_its_low_end_at_its_edge
 
 
 def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> None:
-    assert set(TASKS) - set(PLANNERS) == {"go1plane"}
-    for task in PLANNERS:
-        assert planner_of(task).__module__.startswith("mqe_jax.policies.scripted.")
-    refuses(r"go1plane has no scripted policy; allowed for: go1gate, ", planner_of, "go1plane")
+    assert set(TASKS) - set(SCRIPTED) == {"go1plane"}
+    for task in SCRIPTED:
+        assert find_scripted(task).__module__.startswith("mqe_jax.policies.scripted.")
+    refuses(r"go1plane has no scripted policy; allowed for: go1gate, ", find_scripted, "go1plane")
 
 
 def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     def ahead(obs: dict[str, jax.Array]) -> jax.Array:
         return jnp.zeros((len(obs["base"]), 3)).at[:, 0].set(0.7)
 
-    monkeypatch.setitem(NAMED_PLANNERS, "go1wrestling", {})
-    register_planner("go1wrestling", "ahead", ahead)
+    monkeypatch.setitem(NAMED_SCRIPTED, "go1wrestling", {})
+    register_scripted("go1wrestling", "ahead", ahead)
     env = make("go1wrestling", impl="c", num_envs=1)
     action, _ = load_policy("ahead", env).act(jnp.zeros((2, 1, 12)), (), jax.random.PRNGKey(0))
     np.testing.assert_allclose(action[:, 0], [[0.7, 0, 0]] * 2, atol=1e-6)
     with pytest.raises(InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge"):
         load_policy("ahead", make("go1tug", impl="c", num_envs=1))
-    refuses("already registered for go1wrestling", register_planner, "go1wrestling", "ahead", lambda obs: obs["base"])
-    refuses("unknown task 'go1sumo'", register_planner, "go1sumo", "ahead", ahead)
+    refuses("already registered for go1wrestling", register_scripted, "go1wrestling", "ahead", lambda obs: obs["base"])
+    refuses("unknown task 'go1sumo'", register_scripted, "go1sumo", "ahead", ahead)
 
 
 # -- skills ------------------------------------------------------------------------------------------------------------

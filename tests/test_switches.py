@@ -17,7 +17,7 @@ from jax.extend.random import threefry_2x32
 from mqe_jax.core import threefry  # noqa: F401
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
-from mqe_jax.envs import PLANNERS, TASKS, VectorEnv, make
+from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
 from mqe_jax.policies import all_agents, load_policy, parameters_for
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.train.checkpoint import load_tree, save_tree
@@ -68,7 +68,7 @@ def test_the_loops_of_jax_step_every_task(task: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "name"), [*((x, x) for x in TASKS if x != "go1plane"), *((x, "scripted") for x in PLANNERS)]
+    ("task", "name"), [*((x, x) for x in TASKS if x != "go1plane"), *((x, "scripted") for x in SCRIPTED)]
 )
 def test_policies_act_in_single_precision(task: str, name: str) -> None:
     with strict_x64():

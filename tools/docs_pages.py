@@ -155,12 +155,12 @@ def overview(tasks: Mapping[str, Any]) -> str:
 
 def task_page(task: Any) -> str:
     """Returns the page of a task."""
-    from mqe_jax.envs import PLANNERS
+    from mqe_jax.envs import SCRIPTED
 
     env, name = task(num_envs=1, impl="c"), task.name
     bodies = (inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__)
     body = next(filter(None, bodies))  # that of a base class where the task's is one line
-    policy = "shipped" if name in zoo.names() else "scripted" if name in PLANNERS else "forward"
+    policy = "shipped" if name in zoo.names() else "scripted" if name in SCRIPTED else "forward"
     flags, against = (" --opponent scripted", " against the scripted one") if len(env.teams) > 1 else ("", "")
     caption = f"A typical success of the {policy} policy{against}: [how good it is](../results/strength.md)."
     media = [f"![{task.title}: {task.aim}]({_clip(name)})", caption] if _clip(name) else []

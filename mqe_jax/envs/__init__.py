@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.settings import check_arguments, override
-from mqe_jax.envs.registry import ALIASES, PLANNERS, TASKS, register_task, task_id
+from mqe_jax.envs.registry import ALIASES, SCRIPTED, TASKS, register_task, task_id
 
 if TYPE_CHECKING:
     from mqe_jax.envs.autoreset import VectorEnv
@@ -69,7 +69,7 @@ def make(
 
 __all__ = [
     "ALIASES",
-    "PLANNERS",
+    "SCRIPTED",
     "TASKS",
     "EnvironmentState",
     "Moment",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mqe_jax.envs.base import QuadrupedEnv
 
-Planner: TypeAlias = "Callable[[dict[str, jax.Array]], jax.Array]"
+ScriptedPolicy: TypeAlias = "Callable[[dict[str, jax.Array]], jax.Array]"
 """Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the `command` mode."""
 
 
@@ -27,7 +27,7 @@ class Shipped(NamedTuple):
 
     task: str
     """MODULE:CLASS of mqe_jax.envs."""
-    planner: str | None
+    scripted: str | None
     """Scripted policy, MODULE:FUNCTION of mqe_jax.policies.scripted."""
     title: str
     """Its class's `title`."""
@@ -86,38 +86,39 @@ class _Tasks(UserDict[str, Any]):
 TASKS = _Tasks(dict.fromkeys(SHIPPED))
 """Task classes by id."""
 
-PLANNERS: dict[str, Planner | str] = {name: task.planner for name, task in SHIPPED.items() if task.planner is not None}
-"""Scripted policies by task id; shipped ones as MODULE:FUNCTION, since this package does not import `planners`."""
+SCRIPTED: dict[str, ScriptedPolicy | str] = {
+    name: task.scripted for name, task in SHIPPED.items() if task.scripted is not None
+}
+"""Scripted policies by task id; shipped ones as MODULE:FUNCTION, since `envs` does not import `policies`."""
 
-
-NAMED_PLANNERS: dict[str, dict[str, Planner | str]] = {
+NAMED_SCRIPTED: dict[str, dict[str, ScriptedPolicy | str]] = {
     "go1sheep-hard": {"by-distance": "cooperative:plan_sheep_by_distance"}
 }
-"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`); shipped ones as in `PLANNERS`."""
+"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`); shipped ones as in `SCRIPTED`."""
 
 
-@check_arguments(task=str, name=str, planner=Callable)
-def register_planner(task: str, name: str, planner: Planner) -> None:
+@check_arguments(task=str, name=str, policy=Callable)
+def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
     """Registers a further scripted policy of a task under a name that no other one has.
 
     Example:
         ```python
-        from mqe_jax.envs.registry import register_planner
+        from mqe_jax.envs.registry import register_scripted
 
-        register_planner("go1tug", "wait", lambda obs: jax.numpy.zeros((len(obs["base"]), 3)))
+        register_scripted("go1tug", "wait", lambda obs: jax.numpy.zeros((len(obs["base"]), 3)))
         policy = mqe_jax.load_policy("wait", mqe_jax.make("go1tug"))
         ```
     """
     if not name:
         fail("name", name, "a text that is not empty")
     if task not in TASKS:
-        raise InputError(f"planner {name!r}: unknown task {task!r}; allowed: {', '.join(TASKS)}")
-    if NAMED_PLANNERS.setdefault(task, {}).setdefault(name, planner) is not planner:
-        raise InputError(f"planner: the name {name!r} is already registered for {task}")
+        raise InputError(f"policy {name!r}: unknown task {task!r}; allowed: {', '.join(TASKS)}")
+    if NAMED_SCRIPTED.setdefault(task, {}).setdefault(name, policy) is not policy:
+        raise InputError(f"policy: the name {name!r} is already registered for {task}")
 
 
-@check_arguments(planner=Callable | None)
-def register_task(task: type[QuadrupedEnv], planner: Planner | None = None) -> type[QuadrupedEnv]:
+@check_arguments(scripted=Callable | None)
+def register_task(task: type[QuadrupedEnv], scripted: ScriptedPolicy | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
     A class decorator too. InputError if it is no class of tasks, has no name, or another class has that name.
@@ -132,8 +133,8 @@ def register_task(task: type[QuadrupedEnv], planner: Planner | None = None) -> t
     if known is not None and (known.__module__, known.__qualname__) != (task.__module__, task.__qualname__):
         raise InputError(f"task {task.__name__}: the id {task.name!r} is already registered by {known.__name__}")
     TASKS[task.name] = task
-    if planner is not None:
-        PLANNERS[task.name] = planner
+    if scripted is not None:
+        SCRIPTED[task.name] = scripted
     return task
 
 

@@ -21,7 +21,7 @@ import onnx
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.files import write_atomically
 from mqe_jax.core.settings import fail, override
-from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, make
+from mqe_jax.envs import ALIASES, SCRIPTED, TASKS, QuadrupedEnv, make
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.export.check import verify
 from mqe_jax.export.libraries import add_libraries
@@ -119,7 +119,7 @@ def write_site(
 
 def entries(sources: Sequence[str]) -> list[Entry]:
     """Returns the tasks of a site; runs of one task with the same parameters share an entry."""
-    playable = [task for task in TASKS if task in PLANNERS or task in zoo.names()]
+    playable = [task for task in TASKS if task in SCRIPTED or task in zoo.names()]
     found: list[tuple[str, dict[str, Any], Entry]] = []
     for source in dict.fromkeys(sources or [*playable, *LARGER]):
         task, params, policies = _source(source, playable)
@@ -141,7 +141,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
             short = name if name == "shipped" else _short(Path(name), entry.policies)
             entry.policies[short] = translate(policy, entry.env, source)
     for task, _, entry in found:
-        if task in PLANNERS and entry.env.params.commands == type(entry.env.params).commands:
+        if task in SCRIPTED and entry.env.params.commands == type(entry.env.params).commands:
             entry.policies.setdefault("scripted", load_policy("scripted", entry.env))
     return [entry for *_, entry in found]
 

@@ -20,7 +20,7 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check, check_arguments, fail
 from mqe_jax.core.types import AnyEnvironment, Memory, Observations, PolicyOrAct, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
-from mqe_jax.envs.registry import NAMED_PLANNERS, TASKS
+from mqe_jax.envs.registry import NAMED_SCRIPTED, TASKS
 from mqe_jax.policies import mixture, zoo
 from mqe_jax.policies.mixture import Trained
 from mqe_jax.policies.scripted import scripted_policy
@@ -164,7 +164,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
         ```
 
     Args:
-        source: one of `NAMES`, of the task's `NAMED_PLANNERS`, a task with a shipped policy
+        source: one of `NAMES`, of the task's `NAMED_SCRIPTED`, a task with a shipped policy
             (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path. A folder with one of these
             names is ./NAME.
         env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
@@ -180,7 +180,7 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
     """
     env = getattr(env, "env", env)  # of a batch
     given, source = str(source), source if env is None else population.resolve(source, env.name)
-    further = () if env is None else tuple(NAMED_PLANNERS.get(env.name, ()))
+    further = () if env is None else tuple(NAMED_SCRIPTED.get(env.name, ()))
     if str(source) in (*NAMES, *further):
         if env is None:
             raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")

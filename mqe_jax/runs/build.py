@@ -13,7 +13,7 @@ from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, differences, fail, merge, override
 from mqe_jax.core.types import Cast
 from mqe_jax.core.types import VectorEnv as AnyVectorEnv
-from mqe_jax.envs import ALIASES, PLANNERS, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
+from mqe_jax.envs import ALIASES, SCRIPTED, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.policies import all_agents, load_as, load_policy, parameters_for, zoo
@@ -230,7 +230,7 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
 def reference_opponents(env: QuadrupedEnv) -> list[str]:
     """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
     walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
-    return [*(["scripted"] if env.name in PLANNERS and walking else []), "idle", "random"]
+    return [*(["scripted"] if env.name in SCRIPTED and walking else []), "idle", "random"]
 
 
 def platform() -> str:
@@ -286,7 +286,7 @@ def players(
             config = run_config(name)
             made, params, policy = config.task or "", merge(config.env, params), policy or name
     shipped = name in zoo.names() and not {*params} - {"senses"} and policy is None
-    walking = "scripted" if name in PLANNERS else "forward"
+    walking = "scripted" if name in SCRIPTED else "forward"
     default = walking if params.get("control", "command") == "command" else "random"
     chosen = (name if shipped else default) if policy is None else policy
     if isinstance(made, str):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.envs import PLANNERS, TASKS
+from mqe_jax.envs import SCRIPTED, TASKS
 from mqe_jax.envs.match import Match
 from mqe_jax.policies import zoo
 from mqe_jax.train.folder import load_run_config
@@ -42,7 +42,7 @@ class Menu:
     def policies(self, task: str) -> tuple[str, ...]:
         """Returns the policies of a task."""
         shipped = (task,) if task in zoo.names() else ()
-        scripted = ("scripted",) if task in PLANNERS else ()
+        scripted = ("scripted",) if task in SCRIPTED else ()
         runs = tuple(run for run, its_task in self.runs.items() if its_task == task)
         found = (DEFAULT, *shipped, *scripted, "random", "idle", "forward", *runs)
         own = (self.shown.policy, self.shown.opponent) if task == self.shown.task else ()

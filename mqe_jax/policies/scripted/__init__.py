@@ -12,7 +12,7 @@ from mqe_jax.core.settings import check_arguments
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import ObservationLayout
-from mqe_jax.envs.registry import NAMED_PLANNERS, PLANNERS, Planner, load
+from mqe_jax.envs.registry import NAMED_SCRIPTED, SCRIPTED, ScriptedPolicy, load
 
 # The blocks (A, width) of one environment's observations by name.
 Observation = Mapping[str, jax.Array]
@@ -21,16 +21,16 @@ _FAR = 1e3  # m, x and y of who takes no part
 GAIN = 1.5  # 1/s, commanded speed per distance from the goal
 
 
-def planner_of(task: str, name: str = "scripted") -> Planner:
+def find_scripted(task: str, name: str = "scripted") -> ScriptedPolicy:
     """Returns a task's scripted policy: one team's observation blocks (A, width) by name -> its actions (A, 3).
 
     Raises:
         InputError: if the task has none of this name.
     """
-    planner = PLANNERS.get(task) if name == "scripted" else NAMED_PLANNERS.get(task, {}).get(name)
-    if planner is None:
-        raise InputError(f"policy: {task} has no {name} policy; allowed for: {', '.join(PLANNERS)}")
-    return load("mqe_jax.policies.scripted", planner) if isinstance(planner, str) else planner
+    policy = SCRIPTED.get(task) if name == "scripted" else NAMED_SCRIPTED.get(task, {}).get(name)
+    if policy is None:
+        raise InputError(f"policy: {task} has no {name} policy; allowed for: {', '.join(SCRIPTED)}")
+    return load("mqe_jax.policies.scripted", policy) if isinstance(policy, str) else policy
 
 
 @check_arguments(env=AnySingle, name=str)
@@ -49,13 +49,13 @@ def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.
     Raises:
         InputError: if the task has none of this name.
     """
-    plan, layout = planner_of(env.name, name), env.observation_layout
+    plan, layout = find_scripted(env.name, name), env.observation_layout
     if env.varies:
         return functools.partial(_plan_with_absent, plan, layout)
     return lambda obs: plan(layout.split(obs))
 
 
-def _plan_with_absent(plan: Planner, layout: ObservationLayout, obs: jax.Array) -> jax.Array:
+def _plan_with_absent(plan: ScriptedPolicy, layout: ObservationLayout, obs: jax.Array) -> jax.Array:
     """Returns the actions (A, 3) of a policy that finds robots and other entities that take no part far away.
 
     They are those whose entries are 0. The block `active` says which agents take part (A,); the others' actions are 0.
