@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mqe_jax.core.settings import NonNegative, Positive, PositiveInt, record
+from mqe_jax.core.settings import NonNegative, Positive, PositiveInt, settings_class
 from mqe_jax.envs import Moment, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.physics.collision import OBJECT_BIT, WALL_BIT
@@ -44,7 +44,7 @@ class Pillar(TerrainBlock):
 # Step 2: an object adds one body named `object/<name>`; its joints are its generalised coordinates.
 
 
-@record
+@settings_class
 class Mouse(Object):
     """A ball-shaped mouse that slides over the ground. Coordinates: x, y; velocity likewise."""
 
@@ -78,7 +78,7 @@ def flee(mouse: jax.Array, robot: jax.Array, speed: float, sight: float = 1.5) -
 # Step 4: the task: parameters, scene, reset, observation, rewards, ending.
 
 
-@record
+@settings_class
 class CatchRewards:
     """Weights of the reward terms."""
 
@@ -88,7 +88,7 @@ class CatchRewards:
     """In the step in which the robot catches the mouse."""
 
 
-@record
+@settings_class
 class CatchParams(TaskParams):
     """Parameters of Catch a Mouse."""
 

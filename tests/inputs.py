@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mqe_jax.cli.arguments import COMMANDS
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import hints_of, is_record
+from mqe_jax.core.settings import hints_of, is_settings
 from mqe_jax.envs import TASKS
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.config import TrainConfig
@@ -57,18 +57,18 @@ def refuses(said: str, call: Callable[..., Any], *arguments: Any, **named: Any) 
     assert "\n" not in text and len(text) <= LONGEST, text
 
 
-def records() -> dict[str, Any]:
+def settings_classes() -> dict[str, Any]:
     """Returns the classes whose fields are settings, by name; those of a task are its parameters."""
     found: dict[str, Any] = {"training": TrainConfig, "sweep": Sweep, "walk": WalkTask}
     found |= {f"network {name}": kind for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")}
     return found | {task: kind.Params for task, kind in TASKS.items()}
 
 
-def numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, hint in hints_of(record).items():
+def numbers(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, hint in hints_of(settings).items():
         if (kind := number_in(hint)) is not None:
             yield prefix + name, kind
-        elif is_record(hint):
+        elif is_settings(hint):
             yield from numbers(hint, f"{prefix}{name}.")
 
 
@@ -94,7 +94,7 @@ def refused(kind: Any) -> Strategy:
 @st.composite
 def wrong_settings(draw: st.DrawFn) -> tuple[str, str, Any]:
     """A settings class's name, a dotted name of a number in it, and a value that it must reject."""
-    known = records()
+    known = settings_classes()
     name = draw(st.sampled_from(sorted(known)))
     fields = dict(numbers(known[name]))
     field = draw(st.sampled_from(sorted(fields)))
@@ -115,7 +115,7 @@ LONG = ("view", "walk train", "walk eval", "tournament", "exploit", "oracle")
 """Commands that run for long where a text happens to be allowed; they get numbers only, which never are."""
 
 
-def command_record(command: str) -> Any:
+def settings_of(command: str) -> Any:
     return TrainConfig if isinstance(COMMANDS[command], str) else COMMANDS[command]
 
 
@@ -124,7 +124,7 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
     """Words of a command line with a number that is refused, or a hostile text anywhere."""
     command = draw(st.sampled_from(sorted(set(COMMANDS) - {"demo", "tasks", "zoo"})))
     words = [*command.split(), *TARGETS.get(command, [])]
-    fields = dict(numbers(command_record(command)))
+    fields = dict(numbers(settings_of(command)))
     text = st.sampled_from(TEXTS) | st.text(max_size=20)
     if command in LONG or (fields and draw(st.integers(0, 3))):
         field = draw(st.sampled_from(sorted(fields)))
@@ -136,9 +136,9 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
 
 
 @st.composite
-def yaml_text(draw: st.DrawFn, record: Any) -> str:
+def yaml_text(draw: st.DrawFn, settings: Any) -> str:
     """YAML of the names of settings with hostile values, as text since a value may be a fragment."""
-    names = [*hints_of(record), *(name for name, _ in numbers(record)), *"nothing [a] 1 null self env.task".split()]
+    names = [*hints_of(settings), *(name for name, _ in numbers(settings)), *"nothing [a] 1 null self env.task".split()]
     value = st.sampled_from(TEXTS) | st.text(max_size=30) | st.floats().map(str) | st.integers().map(str)
     lines = draw(st.lists(st.tuples(st.sampled_from(names), value), min_size=1, max_size=4))
     return "\n".join(f"{name}: {text}" for name, text in lines)

@@ -323,7 +323,7 @@ def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str
     """In every settings class: training, sweeps, walking, networks and the parameters of all tasks."""
     name, field, value = case
     needed = {"tasks": ("go1gate",)} if name == "sweep" else {}
-    refuses(field.split(".")[-1], build, inputs.records()[name], {field: value} | needed)
+    refuses(field.split(".")[-1], build, inputs.settings_classes()[name], {field: value} | needed)
 
 
 @inputs.CASES

@@ -11,7 +11,7 @@ import pytest
 
 from mqe_jax.core.blocks import Block, Entities, image
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import override, record, to_mapping
+from mqe_jax.core.settings import override, settings_class, to_mapping
 from mqe_jax.envs import State, VectorEnv, make
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import ObservationLayout, entities
@@ -258,7 +258,7 @@ def test_bad_senses_are_named(senses: Any, message: str) -> None:
         _ = make("go1gate", impl="c", senses=senses).groups
 
 
-@record
+@settings_class
 class Faulty(Sensor):
     """A sensor with one of several mistakes."""
 
@@ -301,7 +301,7 @@ def test_a_sensor_needs_a_name_and_both_decorators() -> None:
     class Bare(Sensor):
         pass
 
-    with pytest.raises(InputError, match=r"^sensor: .*Bare.* below @register and @record"):
+    with pytest.raises(InputError, match=r"^sensor: .*Bare.* below @register and @settings_class"):
         register(Bare)
     with pytest.raises(InputError, match=r"^sensor Bare: the field name has no default"):
-        register(record(Bare))
+        register(settings_class(Bare))

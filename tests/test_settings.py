@@ -22,7 +22,7 @@ from mqe_jax.core.settings import (
     load_yaml,
     merge,
     override,
-    record,
+    settings_class,
     to_mapping,
 )
 from mqe_jax.envs.gate import GateParams
@@ -30,7 +30,7 @@ from mqe_jax.train.config import TrainConfig
 from tests.inputs import refuses
 
 
-@record
+@settings_class
 class Inner:
     clip: Positive = 0.2
     dual: Annotated[float, Gt(1)] | None = None
@@ -42,7 +42,7 @@ class Inner:
             fail("clip", self.clip, "at most 5 when kind is 'joint'")
 
 
-@record
+@settings_class
 class Outer:
     count: PositiveInt = 3
     flag: bool = True
@@ -53,7 +53,7 @@ class Outer:
     free: Mapping[str, Any] = FrozenMapping()
 
 
-@record
+@settings_class
 class Derived(Outer):
     count: PositiveInt = 5
     label: str | None = None

@@ -207,13 +207,13 @@ def _meanings(cls: type[Any]) -> dict[str, str]:
     return {name: x.docstring.value for name, x in members.items() if x.docstring}
 
 
-def _fields(record: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None) -> str:
+def _fields(kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None) -> str:
     """Returns a table of a settings class's fields, own ones first, with the meanings that its docstrings give.
 
     Values are defaults, or those `given`.
     """
-    meanings = [_meanings(cls) for cls in record.__mro__ if cls is not object]
-    values: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(record) if f.name not in skip}
+    meanings = [_meanings(cls) for cls in kind.__mro__ if cls is not object]
+    values: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(kind) if f.name not in skip}
     values |= given or {}
     rows = []
     for name in sorted(values, key=lambda name: name not in meanings[0]):

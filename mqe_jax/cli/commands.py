@@ -25,7 +25,7 @@ from mqe_jax.cli.options import (
 )
 from mqe_jax.core.limits import Environments, Episodes, Horizon
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 
 _ZOO = Path(__file__).parents[1] / "policies" / "zoo"
 _RATES = {
@@ -38,7 +38,7 @@ _RATES = {
 """Rates of the shipped policies that `mqe zoo` lists: title of each table and its columns, by name in the cards."""
 
 
-@record
+@settings_class
 class Tasks:
     """List the tasks with their robots and time limits; with --long, also the sizes of their observations."""
 
@@ -84,7 +84,7 @@ class Tasks:
         return {"tasks": rows}
 
 
-@record
+@settings_class
 class Zoo:
     """List the shipped teams and how good they are; of one task, also how its team was trained."""
 
@@ -150,7 +150,7 @@ def _plain(card: Any, needs: Any) -> dict[str, Any]:
     return {**about, **to_mapping(card), "results": results}
 
 
-@record
+@settings_class
 class Eval(PolicyOptions):
     """Evaluate a trained run, or a task's shipped or scripted policy, over complete episodes from fresh resets."""
 
@@ -202,7 +202,7 @@ class Eval(PolicyOptions):
             yield teams
 
 
-@record
+@settings_class
 class Replay:
     """Replay a recording of diverged physics, and render it with --output."""
 
@@ -248,7 +248,7 @@ class Replay:
         return result
 
 
-@record
+@settings_class
 class Bench(TaskOptions):
     """Measure throughput in environment steps per second: with walk policy and resets, and for physics alone."""
 
@@ -274,7 +274,7 @@ class Bench(TaskOptions):
         return result
 
 
-@record
+@settings_class
 class Demo:
     """Train Narrow Gate from scratch on the CPU, evaluate before and after, write curve and video."""
 

@@ -11,10 +11,10 @@ from mqe_jax.cli.options import Json, print_table
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_folder, check_output, write_atomically
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 
 
-@record
+@settings_class
 class Export:
     """Write a trained policy as one ONNX graph: of a team, together with the walk policy, or of one robot."""
 
@@ -65,7 +65,7 @@ class Export:
         return result
 
 
-@record
+@settings_class
 class PlaySite:
     """Write a web page on which policies play in the reader's browser; it needs no server but one for files."""
 

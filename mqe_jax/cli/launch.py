@@ -20,7 +20,7 @@ from mqe_jax.core.devices import PEER, PEER_ENDED
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import NonNegativeInt, PositiveInt
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 
 MEMBER = "MQE_PROCESS"
 """Environment variable of a process that `launch` started: INDEX/COUNT@PORT, `AUTO` or `ALONE`."""
@@ -52,7 +52,7 @@ _NOISE = re.compile(
 """Lines of JAX's coordination service and collectives; several of a lost connection if the training has ended."""
 
 
-@record
+@settings_class
 class Launch:
     """Train in several processes, one per device, on one host or many: `mqe launch --processes 2 train go1gate`.
 

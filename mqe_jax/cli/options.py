@@ -14,7 +14,7 @@ from mqe_jax.core import settings
 from mqe_jax.core.errors import InputError, short_repr
 from mqe_jax.core.files import parse_yaml
 from mqe_jax.core.literal import line
-from mqe_jax.core.settings import merge, record
+from mqe_jax.core.settings import merge, settings_class
 
 Repeated = tyro.conf.UseAppendAction
 Impl = Annotated[str, tyro.conf.arg(help="Engine: auto, jax (MJX), warp (NVIDIA GPU), c (MuJoCo's C engine, CPU).")]
@@ -34,7 +34,7 @@ DumpDiverged = Annotated[
 ]
 
 
-@record
+@settings_class
 class TaskOptions:
     """Options of a task."""
 
@@ -57,7 +57,7 @@ class TaskOptions:
         return parse_overrides(self.set) | {name: value for name, value in flags.items() if value is not None}
 
 
-@record
+@settings_class
 class PolicyOptions(TaskOptions):
     """Options of a task and its policies."""
 

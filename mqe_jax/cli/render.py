@@ -8,10 +8,10 @@ import tyro
 from mqe_jax.cli.options import Json, PolicyOptions
 from mqe_jax.core.limits import Candidates, ClipLength, FrameRate, ImageWidth, Speed, Time
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 
 
-@record
+@settings_class
 class Render(PolicyOptions):
     """Render an episode of a task or of a trained run to a .mp4, .webp, .gif or .png file."""
 

@@ -12,10 +12,10 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_output
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 
 
-@record
+@settings_class
 class SkillEval:
     """Evaluate a skill: command tracking, disturbances, falls, energy."""
 
@@ -46,7 +46,7 @@ class SkillEval:
         return result
 
 
-@record
+@settings_class
 class SkillConvert:
     """Convert official TorchScript checkpoints of walk-these-ways to weights of the walk policy."""
 

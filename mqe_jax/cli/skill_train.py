@@ -12,13 +12,13 @@ from mqe_jax.cli.options import Impl, Robot
 from mqe_jax.cli.train import HINT, MARKERS
 from mqe_jax.core import interrupts
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.walk.task import WalkTask
 from mqe_jax.walk.training import SETTINGS, train_skill
 
 
-@record
+@settings_class
 class SkillTrain:
     """Train a skill's weights, from scratch or from other weights (GPU)."""
 

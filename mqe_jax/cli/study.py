@@ -12,10 +12,10 @@ from mqe_jax.core import interrupts
 from mqe_jax.core.files import check_output
 from mqe_jax.core.limits import Candidates, Positive
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 
 
-@record
+@settings_class
 class SweepCommand:
     """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes interrupted runs."""
 
@@ -55,7 +55,7 @@ class SweepCommand:
         return result["left"] if self.dry_run else result
 
 
-@record
+@settings_class
 class Report:
     """Write figures and tables of a sweep from its finished runs, with reference values."""
 
@@ -76,7 +76,7 @@ class Report:
         return {"report": [str(file) for file in files]}
 
 
-@record
+@settings_class
 class Tournament(TaskOptions):
     """Play policies against each other and rate them, or as mates in a cooperative task: tables, CSV and picture."""
 

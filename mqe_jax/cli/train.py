@@ -15,7 +15,7 @@ from mqe_jax.core import interrupts
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import override, record
+from mqe_jax.core.settings import override, settings_class
 from mqe_jax.runs.presets import base_config
 from mqe_jax.train.config import TrainConfig
 
@@ -23,7 +23,7 @@ HINT = "resume with the same command and --resume; the run is in {}"
 MARKERS = (tyro.conf.AvoidSubcommands,)
 
 
-@record
+@settings_class
 class Source:
     """Where the settings come from that flags then change."""
 
@@ -35,7 +35,7 @@ class Source:
     """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
 
 
-@record
+@settings_class
 class Network:
     """The network whose settings are flags."""
 
@@ -43,7 +43,7 @@ class Network:
     """Registered name of the network."""
 
 
-@record
+@settings_class
 class Train(TaskOptions):
     """Train a policy on a task, into a run folder.
 

@@ -13,12 +13,12 @@ from mqe_jax.cli.options import PolicyOptions
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Port
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
-@record
+@settings_class
 class View(PolicyOptions):
     """Show a task or a trained run in the browser, with teleoperation and live plots; the page can choose others."""
 

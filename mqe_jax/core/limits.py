@@ -1,7 +1,7 @@
 """What input may hold and cost: the one list of bounds. Whatever is outside of them raises an `InputError`.
 
-Kinds of numbers are types of settings (`settings.record`) and of arguments (`settings.check_arguments`). A plain `int`
-or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
+Kinds of numbers are types of settings (`settings_class`) and of arguments (`check_arguments`). A plain `int` or `float`
+has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
 """
 
 import typing

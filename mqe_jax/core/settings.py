@@ -2,7 +2,7 @@
 
 A settings class is a frozen dataclass whose annotations hold the type and the bounds of each field:
 
-    @record
+    @settings_class
     class Ppo:
         clip: Positive = 0.2
         \"\"\"Half width of the clipping interval of the ratio.\"\"\"
@@ -90,7 +90,7 @@ Parameters = Annotated[Mapping[str, Any], pydantic.AfterValidator(_parameters)]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,))
-def record(cls: type[T]) -> type[T]:
+def settings_class(cls: type[T]) -> type[T]:
     """Makes a class a frozen, keyword-only dataclass that validates its fields.
 
     Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
@@ -183,8 +183,8 @@ def _adapter(kind: Any) -> pydantic.TypeAdapter[Any]:
     return pydantic.TypeAdapter(_accept_yaml(kind), config=_CONFIG)
 
 
-def is_record(kind: object) -> bool:
-    """Returns whether a type (or an instance's type) was made by `record`."""
+def is_settings(kind: object) -> bool:
+    """Returns whether a type (or an instance's type) was made by `settings_class`."""
     return dataclasses.is_dataclass(kind) and pydantic.dataclasses.is_pydantic_dataclass(
         kind if isinstance(kind, type) else type(kind)
     )
@@ -200,15 +200,15 @@ def build(kind: type[T], values: Mapping[str, Any]) -> T:
 
     InputError for a value that is not allowed or an unknown name, with the nearest known one.
     """
-    if not (isinstance(kind, type) and is_record(kind)):
+    if not (isinstance(kind, type) and is_settings(kind)):
         fail("kind", kind, "a class of settings, such as TrainConfig")
     return kind(**_joined(kind, {}, values))
 
 
 def override(settings: T, changes: Mapping[str, Any]) -> T:
     """Returns settings with fields replaced, named as in `build`; mappings are `joined`. InputError as `build`."""
-    if not is_record(settings):
-        fail("settings", settings, "a record, such as TrainConfig()")
+    if not is_settings(settings):
+        fail("settings", settings, "an instance of a settings class, such as TrainConfig()")
     return type(settings)(**_joined(type(settings), _fields(settings), changes))
 
 
@@ -233,7 +233,7 @@ def differences(settings: Any, default: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in _fields(settings).items():
         other = getattr(default, name)
-        if is_record(value) and type(value) is type(other):
+        if is_settings(value) and type(value) is type(other):
             found |= {f"{name}.{inner}": each for inner, each in differences(value, other).items()}
         elif value != other:
             found[name] = value
@@ -263,7 +263,7 @@ def merge(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limi
             if not depth:
                 fail(name, value, f"nested at most {limits.DEPTH} deep")
             now = _fields(both.get(name))
-            other = is_record(both.get(name)) and value.get("name", now.get("name")) != now.get("name")
+            other = is_settings(both.get(name)) and value.get("name", now.get("name")) != now.get("name")
             value = merge({} if other else now, value, depth - 1)
         both[name] = value
     return both
@@ -356,14 +356,14 @@ def _boolean(value: Any) -> bool:
 
 def _fields(value: Any) -> Mapping[str, Any]:
     """Returns a mapping, or settings as one; empty for another value."""
-    if is_record(value):
+    if is_settings(value):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     return value if isinstance(value, Mapping) else {}
 
 
 def _record_in(hint: Any) -> Any:
     """Returns the settings class within an annotated or optional type, or None."""
-    if is_record(hint):
+    if is_settings(hint):
         return hint
     return next((found for part in typing.get_args(hint) if (found := _record_in(part)) is not None), None)
 

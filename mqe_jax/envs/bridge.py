@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Coordinate, Length, TimeLimit
-from mqe_jax.core.settings import Coordinates, fail, record
+from mqe_jax.core.settings import Coordinates, fail, settings_class
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_above
 from mqe_jax.envs.state import Moment, State
@@ -19,7 +19,7 @@ from mqe_jax.sensors.scene import Entity
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
-@record
+@settings_class
 class BridgeRewards:
     """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
@@ -29,7 +29,7 @@ class BridgeRewards:
     """In steps in which the robot is on the opponent's platform."""
 
 
-@record
+@settings_class
 class BridgeParams(TaskParams):
     """Parameters of Traverse Bridge."""
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.limits import Coordinate, Distance, Length, TimeLimit
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
@@ -19,7 +19,7 @@ from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 _WALL_LENGTH = 1.0  # m along x, of the block with the door at its centre
 
 
-@record
+@settings_class
 class DoorRewards:
     """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
@@ -29,7 +29,7 @@ class DoorRewards:
     """Per m of decrease of the distance to the midpoint of the line."""
 
 
-@record
+@settings_class
 class DoorParams(TaskParams):
     """Parameters of Revolving Door."""
 

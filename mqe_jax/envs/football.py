@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Distance, Fraction, Length, Robots, TimeLimit
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.match import Match
 from mqe_jax.envs.observation import Block, ObservationLayout
@@ -40,7 +40,7 @@ _IMPULSE = 0.1  # m/s; change of the ball's velocity in a step that only a touch
 BALL_BLOCKS = (Block("ball", 3, "centre, m"), Block("ball_velocity", 3, "m/s"))
 
 
-@record
+@settings_class
 class FootballParams(TaskParams):
     """Parameters of all football tasks."""
 
@@ -182,7 +182,7 @@ class Football(QuadrupedEnv[S, F]):
         return jnp.linalg.norm(self.ball(data)[:2] - GOALS, axis=-1)
 
 
-@record
+@settings_class
 class FootballMatchRewards:
     """Weights of the reward terms; each is a team's own term minus the opponents', but the last two are its own alone.
 
@@ -215,7 +215,7 @@ class FootballMatchState:
 _LINES, _IN_LINE = 4, 4  # lines of a team at the kick-off, at most; robots in a line while there are fewer lines
 
 
-@record
+@settings_class
 class FootballMatchParams(FootballParams):
     """Parameters of the football matches, with the defaults of Football (1 vs 1)."""
 
@@ -228,7 +228,7 @@ class FootballMatchParams(FootballParams):
         check_teams(self.num_agents, most, f"field_width {self.field_width:g}")
 
 
-@record
+@settings_class
 class Football2vs2Params(FootballMatchParams):
     """Parameters of the football matches, with the defaults of Football (2 vs 2)."""
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Fraction
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.envs.football import BALL_BLOCKS, FAR, GOALS, Football, FootballParams, Play
 from mqe_jax.envs.observation import ObservationLayout, for_all, observe_team, team_blocks
 from mqe_jax.envs.state import Moment, State
@@ -17,7 +17,7 @@ from mqe_jax.npc import defend
 from mqe_jax.physics.robots.index import RobotState
 
 
-@record
+@settings_class
 class DefenderRewards:
     """Weights of the reward terms."""
 
@@ -35,7 +35,7 @@ class DefenderRewards:
     """In steps in which an attacker has fallen. Not in the paper: for training, where `first_goal` pays only once."""
 
 
-@record
+@settings_class
 class DefenderParams(FootballParams):
     """Parameters of Football (2 vs 1)."""
 

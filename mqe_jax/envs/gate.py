@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Coordinate, Distance, Length, TimeLimit
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, ObservationLayout, for_all, observe_team, team_blocks
@@ -20,7 +20,7 @@ from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track, rows_of
 
 
-@record
+@settings_class
 class GateRewards:
     """Weights of the reward terms."""
 
@@ -34,7 +34,7 @@ class GateRewards:
     """In steps with any trunk contact."""
 
 
-@record
+@settings_class
 class GateParams(TaskParams):
     """Parameters of Narrow Gate."""
 

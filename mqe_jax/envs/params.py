@@ -21,7 +21,7 @@ from mqe_jax.core.limits import (
     TimeLimit,
     bounds,
 )
-from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, record
+from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, settings_class
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.physics import robots
 from mqe_jax.sensors.suite import Senses
@@ -29,7 +29,7 @@ from mqe_jax.skills import agile  # noqa: F401  (skills register themselves
 from mqe_jax.skills.control import Commander
 
 
-@record
+@settings_class
 class TaskParams:
     """Parameters common to all tasks; a task adds its own.
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.limits import Length
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
 from mqe_jax.envs.params import TaskParams
@@ -14,7 +14,7 @@ from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import Plane, SpawnArea, Track
 
 
-@record
+@settings_class
 class PlaneRewards:
     """Weights of the reward terms."""
 
@@ -22,7 +22,7 @@ class PlaneRewards:
     """Per m of the robots' summed displacement along x."""
 
 
-@record
+@settings_class
 class PlaneParams(TaskParams):
     """Parameters of Plane."""
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Buffer, Coordinate, Distance, Iterations, Length, NonNegative, TimeLimit
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, Block, ObservationLayout, for_all, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams, check_gap
@@ -23,7 +23,7 @@ _BEHIND = 0.3  # of a robot's centre behind the box's rear face, m
 _ABREAST, _LENGTH = 3, 0.8  # robots that push side by side, at most; distance between their rows, m
 
 
-@record
+@settings_class
 class PushBoxRewards:
     """Weights of the reward terms."""
 
@@ -37,7 +37,7 @@ class PushBoxRewards:
     """Per m of decrease of the lateral distance between box and gate. Not in the paper: shaping."""
 
 
-@record
+@settings_class
 class PushBoxParams(TaskParams):
     """Parameters of Push Box."""
 

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import mujoco
 
 from mqe_jax.core.limits import Lag, NonNegative, TimeLimit
-from mqe_jax.core.settings import Range, fail, record
+from mqe_jax.core.settings import Range, fail, settings_class
 from mqe_jax.physics.robots.index import RobotIndex
 
 if TYPE_CHECKING:
     from mujoco import mjx
 
 
-@record
+@settings_class
 class Randomization:
     """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables.
 

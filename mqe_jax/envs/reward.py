@@ -44,7 +44,7 @@ def _first(value: jax.Array, agents: Sequence[int], active: jax.Array) -> jax.Ar
 
 
 def fade(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float) -> dict[str, jax.Array]:
-    """Returns the terms, those of weight 0 in the record `weights` times a factor ()."""
+    """Returns the terms, those of weight 0 in `weights` times a factor ()."""
     as_float = lambda term: jnp.asarray(term, jnp.float32)  # noqa: E731
     return {name: term if getattr(weights, name) else factor * as_float(term) for name, term in terms.items()}
 

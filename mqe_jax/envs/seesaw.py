@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.limits import Coordinate, Length, TimeLimit
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs import reward
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import ObservationLayout, observe_team, team_blocks
@@ -17,7 +17,7 @@ from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
 
-@record
+@settings_class
 class SeesawRewards:
     """Weights of the reward terms."""
 
@@ -37,7 +37,7 @@ class SeesawRewards:
     """Per 1 / d^2 while the distance d between the robots is below 0.5 m, once for the pair."""
 
 
-@record
+@settings_class
 class SeesawParams(TaskParams):
     """Parameters of Climb on Seesaw."""
 

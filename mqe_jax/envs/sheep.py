@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Buffer, Coordinate, Distance, Few, FlockSize, Friction, Length, NonNegative, TimeLimit
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import GATE, ObservationLayout, entities, for_all, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams, check_gap
@@ -32,7 +32,7 @@ _CLEAR = 0.05  # m, between the sheep of a flock that could not be closer
 _CONTACTS = 2  # of each sheep beyond those of the task's own flock
 
 
-@record
+@settings_class
 class SheepRewards:
     """Weights of the reward terms."""
 
@@ -50,7 +50,7 @@ class SheepRewards:
     """In steps with a fall or a collision of a robot. For training alone."""
 
 
-@record
+@settings_class
 class SheepEasyParams(TaskParams):
     """Parameters of both tasks, with the defaults of the easy one."""
 
@@ -134,7 +134,7 @@ class SheepEasyParams(TaskParams):
         return self.flock_center + spacing * grid, noise
 
 
-@record
+@settings_class
 class SheepHardParams(SheepEasyParams):
     """Parameters of `SheepEasyParams` with the defaults of the hard task."""
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Distance, Length, TimeLimit
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _START_X = 0.1  # m, x of the arena's near wall
 
 
-@record
+@settings_class
 class TugRewards:
     """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
@@ -37,7 +37,7 @@ class TugRewards:
     """Per m of decrease of the distance to the cylinder's axis."""
 
 
-@record
+@settings_class
 class TugParams(TaskParams):
     """Parameters of Push Cylinder."""
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.limits import Distance, Length, Positive, TimeLimit
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import ObservationLayout, by_entity, others
 from mqe_jax.envs.params import TaskParams, check_above, check_teams
@@ -24,7 +24,7 @@ _ARC = np.radians(140.0)  # on which a team stands at the start, at most
 _MARGIN = 0.4  # m, from the ring's edge to the robots at the start, at least
 
 
-@record
+@settings_class
 class WrestlingRewards:
     """Weights of the reward terms; `win` is zero-sum, the others are for training alone."""
 
@@ -36,7 +36,7 @@ class WrestlingRewards:
     """Per m of decrease of the distance between a robot and the nearest opponent that is still in."""
 
 
-@record
+@settings_class
 class WrestlingParams(TaskParams):
     """Parameters of Sumo Wrestling."""
 

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.core.limits import Coordinate, Damping, Distance, Friction, Length, Mass
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.physics.appearance import HIDDEN_GROUP, STONE, WOOD, Color, bodies
 from mqe_jax.physics.appearance.shapes import circle
 from mqe_jax.physics.collision import GROUND_BIT, OBJECT_BIT, WALL_BIT
@@ -81,7 +81,7 @@ def _add_joint(body: Any, suffix: str, kind: Any, damping: float = 0.0, **option
     body.add_joint(name=f"{body.name}/{suffix}", type=kind, damping=(damping, 0, 0), **options)
 
 
-@record
+@settings_class
 class Box(Object):
     """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
 
@@ -114,7 +114,7 @@ class Box(Object):
             bodies.crate(body, half)
 
 
-@record
+@settings_class
 class Ball(Object):
     """A football with rolling resistance. Coordinates and velocity as in `Box`."""
 
@@ -141,7 +141,7 @@ class Ball(Object):
             bodies.football(body, self.radius)
 
 
-@record
+@settings_class
 class Cylinder(Object):
     """An upright cylinder that slides along y only, with the ground's friction. Coordinate: y, m; velocity likewise."""
 
@@ -173,7 +173,7 @@ class Cylinder(Object):
             bodies.drum(body, self.radius, self.height)
 
 
-@record
+@settings_class
 class Door(Object):
     """A revolving door: a panel on a vertical hinge at its centre. Coordinate: angle, rad, 0 along y."""
 
@@ -201,7 +201,7 @@ class Door(Object):
             bodies.door(body, half)
 
 
-@record
+@settings_class
 class Seesaw(Object):
     """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative with the near end down."""
 
@@ -231,7 +231,7 @@ class Seesaw(Object):
             bodies.trestle(spec.worldbody, self.hinge, half[1])
 
 
-@record
+@settings_class
 class Platform(Object):
     """A fixed block that supports robots. No coordinates."""
 
@@ -270,7 +270,7 @@ class Platform(Object):
             bodies.column(spec.worldbody, self.column, (x, y, foot))
 
 
-@record
+@settings_class
 class Ring(Object):
     """A circle marked on the ground, without collision geoms. No coordinates."""
 
@@ -287,7 +287,7 @@ class Ring(Object):
             part.add(body)
 
 
-@record
+@settings_class
 class Sheep(Object):
     """An upright sheep that slides without friction or rotation (see `flock`). Coordinates: x, y; velocity likewise."""
 

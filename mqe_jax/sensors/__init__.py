@@ -13,13 +13,13 @@ import mujoco
 
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import FrozenMapping, fail, is_record, record
+from mqe_jax.core.settings import FrozenMapping, fail, is_settings, settings_class
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.sensors.scene import SensedScene, Snapshot
 
 
-@record
+@settings_class
 class Sensor:
     """Base of all sensors: functions of one environment, for all its agents.
 
@@ -28,11 +28,11 @@ class Sensor:
         from typing import Literal
 
         from mqe_jax.core.blocks import Block
-        from mqe_jax.core.settings import record
+        from mqe_jax.core.settings import settings_class
         from mqe_jax.sensors import Sensor, register
 
         @register
-        @record
+        @settings_class
         class Altimeter(Sensor):
             name: Literal["altimeter"] = "altimeter"
 
@@ -107,8 +107,8 @@ def register(sensor: S) -> S:
     Raises:
         InputError: for anything else, without a name, or if another class is registered under it.
     """
-    if not (isinstance(sensor, type) and issubclass(sensor, Sensor) and is_record(sensor)):
-        fail("sensor", sensor, "a class derived from Sensor, below @register and @record")
+    if not (isinstance(sensor, type) and issubclass(sensor, Sensor) and is_settings(sensor)):
+        fail("sensor", sensor, "a class derived from Sensor, below @register and @settings_class")
     if not (name := sensor().name):
         raise InputError(f"sensor {sensor.__name__}: the field name has no default")
     if SENSORS.setdefault(name, sensor) is not sensor:

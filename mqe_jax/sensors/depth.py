@@ -12,7 +12,7 @@ from annotated_types import Gt, Le, Lt
 
 from mqe_jax.core.blocks import Block, image
 from mqe_jax.core.limits import Length
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.physics.engines import private
 from mqe_jax.physics.robots.index import prefix
 from mqe_jax.physics.rotation import rotate
@@ -28,7 +28,7 @@ Angle = Annotated[float, Gt(0), Lt(180)]  # degrees
 
 
 @register
-@record
+@settings_class
 class Depth(Sensor):
     """Distances to what a camera ahead of the trunk sees, along its axis, as parts of its range.
 

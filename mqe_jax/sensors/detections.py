@@ -9,7 +9,7 @@ import numpy as np
 
 from mqe_jax.core.blocks import Block, by_entity, entities
 from mqe_jax.core.limits import Degrees, Distance, Fraction, Length
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.physics.objects import Rectangle
 from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.marks import Marks, marks
@@ -24,7 +24,7 @@ _FADE, _PALEST = 2.0, 0.2  # time after which a line to somebody seen has half i
 
 
 @register
-@record
+@settings_class
 class Detections(Sensor):
     """Robots and entities at their last sighting, in the robot's yaw frame of that moment, with its age.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.limits import Length, Rays
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.marks import Marks, marks
 from mqe_jax.sensors.planar import turn
@@ -19,7 +19,7 @@ _COLOR = (0.0, 0.55, 0.8)
 
 
 @register
-@record
+@settings_class
 class Lidar(Sensor):
     """Distances to the nearest wall, robot or object, seen from above; heights do not count."""
 

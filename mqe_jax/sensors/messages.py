@@ -9,7 +9,7 @@ import numpy as np
 
 from mqe_jax.core.blocks import Block, by_entity, entities
 from mqe_jax.core.limits import Few, Fraction, Length
-from mqe_jax.core.settings import fail, record
+from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.marks import Marks, marks
 from mqe_jax.sensors.scene import SensedScene, Snapshot
@@ -18,7 +18,7 @@ _COLOR = (0.95, 0.2, 0.2)
 
 
 @register
-@record
+@settings_class
 class Messages(Sensor):
     """The last numbers of an agent's action, which its teammates in range receive with their next observation.
 

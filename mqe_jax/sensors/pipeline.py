@@ -10,10 +10,10 @@ import jax.numpy as jnp
 
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.limits import Few, Fraction, Lag, NonNegative, Positive
-from mqe_jax.core.settings import Range, record
+from mqe_jax.core.settings import Range, settings_class
 
 
-@record
+@settings_class
 class Pipeline:
     """What happens to the readings of one block, in this order; masks are delayed and dropped only."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.limits import Degrees, Distance
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
 from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.marks import Marks, marks
@@ -22,7 +22,7 @@ _ARROW = np.array([[[0, 0], [0.45, 0]], [[0.45, 0], [0.33, 0.08]], [[0.45, 0], [
 
 
 @register
-@record
+@settings_class
 class Proprioception(Sensor):
     """Gravity, angular velocity, joints, the last action, and an odometry estimate that starts at the true pose."""
 

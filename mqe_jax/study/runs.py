@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.literal import line
-from mqe_jax.core.settings import FrozenMapping, build, load_yaml, record
+from mqe_jax.core.settings import FrozenMapping, build, load_yaml, settings_class
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
 from mqe_jax.train.logs import number, read_metrics
@@ -115,7 +115,7 @@ def table(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = (), digits: 
     return text.getvalue()
 
 
-@record
+@settings_class
 class Reference:
     """Values that a report compares with, such as a paper's, and the titles and order of its cells."""
 

@@ -21,7 +21,7 @@ from annotated_types import MaxLen, MinLen
 from mqe_jax.core.errors import InputError, InUseError, NonFiniteError, nearest
 from mqe_jax.core.files import check_folder, lock, write_atomically
 from mqe_jax.core.limits import Seed, SeedCount
-from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, record, to_mapping
+from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, settings_class, to_mapping
 from mqe_jax.core.types import Cast
 from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
@@ -35,7 +35,7 @@ MakeEnvironments = Callable[[TrainConfig, int], Cast]
 """Factory of the training and evaluation environments for a given number of seeds trained together."""
 
 
-@record
+@settings_class
 class Sweep:
     """Settings of a sweep, which trains every combination of tasks, algorithms, variants and seeds."""
 
@@ -65,7 +65,7 @@ class Sweep:
                 fail(f"variants.{name}", values, "a mapping of settings, under a name of letters and digits")
 
 
-@record
+@settings_class
 class Measurement:
     """Settings of a part that measures policies: a call for every combination of tasks and variants."""
 

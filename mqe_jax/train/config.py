@@ -21,14 +21,14 @@ from mqe_jax.core.limits import (
     Seed,
     Steps,
 )
-from mqe_jax.core.settings import FileName, FrozenMapping, Parameters, fail, load_yaml, merge, override, record
+from mqe_jax.core.settings import FileName, FrozenMapping, Parameters, fail, load_yaml, merge, override, settings_class
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
 _MATE = tyro.conf.arg(name="mate", metavar="NAME|RUN|FILE")
 
 
-@record
+@settings_class
 class PPO:
     """The PPO update."""
 
@@ -65,7 +65,7 @@ class PPO:
     """Initial fraction of training in which only the critic is trained, for a policy that starts from weights."""
 
 
-@record
+@settings_class
 class OptimizerSettings:
     """Adam and its learning rate."""
 
@@ -84,7 +84,7 @@ class OptimizerSettings:
     """Global gradient-norm clip; none disables clipping."""
 
 
-@record
+@settings_class
 class Curriculum:
     """Curriculum: task modifications annealed to zero during training; not applied in evaluation."""
 
@@ -102,7 +102,7 @@ class Curriculum:
     """Fraction of training over which `failure_bootstrap` is annealed to 0."""
 
 
-@record
+@settings_class
 class Imitation:
     """A teacher that the policy imitates in the states that it reaches itself (Schmitt et al., arXiv 1803.03835).
 
@@ -118,7 +118,7 @@ class Imitation:
     """Fraction of training after which the weight is 0; above 1, some is left at the end."""
 
 
-@record
+@settings_class
 class Normalization:
     """Normalisation to mean 0 and standard deviation 1."""
 
@@ -132,7 +132,7 @@ class Normalization:
     """Normalise the advantages of each rollout."""
 
 
-@record
+@settings_class
 class LeagueSettings:
     """The pool of earlier policies that `opponents` draw from."""
 
@@ -146,7 +146,7 @@ class LeagueSettings:
     """Episodes of a block of environments against a member until it plays another one."""
 
 
-@record
+@settings_class
 class Checkpointing:
     """Checkpoints of the complete learner state."""
 
@@ -159,7 +159,7 @@ class Checkpointing:
     weights, optimiser state, statistics and keys (under 1 MB), and environments are reset when a run resumes."""
 
 
-@record
+@settings_class
 class EvaluationSettings:
     """Evaluation during training, on separate environments of the unmodified task (Gorsane et al., arXiv 2209.10485).
 
@@ -173,7 +173,7 @@ class EvaluationSettings:
     """Episodes per evaluation under sampled actions, and as many under mean actions; one per environment."""
 
 
-@record
+@settings_class
 class TrainConfig:
     """Settings of a training run; the defaults are mostly OpenRL's, but with one ratio per agent.
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from mqe_jax.core.blocks import Block, entities
 from mqe_jax.core.limits import PositiveInt
-from mqe_jax.core.settings import FrozenMapping, Parameters, Range, check_arguments, fail, leaves, record
+from mqe_jax.core.settings import FrozenMapping, Parameters, Range, check_arguments, fail, leaves, settings_class
 from mqe_jax.core.types import AnyEnvironment, teams_of
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
@@ -15,7 +15,7 @@ ACTIONS = ("robot", "control", "skill", "gait", "commands", "command_ranges", "p
 """What tells the meaning of actions, by the names of task parameters."""
 
 
-@record
+@settings_class
 class Needs:
     """What a policy needs of its environment; None for what the environment does not describe or its actions ignore."""
 

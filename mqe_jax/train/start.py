@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import fail, is_record, leaves, override, to_mapping
+from mqe_jax.core.settings import fail, is_settings, leaves, override, to_mapping
 from mqe_jax.core.types import Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig
@@ -154,7 +154,7 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
 def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[str, Any]) -> None:
     """Raises an InputError naming the first parameter of a task that differs in the settings, if they name any."""
     task: Any = getattr(env, "env", None)
-    if not is_record(getattr(task, "params", None)) or not (config.task or config.training_env):
+    if not is_settings(getattr(task, "params", None)) or not (config.task or config.training_env):
         return
     overrides = dict(parameters)
     control = overrides.pop("control", "command")

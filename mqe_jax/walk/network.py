@@ -25,7 +25,7 @@ import numpy as np
 from mqe_jax import walk_policy
 from mqe_jax.core import devices
 from mqe_jax.core.limits import Horizon, NonNegative
-from mqe_jax.core.settings import FileName, fail, record
+from mqe_jax.core.settings import FileName, fail, settings_class
 from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.physics import robots
 from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
@@ -111,7 +111,7 @@ AGILE_FORM = Form(
 )
 
 
-@record
+@settings_class
 class HistorySettings(GaussianSettings):
     """Settings of a walking skill and its critic, which sees the privileged observation."""
 

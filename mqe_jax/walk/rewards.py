@@ -5,13 +5,13 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.core.settings import record
+from mqe_jax.core.settings import settings_class
 from mqe_jax.physics.robots.index import RobotState, foot_positions, knee_positions
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
 
 
-@record
+@settings_class
 class WalkRewards:
     """Weights of the reward terms; the first four are positive terms, the others go into the exponent.
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from annotated_types import Ge, Le
 
 from mqe_jax.core.limits import Buffer, Distance, Few, Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
-from mqe_jax.core.settings import Range, record
+from mqe_jax.core.settings import Range, settings_class
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.walk.rewards import WalkRewards
@@ -24,7 +24,7 @@ RANDOMIZATION = Randomization(
 )
 
 
-@record
+@settings_class
 class WalkTask:
     """Parameters of the walking task."""
 
@@ -76,7 +76,7 @@ class EpisodeSpec:
     shove: jax.Array  # maximum force of a shove (), N
 
 
-@record
+@settings_class
 class WalkParams(TaskParams):
     """Parameters of the walking environment: a `WalkTask`, and what the environment core needs to know of it."""
 

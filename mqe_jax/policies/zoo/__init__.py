@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Episodes, Fraction, NonNegative
-from mqe_jax.core.settings import PathText, build, check_arguments, record, to_mapping
+from mqe_jax.core.settings import PathText, build, check_arguments, settings_class, to_mapping
 from mqe_jax.core.types import AnyTrained
 from mqe_jax.policies import mixture
 from mqe_jax.policies.mixture import Mixture, Trained
@@ -21,7 +21,7 @@ from mqe_jax.train.policy import NAMED, TrainedPolicy
 FOLDER = Path(__file__).parent
 
 
-@record
+@settings_class
 class Measured:
     """A rate in fresh episodes."""
 
@@ -38,7 +38,7 @@ class Measured:
         return Rate.of(self.value, self.episodes)
 
 
-@record
+@settings_class
 class Card:
     """How a shipped policy was trained, and its results."""
 
