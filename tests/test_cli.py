@@ -239,12 +239,17 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     done = subprocess.run([sys.executable, "-W", "error", "-c", START], capture_output=True, text=True, check=True)
     first, *lines, last, late, name = done.stdout.splitlines()
     assert "Failed" not in done.stdout and (late, name) == ("set()", "mujoco.mjx")
-    assert first.split() == ["task", "title", "robots", "time,", "s"]
-    assert json.loads(last)["tasks"][0]["task"] == "go1plane" and max(map(len, lines)) <= 80
+    assert first.split() == ["task", "title", "robots", "sizes", "time,", "s"]
+    listed = {row["task"]: row for row in json.loads(last)["tasks"]}
+    assert max(map(len, lines)) <= 80
+    assert (listed["go1gate"]["sizes"], listed["go1tug"]["sizes"]) == ([1, 64], None)
     rows = [line.split() for line in lines if line.startswith("go1")]
     short, long = ({row[0]: row for row in half} for half in (rows[:13], rows[13:]))
-    assert short["go1gate"] == ["go1gate", "Narrow", "Gate", "2", "10"]
-    assert long["go1gate"] == ["go1gate", "2", "10", "16", "93", "shipped"] and long["go1plane"][-1] == "none"
+    assert short["go1gate"] == ["go1gate", "Narrow", "Gate", "2", "1", "to", "64", "10"]
+    assert (
+        long["go1gate"] == ["go1gate", "2", "1", "to", "64", "10", "16", "93", "shipped"]
+        and long["go1plane"][-1] == "none"
+    )
     assert long["go1football-2vs2"][1:4] == ["2", "vs", "2"]
     errors = [line for line in done.stderr.splitlines() if line.startswith("mqe: ")]
     assert len(errors) == 7 and all("did you mean" in line for line in errors[:6]) and "'nobody'" in errors[6]

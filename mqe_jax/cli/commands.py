@@ -40,7 +40,7 @@ _RATES = {
 
 @settings_class
 class Tasks:
-    """List the tasks with their robots and time limits; with --long, also the sizes of their observations."""
+    """List the tasks with their robots, sizes and time limits; with --long, also the sizes of their observations."""
 
     json: Json = False
     long: Long = False
@@ -60,6 +60,7 @@ class Tasks:
                     "teams": len(task.teams),
                     "observation": task.observation,
                     "privileged": task.privileged,
+                    "sizes": task.sizes,
                     "time_limit_s": task.time_limit,
                     "shipped_policy": (_ZOO / f"{name}.safetensors").is_file(),
                 }
@@ -70,17 +71,19 @@ class Tasks:
             "task": [row["task"] for row in rows],
             "title": [row["title"] for row in rows],
             "robots": [" vs ".join(map(str, task.teams)) for task in SHIPPED.values()],
+            "sizes": [f"{task.sizes[0]} to {task.sizes[1]}" if task.sizes else "" for task in SHIPPED.values()],
             "time, s": [f"{row['time_limit_s']:g}" for row in rows],
         }
         if self.long:
             del columns["title"]
             columns |= {name: [str(row[name]) for row in rows] for name in ("observation", "privileged")}
             columns["policy"] = ["shipped" if row["shipped_policy"] else "none" for row in rows]
-        print_columns(columns, left=2 if self.long else 3)
+        print_columns(columns, left=3 if self.long else 4)
         if self.long:
             print("\nobservation: numbers that an agent sees; privileged: that a critic may see")
         else:
-            print("\nWatch one: mqe render go1gate -o gate.gif")
+            print("\nsizes: numbers of robots that --set num_agents=N allows, even in matches")
+            print("Watch one: mqe render go1gate -o gate.gif")
         return {"tasks": rows}
 
 

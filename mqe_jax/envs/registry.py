@@ -39,19 +39,21 @@ class Shipped(NamedTuple):
     """Length of the privileged observation."""
     time_limit: float
     """Time limit, s."""
+    sizes: tuple[int, int] | None = None
+    """Least and greatest `num_agents`, even in matches; None if it is fixed."""
 
 
 SHIPPED = {
-    "go1plane": Shipped("plane:Go1Plane", None, "Plane", (2,), 14, 91, 10.0),
-    "go1gate": Shipped("gate:Go1Gate", "cooperative:plan_gate", "Narrow Gate", (2,), 16, 93, 10.0),
+    "go1plane": Shipped("plane:Go1Plane", None, "Plane", (2,), 14, 91, 10.0, (1, 64)),
+    "go1gate": Shipped("gate:Go1Gate", "cooperative:plan_gate", "Narrow Gate", (2,), 16, 93, 10.0, (1, 64)),
     "go1seesaw": Shipped("seesaw:Go1Seesaw", "cooperative:plan_seesaw", "Climb on Seesaw", (2,), 14, 93, 10.0),
     "go1sheep-easy": Shipped(
-        "sheep:Go1SheepEasy", "cooperative:plan_sheep_easy", "Sheep Dog (Easy)", (2,), 18, 97, 15.0
+        "sheep:Go1SheepEasy", "cooperative:plan_sheep_easy", "Sheep Dog (Easy)", (2,), 18, 97, 15.0, (1, 64)
     ),
     "go1sheep-hard": Shipped(
-        "sheep:Go1SheepHard", "cooperative:plan_sheep_hard", "Sheep Dog (Hard)", (2,), 34, 129, 15.0
+        "sheep:Go1SheepHard", "cooperative:plan_sheep_hard", "Sheep Dog (Hard)", (2,), 34, 129, 15.0, (1, 64)
     ),
-    "go1pushbox": Shipped("pushbox:Go1PushBox", "cooperative:plan_pushbox", "Push Box", (2,), 22, 106, 15.0),
+    "go1pushbox": Shipped("pushbox:Go1PushBox", "cooperative:plan_pushbox", "Push Box", (2,), 22, 106, 15.0, (1, 64)),
     "go1football-defender": Shipped(
         "football_defender:Go1FootballDefender", "football:plan_defender", "Football (2 vs 1)", (2,), 20, 153, 20.0
     ),
@@ -59,13 +61,15 @@ SHIPPED = {
     "go1revolvingdoor": Shipped(
         "door:Go1RevolvingDoor", "matches:plan_revolving_door", "Revolving Door", (1, 1), 12, 95, 5.0
     ),
-    "go1wrestling": Shipped("wrestling:Go1Wrestling", "matches:plan_wrestling", "Sumo Wrestling", (1, 1), 12, 91, 15.0),
+    "go1wrestling": Shipped(
+        "wrestling:Go1Wrestling", "matches:plan_wrestling", "Sumo Wrestling", (1, 1), 12, 91, 15.0, (2, 10)
+    ),
     "go1bridge": Shipped("bridge:Go1Bridge", "matches:plan_bridge", "Traverse Bridge", (1, 1), 12, 91, 20.0),
     "go1football-1vs1": Shipped(
-        "football:Go1Football1vs1", "football:plan_match", "Football (1 vs 1)", (1, 1), 19, 108, 20.0
+        "football:Go1Football1vs1", "football:plan_match", "Football (1 vs 1)", (1, 1), 19, 108, 20.0, (2, 64)
     ),
     "go1football-2vs2": Shipped(
-        "football:Go1Football2vs2", "football:plan_match", "Football (2 vs 2)", (2, 2), 32, 198, 20.0
+        "football:Go1Football2vs2", "football:plan_match", "Football (2 vs 2)", (2, 2), 32, 198, 20.0, (2, 64)
     ),
 }
 """The package's tasks by id, with default parameters."""
