@@ -118,38 +118,36 @@ def lead(win: Rate, loss: Rate, episodes: int) -> Rate:
 
 
 def population(found: Rates) -> str:
-    """Returns the table of mean and lowest wins against the population, and of the smallest lead."""
+    """Returns the table of mean wins against the population, and of the smallest lead."""
     body = []
     for task in MATCHES:
         every = members(found, task)
         leads = {name: lead(win, loss, MEMBER_EPISODES) for name, (win, loss) in every.items()}
         worst = min(leads, key=lambda name: leads[name].value)
-        shown = [found[task, "plain", "win_rate"], min(win for win, _ in every.values()), leads[worst]]
-        body.append([f"`{task}`", *(each.percent for each in shown), worst])
-    return table(("match", "mean wins", "lowest wins", "smallest lead, points", "against"), body)
+        body.append([f"`{task}`", found[task, "plain", "win_rate"].percent, leads[worst].percent, worst])
+    return table(("match", "wins, %", "smallest lead, points", "against"), body)
 
 
 def exploitability() -> str:
-    """Returns the table of the largest lead of each seed's best responses, with its actions."""
-    body = []
+    """Returns the table of the largest lead of the best responses to each shipped team, and to a mixture if any."""
+    body, oracles = [], published("oracle")
     for task in MATCHES:
-        by_seed: dict[str, list[tuple[Rate, str]]] = {}
-        for row in rows("exploitability"):
-            if row["task"] == task:
-                by_seed.setdefault(row["seed"], []).append((rate(row), row["actions"]))
-        largest = [max(by_seed[seed]) for seed in sorted(by_seed)]
-        body.append([f"`{task}`", *(f"{lead.percent} {actions}" for lead, actions in largest)])
-    return table(("match", "lead, first seed", "lead, second seed"), body)
+        leads = [max(rate(row) for row in rows("exploitability") if row["task"] == task).percent, ""]
+        last = oracles[task]["rounds"][-1] if task in oracles else {"weights": {}}
+        if len(last["weights"]) > 1:
+            leads[1] = Rate(**last["exploitability_lower_bound"]).percent
+        body.append([f"`{task}`", *leads])
+    return table(("match", "lead over the shipped team, points", "over the mixture, points"), body)
 
 
 def robustness(found: Rates) -> str:
-    """Returns the table of the worst condition and of the other robot."""
+    """Returns the table of the worst condition."""
     body = []
     for task in robust_tasks(found):
-        every = {name: robust(found, task, name) for name in CONDITIONS if name not in ("usual", "go2")}
+        every = {name: robust(found, task, name) for name in CONDITIONS if name != "usual"}
         worst = min(every, key=lambda name: every[name].value)
-        body.append([f"`{task}`", every[worst].percent, CONDITIONS[worst], robust(found, task, "go2").percent])
-    return table(("task", "worst of five", "condition", "Go2"), body)
+        body.append([f"`{task}`", CONDITIONS[worst], every[worst].percent])
+    return table(("task", "worst condition", "success or wins, %"), body)
 
 
 def robust_rates() -> Rates:
@@ -204,20 +202,30 @@ def drawn_mates(task: str) -> dict[str, tuple[Rate]]:
 
 def mixed() -> str:
     """Returns the table of mixed teams."""
-    head = ("own mate", "other seed", "difference, points", "worst pair", "scripted mate", "idle mate")
-    body = [[f"`{task}`", *(each.percent for each in mates(task).values())] for task in COOPERATIVE]
-    return table(("task", *head), body)
+    body = []
+    for task in COOPERATIVE:
+        found = mates(task)
+        body.append([f"`{task}`", *(found[name].percent for name in ("same", "cross", "gap", "worst"))])
+    return table(("task", "own mate, %", "other seed, %", "difference, points", "worst pair, %"), body)
+
+
+def pool(task: str) -> list[Rate]:
+    """Returns a team's success before and after it trained with a pool: of its robots together, with a new mate."""
+    data = published(f"pool_{task}")
+    before, after, new = data["start"], data["policies"][0], data["policies"][-1]
+    return [team(task, *pair) for pair in ((before, before), (after, after), (new, before), (new, after))]
 
 
 def pools() -> str:
     """Returns the table of teams before and after they trained with a pool of mates."""
-    body = []
-    for task in POOLS:
-        data = published(f"pool_{task}")
-        before, after, new = data["start"], data["policies"][0], data["policies"][-1]
-        pairs = ((before, before), (after, after), (new, before), (new, after))
-        body.append([f"`{task}`", *(team(task, *pair).percent for pair in pairs)])
-    return table(("task", "own mate: before", "after", "new mate as agent 0: before", "after"), body)
+    body = [[f"`{task}`", *(each.percent for each in pool(task))] for task in POOLS]
+    return table(("task", "own mate before, %", "after, %", "new mate before, %", "after, %"), body)
+
+
+def drawn_pool(task: str) -> dict[str, tuple[Rate]]:
+    """Returns the rates of `pool` that are drawn, by label."""
+    labels = ("own mate, before", "own mate, after", "new mate, before", "new mate, after")
+    return {label: (each,) for label, each in zip(labels, pool(task), strict=True)}
 
 
 def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -> bytes:
@@ -227,7 +235,9 @@ def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -
     """
     figure = Figure((7.6, 1.0 + 1.15 * -(-len(groups) // 2)), dpi=105, layout="constrained")
     axes = figure.subplots(-(-len(groups) // 2), 2, sharex=True, squeeze=False)
-    for each, (title, values) in zip(axes.ravel(), groups.items(), strict=True):
+    for empty in axes.ravel()[len(groups) :]:
+        empty.remove()
+    for each, (title, values) in zip(axes.ravel(), groups.items(), strict=False):
         for i, pair in enumerate(values.values()):
             each.barh(i, 100 * (len(pair) > 1), height=0.62, color=GREY)
             for value, start, way, color in zip(pair, (0, 100), (100, -100), (BLUE, RED), strict=False):
@@ -312,6 +322,7 @@ def pictures() -> dict[str, bytes]:
         "strength.png": draw_rates(teams, f"success, or {label}"),
         "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
         "mates.png": draw_rates({task: drawn_mates(task) for task in COOPERATIVE}, "success, %"),
+        "pools.png": draw_rates({task: drawn_pool(task) for task in POOLS}, "success, %"),
         "robustness.png": draw_heat(robust_rates()),
         "exploitability.png": draw_leads(rows("exploitability")),
     }
