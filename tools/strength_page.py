@@ -205,8 +205,8 @@ def mixed() -> str:
     body = []
     for task in COOPERATIVE:
         found = mates(task)
-        body.append([f"`{task}`", *(found[name].percent for name in ("same", "cross", "gap", "worst"))])
-    return table(("task", "own mate, %", "other seed, %", "difference, points", "worst pair, %"), body)
+        body.append([f"`{task}`", *(found[name].percent for name in ("same", "cross", "gap"))])
+    return table(("task", "own mate, %", "other seed, %", "difference, points"), body)
 
 
 def pool(task: str) -> list[Rate]:
