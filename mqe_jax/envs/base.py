@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax import skills
-from mqe_jax.core.errors import InputError, warn
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, results, weights_of
 from mqe_jax.core.settings import check, check_arguments, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
+from mqe_jax.envs.assembly import make_controller, make_scene
 from mqe_jax.envs.observation import ObservationLayout, finite
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
@@ -37,7 +37,7 @@ from mqe_jax.physics.robots.index import RobotState, read_robots, scatter
 from mqe_jax.physics.rotation import euler_to_quaternion
 from mqe_jax.physics.scene import build_model, compile_scene
 from mqe_jax.sensors.suite import ONBOARD
-from mqe_jax.skills.control import Controller, check_mode
+from mqe_jax.skills.control import check_mode
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -68,30 +68,15 @@ class QuadrupedEnv(Task[S, P]):
         num_envs = check("num_envs", num_envs, Environments)
         self.num_agents, self.robot = self.params.num_agents, robots.get(self.params.robot)
         check_sizes(self)
-        scene = self.scene()
-        network = self.params.actuator_network if control != "torque" else None
-        # NPC robots follow joint targets in every mode.
-        torque_robots = scene.num_robots if network else self.num_agents if control == "torque" else 0
-        self._scene = dataclasses.replace(
-            scene,
-            robot=self.robot,
-            contacts=self.params.contacts,
-            friction=self.params.friction,
-            joint_mechanics=self.params.joint_mechanics,
-            solver_iterations=self.params.solver_iterations,
-            torque_robots=torque_robots,
-            max_contacts=self.params.contacts_per_robot * scene.num_robots + self.extra_contacts,
-            foot_sensors=self.params.privileged_contact_forces,
-            edits=tuple(sensor.edit_spec for sensor in self.params.senses),
-        )
-        self.compiled = compile_scene(self._scene)
+        self._scene = scene = make_scene(self)
+        self.compiled = compile_scene(scene)
         self.index, self.objects = self.compiled.index, self.compiled.objects
         self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
             impl=impl,
             num_envs=num_envs,
-            contacts_per_env=self._scene.max_contacts,
+            contacts_per_env=scene.max_contacts,
             max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots + 4 * self.extra_contacts,
             sparse_solver=self.params.sparse_solver,
         )
@@ -101,37 +86,10 @@ class QuadrupedEnv(Task[S, P]):
         if self.max_steps < 1:
             fail("episode_length", self.params.episode_length, f"at least one environment step, {self.dt} s")
         self.actuators = None
-        if network:
+        if (network := self.params.actuator_network) and control != "torque":
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
-        skill = skills.make(self.params.skill, self.robot)
-        npc, npcs = None, scene.num_robots > self.num_agents
-        if npcs and self.npc_skill != skill.name:
-            other, npcs = skills.make(self.npc_skill, self.robot), False
-            other = other.restrict(self.npc_varied, None) if self.npc_varied else other
-            other.check_period(scene.timestep, self.physics.num_substeps)
-            npc = other, other.load_params()
-        if not npcs or self.npc_varied:
-            skill = skill.restrict((*self.params.commands, *(self.npc_varied if npcs else ())), self.params.gait)
-        uses_skill = control == "command" or npcs
-        if uses_skill:
-            skill.check_period(scene.timestep, self.physics.num_substeps)
-        if uses_skill and (beyond := skill.untrained_commands(self.params.command_ranges)):
-            warn(f"command_ranges: the skill {self.params.skill!r} was not trained for {', '.join(beyond)}")
-        self.controller = Controller(
-            mode=control,
-            robot=self.robot,
-            num_robots=scene.num_robots,
-            num_agents=self.num_agents,
-            skill=skill,
-            skill_params=skill.load_params(self.params.skill_weights) if uses_skill else None,
-            commands=(*self.params.commands, *skill.selector),
-            default_commands=skill.default_commands(self.params.gait),
-            ranges=self.params.command_ranges,
-            npc=npc,
-            lag=self.params.randomization.action_lag,
-            position_scale=self.params.position_scale,
-        )
+        self.controller = make_controller(self, scene, self.physics.num_substeps)
         self.sizes = Sizes(self)
         self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
         self.privileged = PrivilegedObservation(

@@ -1,0 +1,68 @@
+"""What an environment is made of: its scene and its controller, from the task and its parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from mqe_jax import skills
+from mqe_jax.core.errors import warn
+from mqe_jax.envs.task import Task
+from mqe_jax.physics.scene import Scene
+from mqe_jax.skills.control import Controller
+
+
+def make_scene(task: Task[Any, Any]) -> Scene:
+    """Returns the task's scene with the robot, physics and sensors of its parameters."""
+    scene, params = task.scene(), task.params
+    # NPC robots follow joint targets in every mode.
+    by_torque = task.num_agents if task.control == "torque" else scene.num_robots if params.actuator_network else 0
+    return dataclasses.replace(
+        scene,
+        robot=task.robot,
+        contacts=params.contacts,
+        friction=params.friction,
+        joint_mechanics=params.joint_mechanics,
+        solver_iterations=params.solver_iterations,
+        torque_robots=by_torque,
+        max_contacts=params.contacts_per_robot * scene.num_robots + task.extra_contacts,
+        foot_sensors=params.privileged_contact_forces,
+        edits=tuple(sensor.edit_spec for sensor in params.senses),
+    )
+
+
+def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Controller:
+    """Returns the controller of the scene's robots: the agents' skill, and that of NPC robots.
+
+    Warns of commands beyond those that the skill was trained for. InputError for a skill whose period is not that of an
+    environment step of `num_substeps`.
+    """
+    params = task.params
+    skill = skills.make(params.skill, task.robot)
+    npc, npcs = None, scene.num_robots > task.num_agents
+    if npcs and task.npc_skill != skill.name:
+        other, npcs = skills.make(task.npc_skill, task.robot), False
+        other = other.restrict(task.npc_varied, None) if task.npc_varied else other
+        other.check_period(scene.timestep, num_substeps)
+        npc = other, other.load_params()
+    if not npcs or task.npc_varied:
+        skill = skill.restrict((*params.commands, *(task.npc_varied if npcs else ())), params.gait)
+    uses_skill = task.control == "command" or npcs
+    if uses_skill:
+        skill.check_period(scene.timestep, num_substeps)
+    if uses_skill and (beyond := skill.untrained_commands(params.command_ranges)):
+        warn(f"command_ranges: the skill {params.skill!r} was not trained for {', '.join(beyond)}")
+    return Controller(
+        mode=task.control,
+        robot=task.robot,
+        num_robots=scene.num_robots,
+        num_agents=task.num_agents,
+        skill=skill,
+        skill_params=skill.load_params(params.skill_weights) if uses_skill else None,
+        commands=(*params.commands, *skill.selector),
+        default_commands=skill.default_commands(params.gait),
+        ranges=params.command_ranges,
+        npc=npc,
+        lag=params.randomization.action_lag,
+        position_scale=params.position_scale,
+    )
