@@ -145,7 +145,7 @@ def performance() -> Figure:
         ("Warp, NVIDIA H200", VIOLET, warp, (4, 14), "right"),
         ("MJX, NVIDIA H100", ORANGE, mjx, (4, 14), "right"),
         ("C, 16 CPU cores", BLUE, cores, (10, 0), "left"),
-        ("C, 2 CPU cores", GREEN, [(256, np.median(two), min(two), max(two))], (-6, -18), "left"),
+        ("C, 2 CPU cores", GREEN, [(256, np.median(two), min(two), max(two))], (-6, -20), "left"),
         ("Isaac Gym, RTX 3090 (paper)", INK, [(500, 18300, 18300, 18300)], (10, 0), "left"),
     )
     figure = Figure((WIDTH / 100, 4.2), layout="constrained")
@@ -155,14 +155,14 @@ def performance() -> Figure:
         axes.vlines(environments, slowest, fastest, color=color, lw=5, alpha=0.35)
         axes.plot(environments, rates, "o-", color=color, lw=2.2, ms=7)
         at = (environments[-1], rates[-1])
-        look = {"ha": side, "va": "center", "weight": "bold", "fontsize": 13, "color": color}
+        look = {"ha": side, "va": "center", "weight": "bold", "fontsize": 14, "color": color}
         axes.annotate(label, at, shift, textcoords="offset points", **look)
     axes.set(xscale="log", yscale="log", xlim=(215, 5000), ylim=(9e3, 1.6e6))
-    axes.set_xticks(ticks := [256, 512, 1024, 2048, 4096], [str(tick) for tick in ticks], fontsize=13)
-    axes.set_yticks(ticks := [10_000, 100_000, 1_000_000], [f"{tick:,}" for tick in ticks], fontsize=13)
+    axes.set_xticks(ticks := [256, 512, 1024, 2048, 4096], [str(tick) for tick in ticks], fontsize=14)
+    axes.set_yticks(ticks := [10_000, 100_000, 1_000_000], [f"{tick:,}" for tick in ticks], fontsize=14)
     axes.minorticks_off()
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("environments", fontsize=13)
-    axes.set_ylabel("environment steps/s", fontsize=13)
+    axes.set_xlabel("environments", fontsize=14)
+    axes.set_ylabel("environment steps/s", fontsize=14)
     return figure
