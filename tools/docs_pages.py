@@ -38,7 +38,8 @@ def on_files(files: Any, config: Any) -> Any:
     """Adds the generated pages, and the files of the page of `mqe play-site`."""
     (reference,) = (section["API reference"] for section in config["nav"] if "API reference" in section)
     modules = {path: f"mqe_jax.{Path(path).stem}" for path in reference}
-    for path, content in (pages() | {path: f"# {x}\n\n::: {x}\n" for path, x in modules.items()}).items():
+    references = {path: reference_page(module, {*modules.values()}) for path, module in modules.items()}
+    for path, content in (pages() | references).items():
         head = "".join(f"---\n{text}\n---\n" for start, text in SETTINGS.items() if path.startswith(start))
         files.append(File.generated(config, path, content=head + content))
     for file in filter(Path.is_file, PLAY.rglob("*") if _playable() else ()):
@@ -131,6 +132,14 @@ def pages() -> dict[str, str]:
     return made
 
 
+def reference_page(module: str, pages: set[str]) -> str:
+    """Returns the page of a module, without what it only exports from modules that have pages."""
+    members = _package()[module.partition(".")[2]].members.values()
+    elsewhere = [x.name for x in members if x.is_alias and x.target_path.rpartition(".")[0] in pages]
+    filters = ["!^_", f"!^({'|'.join(elsewhere)})$"]
+    return f"# {module}\n\n::: {module}\n    options:\n      filters: {filters}\n"
+
+
 def front(readme: str) -> str:
     """Returns a file of the repository as a page: its links as from docs/, tasks linked to their pages."""
     page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
@@ -155,11 +164,12 @@ def overview(tasks: Mapping[str, Any]) -> str:
 
 def task_page(task: Any) -> str:
     """Returns the page of a task."""
-    from mqe_jax.envs import SCRIPTED
+    from mqe_jax.envs import SCRIPTED, TaskParams
 
     env, name = task(num_envs=1, impl="c"), task.name
     bodies = (inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__)
-    body = next(filter(None, bodies))  # that of a base class where the task's is one line
+    body = next(filter(None, bodies))  # that of a base class if the task's is one line
+    body = re.sub(r"see `\w+Rewards`", "the terms below", body)
     policy = "shipped" if name in zoo.names() else "scripted" if name in SCRIPTED else "forward"
     flags, against = (" --opponent scripted", " against the scripted one") if len(env.teams) > 1 else ("", "")
     caption = f"A typical success of the {policy} policy{against}: [how good it is](../results/strength.md)."
@@ -174,11 +184,9 @@ def task_page(task: Any) -> str:
     width = max(map(len, commands))
     lines = "\n".join(f"{command:{width}}  # {text}" for command, text in commands.items())
     facts = [
-        f"- {env.num_agents} agents in {'two teams' if len(env.teams) > 1 else 'one team'}",
-        f"- action per agent: command {len(ranges)} (of the skill `{env.params.skill}`: {', '.join(ranges)}), "
-        "position 12, torque 12",
-        f"- observation {env.observation_size} per agent, privileged observation {env.privileged_observation_size}",
-        f"- time limit {env.params.episode_length:g} s, {env.max_steps} steps of {env.dt:g} s",
+        f"- Robots: {' vs '.join(str(len(team)) for team in env.teams)}.",
+        f"- Action: commands of the skill `{env.params.skill}` ({', '.join(ranges)}). "
+        "With control `position` or `torque`, 12 numbers.",
     ]
     rows = [f"| `{b.name}` | {b.width} | {b.meaning or ''} |" for b in env.observation_layout.blocks]
     sections = [
@@ -187,12 +195,15 @@ def task_page(task: Any) -> str:
         *media,
         f"```bash\n{lines}\n```",
         "[Settings of the training, and what to expect](../results/settings.md).",
-        body,
-        "\n".join(facts),
-        "## Observation of an agent\n\n| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),
+        "\n".join([*facts, body]),
+        f"## Observation of an agent\n\n{env.observation_size} numbers:",
+        "| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),
+        f"A critic may also see the privileged observation, {env.privileged_observation_size} numbers.",
         "## Reward terms\n\n" + _fields(type(env.params.rewards), "weight", given=vars(env.params.rewards)),
-        "A weight is set by `--set rewards.NAME=VALUE`, or `make(task, rewards={...})`.",
-        "## Parameters\n\n" + _fields(type(env.params), "default", skip=("rewards", "randomization")),
+        "Set a weight with `--set rewards.NAME=VALUE` or `make(task, rewards={...})`.",
+        "## Parameters\n\n" + _fields(type(env.params), "default", skip=_shared(type(env.params), TaskParams)),
+        "Set one with `--set NAME=VALUE` or `make(task, NAME=VALUE)`. "
+        "All tasks share [further parameters](../reference/envs.params.md).",
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -208,7 +219,7 @@ def _meanings(cls: type[Any]) -> dict[str, str]:
 
 
 def _fields(kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None) -> str:
-    """Returns a table of a settings class's fields, own ones first, with the meanings that its docstrings give.
+    """Returns a table of a settings class's fields, those of its base last, with the meanings that docstrings give.
 
     Values are defaults, or those `given`.
     """
@@ -216,7 +227,7 @@ def _fields(kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Map
     values: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(kind) if f.name not in skip}
     values |= given or {}
     rows = []
-    for name in sorted(values, key=lambda name: name not in meanings[0]):
+    for name in sorted(values, key=lambda name: name in meanings[-1]):
         parts = {name: (values[name], next((own[name] for own in meanings if name in own), ""))}
         if dataclasses.is_dataclass(values[name]):  # an object of the scene
             inner, texts = values[name], _meanings(type(values[name]))
@@ -225,6 +236,13 @@ def _fields(kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Map
             meaning = " ".join(text.split()).replace("|", "\\|")
             rows.append(f"| `{part}` | {_shown(value)} | {meaning} |")
     return f"| name | {column} | meaning |\n|---|---|---|\n" + "\n".join(rows)
+
+
+def _shared(kind: type[Any], base: type[Any]) -> tuple[str, ...]:
+    """Returns the fields that a settings class has from another one, with the same default, and groups of settings."""
+    known = {field.name: field.default for field in dataclasses.fields(base)}
+    same = [f.name for f in dataclasses.fields(kind) if f.name in known and f.default == known[f.name]]
+    return ("rewards", "randomization", *same)
 
 
 @functools.cache
