@@ -58,10 +58,11 @@ def make(
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         control: action mode: 'command', 'position' or 'torque'.
         num_envs: maximum batch size; sizes Warp's contact buffer.
-        overrides: task parameters by name; nested ones as mappings or, from a dict, by dotted names:
-            `make("go1gate", robot="go2", gate_width=0.8, rewards={"collision": -5.0})`.
+        overrides: task parameters by name. Nested ones are mappings, `rewards={"collision": -5.0}`, or have dotted
+            names in a dict, `**{"rewards.collision": -5.0}`.
 
-    InputError for an unknown task, engine, mode or parameter, naming the nearest match, or a bad value.
+    Raises:
+        InputError: for an unknown task, engine, mode or parameter, or a value that is not allowed.
     """
     cls = TASKS[task_id(task)]
     return cls(override(cls.Params(), overrides), impl=impl, control=control, num_envs=num_envs)

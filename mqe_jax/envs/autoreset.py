@@ -21,7 +21,7 @@ from mqe_jax.envs.state import State
 from mqe_jax.sensors.suite import ONBOARD
 
 SEEN = ("obs", "privileged_obs", "groups")
-"""Fields that are observed once after the reset, and of which a batch may have those at the end of a step too."""
+"""Fields of observations. They describe the state after a reset; `VectorEnv.final` adds those from before it."""
 
 KEPT = ("assistance", "reward", "terminated", "truncated", "outcome", "metrics", *(f"final_{name}" for name in SEEN))
 """Fields that an auto-reset keeps; all but the first describe the last step."""
@@ -36,9 +36,9 @@ Start = Callable[[jax.Array, jax.Array], State]
 def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None, groups: Sequence[str] = ()) -> State:
     """Replaces the state of one environment by a new initial state if its episode has ended, and observes it.
 
-    Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step that ended the episode;
-    `assistance` is kept. The new episode starts in the state of `start`, by default of the task's reset; `groups` are
-    observed besides the group `policy`.
+    Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step that ended the episode,
+    and `assistance` is kept. `start` samples the new state, by default the task's reset. `groups` are observed in
+    addition to the group `policy`.
     """
     done = state.terminated | state.truncated
     with jax.named_scope("reset"):
@@ -56,7 +56,7 @@ def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None, group
 
 
 class EnvBatch:
-    """What all batches of environments of tasks have."""
+    """Base of all batches of environments of a task."""
 
     env: QuadrupedEnv
     num_envs: int  # N
@@ -70,7 +70,7 @@ class EnvBatch:
         return f"<{type(self).__name__} of {self.num_envs}: {getattr(self, 'inner', self.env)!r}>"
 
     def check_step(self, state: Any, action: jax.Array, kind: type) -> None:
-        """Raises an InputError for anything but states of a kind of N environments, and actions (N, A, action_size)."""
+        """Raises an InputError unless state is a `kind` of N environments and actions are (N, A, action_size)."""
         steps = jnp.shape(state.step) if isinstance(state, kind) else ()
         if steps != (self.num_envs,):
             found = f"{type(state).__name__} {steps}".removesuffix(" ()")
@@ -101,9 +101,9 @@ class VectorEnv(EnvBatch):
     def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = SEEN) -> None:
         """Creates the batch.
 
-        `copies` are batches under an outer `vmap`, such as one per seed, for which buffers are sized. `final` says by
-        the names in `SEEN` which observations a step also returns as they were before any reset (`final_obs`, ...): a
-        critic needs what it reads, and each takes time.
+        `copies` is the number of batches under an outer `vmap`, such as one per seed; buffers are sized for all.
+        `final` names the fields in `SEEN` that a step also returns as they were before any reset (`final_obs`, ...). A
+        critic needs those that it reads, and each takes time.
         """
         if not isinstance(env, QuadrupedEnv):
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
@@ -140,7 +140,7 @@ class VectorEnv(EnvBatch):
         return jax.vmap(self._reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
 
     def share(self, parts: int) -> Self:
-        """Returns the batch of one of several processes; raises an InputError for a fraction of an environment."""
+        """Returns the batch of one of several processes; InputError if the environments do not divide evenly."""
         other = copy.copy(self)
         other.num_envs = devices.share("num_envs", self.num_envs, parts)
         other.env = self.env.with_num_envs(other.num_envs * self.copies)

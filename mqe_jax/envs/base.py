@@ -202,7 +202,7 @@ class QuadrupedEnv(Task[S, P]):
 
     @jax.named_scope("task")
     def advance(self, state: State[S], action: jax.Array) -> State[S]:
-        """Returns the state of `step` with the observations from before it."""
+        """Returns the state of `step`, still with the observations of the state before."""
         self.check_state(state)
         action = self.controller.check_action(action, self.action_size)
         bad_action = ~jnp.all(jnp.isfinite(action) | ~state.active[:, None])
@@ -240,7 +240,7 @@ class QuadrupedEnv(Task[S, P]):
 
     @jax.named_scope("task")
     def with_observations(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
-        """Returns the state with the observations that belong to it, and those of further groups; once a step."""
+        """Returns the state with its observations, also of further groups; once a step, as sensors have memory."""
         robots, noise, seen = self.read(state.data, state.active), self.params.randomization.observation_noise, {}
         there = self.there(state) if self.varies else {}
         for number, (name, layout) in enumerate({"policy": self.observation_layout, **self.groups}.items()):
@@ -290,7 +290,7 @@ class QuadrupedEnv(Task[S, P]):
         return self.privileged.observe(robot_state, state, self.controller.clock(state.control))
 
     def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:
-        """Returns the outcome if the episode ends in this step, without its cause; arguments as of `outcome`."""
+        """Returns the outcome of an episode that ends in this step, without the cause; arguments as of `outcome`."""
         values = results("outcome", self.outcome(state, robot_state, failed))
         values = {name: value[None] for name, value in values.items()}
         return Outcome(success=values.pop("success"), further=values)
@@ -300,7 +300,7 @@ class QuadrupedEnv(Task[S, P]):
         return read_robots(self.index, data.qpos, data.qvel, data.sensordata, active)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
-        """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame; InputError for no object."""
+        """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame; InputError if unknown."""
         check("name", name, Literal[tuple(self.objects)])
         qpos: Any = getattr(data, "qpos", None)
         if np.shape(qpos)[-1:] != (self.compiled.model.nq,):

@@ -56,9 +56,9 @@ class FootballParams(TaskParams):
     ball_noise: Distance = 0.0
     """Half-width of the uniform noise on the ball's position at reset, m."""
     head_start: Fraction = 0.0
-    """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a match that of a team
-    drawn at random. The robots that attack it start as far forward, so that agents first learn to score from near.
-    Inactive at assistance 0."""
+    """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a match to either one.
+    The robots that attack this goal start as far forward. Agents first learn to score from near. Inactive at assistance
+    0."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -184,7 +184,7 @@ class Football(QuadrupedEnv[S, F]):
 
 @settings_class
 class FootballMatchRewards:
-    """Weights of the reward terms; each is a team's own term minus the opponents', but the last two are its own alone.
+    """Weights of the reward terms: zero-sum between the teams, except `advance` and `chase`.
 
     The released system defines no rewards for these matches; all terms except the goal are this package's.
     """
@@ -198,9 +198,9 @@ class FootballMatchRewards:
     fall: float = -10.0
     """When a robot of the team has fallen, which ends the match as a loss."""
     advance: float = 0.0
-    """Per m by which the ball comes nearer to that goal than before in the episode. For training alone."""
+    """Per m by which the ball is nearer to that goal than ever before in the episode. For training only."""
     chase: float = 0.0
-    """As `approach`, but the opponents' is not subtracted. For training alone."""
+    """As `approach`, without subtracting the opponents'. For training only."""
 
 
 @jax.tree_util.register_dataclass

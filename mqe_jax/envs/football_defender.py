@@ -24,7 +24,7 @@ class DefenderRewards:
     goal: float = 10.0
     """In steps in which the ball is in the goal."""
     nearness: float = 3.0
-    """Times exp(-distance of the ball to the goal's midpoint / 3 m)."""
+    """In every step, exp(-d / 3 m) with the distance d of the ball to the goal's midpoint."""
     progress: float = 0.0
     """Per m of decrease of the ball's distance to the goal's midpoint. Not in the paper: shaping."""
     approach: float = 0.0

@@ -29,7 +29,7 @@ class GateRewards:
     approach: float = 1.0
     """Per m of decrease of a robot's distance to its target."""
     crowding: float = -0.025
-    """Times the sum over robots of 1 / d^2 while the distance d between the robots is below 0.5 m."""
+    """In every step, the sum of 1 / d^2 over ordered pairs of robots at a distance d below 0.5 m."""
     collision: float = -2.0
     """In steps with any trunk contact."""
 
@@ -56,8 +56,8 @@ class GateParams(TaskParams):
     target_x: Coordinate = 5.5
     """X of the robots' targets, m."""
     target_y: Coordinate = 0.75
-    """|y| of the targets, m; the robots' paths cross: the first robot's target is on the left. Those of more than two
-    robots are in rows, mirrored from the robots' places at the start; the first row's are the last."""
+    """|y| of two robots' targets, m. Their paths cross: the first robot's target is on the left. Targets of more robots
+    mirror the rows in which they start."""
     rewards: GateRewards = GateRewards()
     """Weights of the reward terms."""
 

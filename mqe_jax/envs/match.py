@@ -23,9 +23,9 @@ from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 class Match(QuadrupedEnv[S, P]):
     """Base of the competitive tasks.
 
-    Reward: zero-sum; each term is the team's own minus the opponents', but for those whose weight is 0 by default.
-    Result: an `eliminated` team (by default one with a fallen robot) loses unless both are; otherwise the `leading`
-    team wins, and it is a draw if both or neither lead.
+    Reward: zero-sum, except terms whose weight is 0 by default. A term is the team's own minus the opponents'.
+    Result: an `eliminated` team (by default one with a fallen robot) loses. If no team is eliminated, the `leading`
+    team wins. It is a draw if both teams are eliminated, or both or neither lead.
     Success is a win. Diverged physics is a draw.
 
     Example:

@@ -137,7 +137,7 @@ def for_all(value: jax.Array, agents: int) -> jax.Array:
 
 
 def finite(x: jax.Array) -> jax.Array:
-    """Returns observations without numbers that are not finite or beyond 1e4."""
+    """Returns observations clipped to +-1e4, with 0 in place of NaN."""
     return jnp.clip(jnp.nan_to_num(x), -1e4, 1e4)
 
 

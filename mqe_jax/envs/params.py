@@ -43,11 +43,11 @@ class TaskParams:
     num_agents: Robots = 2
     """Number of controlled robots; in a match those of both teams."""
     fewest_agents: Robots | None = None
-    """Fewest robots that take part in an episode, in a match those of both teams: the number is drawn at reset, at most
-    `num_agents`, and the other robots are parked. None: all take part."""
+    """Fewest robots that take part in an episode, in a match those of both teams. Reset draws the number, at most
+    `num_agents`, and parks the other robots. None: all take part."""
     growing: bool = False
-    """Curriculum: at `State.assistance` a the highest number of robots or sheep that is drawn is that much nearer to
-    the fewest, so that agents first learn in small teams. Inactive at assistance 0."""
+    """Curriculum: agents first learn in small teams. At `State.assistance` 1 only the fewest robots or sheep are drawn;
+    the highest number grows linearly to all at assistance 0."""
     robot: str = "go1"
     """Name of the robot, such as go1 or go2 (`mqe_jax.physics.robots`)."""
     episode_length: TimeLimit = 10.0
@@ -63,8 +63,8 @@ class TaskParams:
     max_roll: Positive = 0.8
     """Maximum |roll|, rad; above it the episode terminates."""
     max_pitch: Positive = 1.6
-    """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so a limit above pi / 2, as in the
-    released system, is never reached: a robot that pitches over has a roll of pi."""
+    """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so it never reaches the released
+    system's limit, which is above pi / 2. A robot that pitches over has a roll of pi."""
     min_height: Coordinate = -1.0
     """Minimum trunk height, m; below it the episode terminates."""
     max_height: Coordinate = 100.0
@@ -74,17 +74,17 @@ class TaskParams:
     collision_force: Positive = 1.0
     """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
     skill: str | tuple[str, ...] = "walk"
-    """Skill of the agents with control `command` (`mqe_jax.skills`); of several, a further action entry says which one
-    acts (`mqe_jax.skills.choice`)."""
+    """Skill of the agents with control `command` (`mqe_jax.skills`). With several, a further action entry chooses one
+    (`mqe_jax.skills.choice`)."""
     skill_weights: FileName | None = None
     """Weights file of the skill; the shipped one if None."""
     gait: str | None = None
-    """Named default commands of the skill; of the walk policy trot, pronk, bound or pace, trot if None."""
+    """Name of default commands of the skill. The walk policy has trot, pronk, bound and pace; None: trot."""
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
     """Commands of the skill that the action sets, in order."""
     command_ranges: Mapping[str, Range] = FrozenMapping()
-    """Lowest and highest value of these commands, by name; the skill's default ranges for those that are not named.
-    Scripted policies keep the default ranges."""
+    """Lowest and highest value of these commands, by name; others have the skill's default ranges. Scripted policies
+    keep the default ranges."""
     position_scale: Positive = 1.0
     """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
     joint angles, hips within 0.125 rad."""
@@ -97,14 +97,14 @@ class TaskParams:
     solver_iterations: Iterations = 4
     """Maximum solver iterations per physics step."""
     sparse_solver: bool | None = None
-    """Whether the solver on Warp skips the zeros between robots that do not touch, with the same result to rounding.
-    None: in scenes with more than 80 degrees of freedom, 18 of them per robot. The other engines ignore it."""
+    """Whether the solver on Warp skips the zeros between robots that do not touch; results are equal up to rounding.
+    None: in scenes with more than 80 degrees of freedom, of which a robot has 18. The other engines ignore it."""
     contacts: Literal["full", "minimal"] = "full"
     """Set of the robots' collision geoms: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
     and disables limb collisions."""
     contacts_per_robot: Buffer = 12
-    """Contact buffer size per robot: per environment on MJX-JAX, which keeps the deepest contacts, and on average over
-    all environments on Warp."""
+    """Contact buffer size per robot. MJX-JAX has a buffer per environment and keeps the deepest contacts; on Warp all
+    environments share one."""
     constraints_per_robot: Buffer = 64
     """Constraint buffer size per robot on Warp, per environment."""
     privileged_contact_forces: bool = False
@@ -113,13 +113,13 @@ class TaskParams:
     randomization: Randomization = Randomization()
     """Domain randomisation."""
     senses: Senses = ()
-    """Sensors of the group of observations `onboard`: `onboard`, `full` for none, or a list of sensors, by names or as
-    mappings of settings.
+    """Sensors, whose readings are the group of observations `onboard`: the set `onboard`, `full` (no sensors), or a
+    list of names and mappings of settings.
     """
     frozen_time: Time = 4.0
-    """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s, so that agents
-    first learn sequential subtasks one at a time. Where the number of robots varies, nobody observes it meanwhile: its
-    mates learn to act as a smaller team. Inactive at assistance 0."""
+    """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s. Agents first
+    learn sequential subtasks one at a time. If the number of robots varies, mates do not observe the frozen one: they
+    learn to act as a smaller team. Inactive at assistance 0."""
     shaping_floor: Fraction = 1.0
     """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at assistance 1."""
 

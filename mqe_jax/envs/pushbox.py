@@ -1,4 +1,4 @@
-"""go1pushbox, the paper's Push Box: robots, by default two, push a box through a gate, too heavy for one of them."""
+"""go1pushbox, the paper's Push Box: robots, by default two, push a box that is too heavy for one through a gate."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ class PushBoxParams(TaskParams):
     past_gate: Coordinate = 0.0
     """Distance of the box's centre behind the gate's at which it counts as through, m."""
     box: Box = Box()
-    """The box as two robots push it; the mass grows with `num_agents` / 2."""
+    """The box for two robots; its mass is multiplied by `num_agents` / 2."""
     box_x: Coordinate = 2.5
     """X of the box's centre at reset, m."""
     box_noise: Distance = 0.5

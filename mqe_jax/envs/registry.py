@@ -125,7 +125,7 @@ def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
 def register_task(task: type[QuadrupedEnv], scripted: ScriptedPolicy | None = None) -> type[QuadrupedEnv]:
     """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
 
-    A class decorator too. InputError if it is no class of tasks, has no name, or another class has that name.
+    Also a class decorator. InputError if it is no class of tasks, has no name, or another class has that name.
     """
     from mqe_jax.envs.base import QuadrupedEnv
 
@@ -143,7 +143,7 @@ def register_task(task: type[QuadrupedEnv], scripted: ScriptedPolicy | None = No
 
 
 def task_id(name: str) -> str:
-    """Returns the id of a task from it or an alias; raises an InputError that names the nearest for an unknown one.
+    """Returns the id for which an id or an alias stands; InputError for an unknown one.
 
     Example:
         ```python

@@ -43,11 +43,11 @@ class SheepRewards:
     nearness: float = 0.0
     """Sum of exp(-distance to the gate's centre / 2 m) over the sheep that are not past the gate."""
     crossing: float = 0.0
-    """Per sheep that passes the gate in a step, less those that come back. For training alone."""
+    """Per sheep that passes the gate in a step, minus those that come back. For training only."""
     gathering: float = 0.0
-    """Per m of decrease of the sheep's summed distances to the gate's centre, 0 past it. For training alone."""
+    """Per m of decrease of the sheep's summed distances to the gate's centre, 0 past it. For training only."""
     failure: float = 0.0
-    """In steps with a fall or a collision of a robot. For training alone."""
+    """In steps with a fall or a collision of a robot. For training only."""
 
 
 @settings_class
@@ -73,9 +73,9 @@ class SheepEasyParams(TaskParams):
     flock: tuple[Few, Few] = (1, 1)
     """Number of sheep along x and along y."""
     num_sheep: FlockSize | None = None
-    """Number of sheep, in about as many rows as columns; that of `flock` if none."""
+    """Number of sheep, in about as many rows as columns; None: that of `flock`."""
     fewest_sheep: FlockSize | None = None
-    """Fewest sheep of an episode, whose number is drawn at reset, up to all; the others are parked. None: all."""
+    """Fewest sheep in an episode. Reset draws the number and parks the others. None: all take part."""
     flock_center: tuple[Coordinate, Coordinate] = (3.0, 0.0)
     """Centre of the flock at reset, m."""
     flock_spacing: Distance = 1.5

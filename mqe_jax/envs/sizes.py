@@ -40,13 +40,13 @@ _NO_MATES = entities("teammate", "robot", 1, 6 + _NEAR, "none in a team of one",
 
 
 def draw(key: jax.Array, fewest: int, most: int, level: jax.Array | float = 0.0) -> jax.Array:
-    """Returns a number () int32 from `fewest` to `most`, all alike; at a curriculum level () of 1 only the fewest."""
+    """Returns a number () int32 from `fewest` to `most`, uniformly; at a curriculum level () of 1 the fewest."""
     beyond = jnp.round(level * (most - fewest)).astype(jnp.int32)
     return jax.random.randint(key, (), fewest, most + 1 - beyond)
 
 
 def check_sizes(env: Any) -> None:
-    """Raises an InputError naming the parameter of an environment whose numbers of robots do not fit the task."""
+    """Raises an InputError if an environment's numbers of robots do not fit the task."""
     params, expected, fewest = env.params, env.Params().num_agents, env.params.fewest_agents
     if not env.variable_num_agents:
         for name in ("num_agents", "fewest_agents"):
@@ -60,7 +60,7 @@ def check_sizes(env: Any) -> None:
 
 
 class Sizes:
-    """The numbers of robots that may take part in an episode of an environment; of teams, equally many of each."""
+    """The numbers of robots that may take part in an episode, equal for all teams."""
 
     def __init__(self, env: Any) -> None:
         params, teams, index = env.params, env.teams, env.index
@@ -142,9 +142,9 @@ class Herd:
     def start(
         self, key: jax.Array, grids: Sequence[tuple[np.ndarray, float]], level: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Returns positions (S, 2), m, and half the width of their noise (S, 1), m, of a number of objects, drawn.
+        """Draws a number of objects; returns their positions (S, 2), m, and the half-width of their noise (S, 1), m.
 
-        `grids` are both for each number, up to all; the level is that of `draw`.
+        `grids` holds both for each number; `level` is as in `draw`.
         """
         most = len(grids[-1][0])
         start, spread = np.zeros((len(grids), most, 2), np.float32), np.zeros((len(grids), most, 1), np.float32)
@@ -174,9 +174,9 @@ def _poses(env: Any, agents: int) -> np.ndarray:
 
 
 def robots_there(teams: Sequence[Sequence[int]], mates: jax.Array, opponents: jax.Array) -> dict[str, jax.Array]:
-    """Returns who is there of the blocks of each agent's teammates and opponents (A, count) bool, in their order.
+    """Returns which of each agent's teammates and opponents take part (A, count) bool, by block.
 
-    `mates` and `opponents` say which agents are there as such (A,); a block without anybody is left out.
+    `mates` and `opponents` say which agents take part as such (A,) bool. Empty blocks are left out.
     """
     own = np.array([[other for other in team if other != agent] for team in teams for agent in team], int)
     others = [[other for rival in teams if rival is not team for other in rival] for team in teams for _ in team]
@@ -199,8 +199,8 @@ def hide(layout: ObservationLayout, obs: jax.Array, there: Mapping[str, jax.Arra
 def entity_layout(layout: ObservationLayout) -> ObservationLayout:
     """Returns the blocks of the group `entities` of a task, from those of its group `policy`.
 
-    Each entity has its entries there, whose first two are its x and y, m, then those relative to the agent. There is a
-    block of teammates, empty, also in a team of one. The one-hot is replaced by the agent's place in its team.
+    An entity has its own entries, which begin with its x and y, m, then its x and y relative to the agent. A team of
+    one has an empty block of teammates. The one-hot is replaced by the agent's place in its team.
     """
     blocks = [_PLACE]
     for block in layout.blocks:

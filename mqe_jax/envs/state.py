@@ -31,7 +31,7 @@ class EnvironmentState:
     privileged_obs: jax.Array
     """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new episode."""
     final_obs: Any
-    """Observations at the end of the last step (A, O), which differ from `obs` after an auto-reset alone; None in a
+    """Observations at the end of the last step (A, O), which differ from `obs` only after an auto-reset; None in a
     batch without them (`VectorEnv.final`)."""
     final_privileged_obs: Any
     """Privileged observation at the end of the last step (P,), or None."""

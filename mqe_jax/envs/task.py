@@ -42,7 +42,7 @@ class Task(Sensing, Generic[S, P]):
     title: ClassVar[str] = ""
     """Display title: the paper's name if the task is in the paper."""
     aim: ClassVar[str] = ""
-    """What a team has to do, in one line, as told to somebody who drives a robot."""
+    """What a team has to do, in one line, for somebody who drives a robot."""
     Params: ClassVar[type[Any]] = TaskParams
     """Class of the task's parameters, P."""
     npc_varied: ClassVar[tuple[str, ...]] = ()
@@ -86,14 +86,14 @@ class Task(Sensing, Generic[S, P]):
 
     @property
     def heading(self) -> str:
-        """The title, with the sizes that are not the task's default ones."""
+        """The title, with the sizes of teams unless they are the task's default."""
         if self.num_agents == self.Params().num_agents:
             return self.title
         return f"{self.title}, {' vs '.join(str(len(team)) for team in self.teams)} robots"
 
     @property
     def extra_contacts(self) -> int:
-        """Contacts for which an environment's buffers have room beyond those of its robots."""
+        """Contacts for which an environment has room, in addition to those of its robots."""
         return 0
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
@@ -154,8 +154,9 @@ class Task(Sensing, Generic[S, P]):
         return robots_there(self.teams, self.observed(state), state.active)
 
     def observed(self, state: State[S]) -> jax.Array:
-        """Returns which agents observe and are observed by teammates (A,) bool: the active ones, without those that are
-        frozen where the number of robots varies.
+        """Returns which agents observe, and are observed by teammates (A,) bool: the active ones.
+
+        If the number of robots varies, frozen agents do not.
         """
         varies = self.params.fewest_agents is not None
         return state.active & (state.step >= state.frozen_steps) if varies else state.active
@@ -176,7 +177,7 @@ class Task(Sensing, Generic[S, P]):
 
     @property
     def sized_layout(self) -> ObservationLayout:
-        """Blocks of which the group `entities` consists, at every size alike but for the number of entities."""
+        """Blocks of the group `entities`, which differ between sizes only in the number of entities."""
         return self.observation_layout
 
     def observe_sized(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:

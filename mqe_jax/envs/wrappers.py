@@ -1,4 +1,4 @@
-"""Batches of environments that show another batch differently, for training."""
+"""Wrappers for vectorised environments."""
 
 import copy
 import dataclasses
@@ -73,7 +73,7 @@ class Wrapper(Outer):
 class Deadline(Wrapper):
     """The time limit terminates episodes; the privileged observation has one more number, the share of time left.
 
-    What a team may still do after the limit is worth nothing to it then (Pardo et al., arXiv 1712.00378).
+    Time-outs are terminal, without bootstrapping (Pardo et al., arXiv 1712.00378).
     """
 
     def __init__(self, inner: Any) -> None:

@@ -26,7 +26,7 @@ _MARGIN = 0.4  # m, from the ring's edge to the robots at the start, at least
 
 @settings_class
 class WrestlingRewards:
-    """Weights of the reward terms; `win` is zero-sum, the others are for training alone."""
+    """Weights of the reward terms; `win` is zero-sum, the others are for training only."""
 
     win: float = 10.0
     """When all opponents have fallen or left the ring, which ends the episode; minus the same of the opponents."""
