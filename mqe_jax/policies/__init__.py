@@ -167,9 +167,10 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
         source: one of `NAMES`, of the task's `NAMED_SCRIPTED`, a task with a shipped policy
             (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path. A folder with one of these
             names is ./NAME.
-        env: the task (of a match: the policy acts for one of its teams); needed for names, and for paths checked.
-        deterministic: whether a trained policy acts with its mean actions; it does so too where its file or the card
-            of a shipped one declares it.
+        env: the task; in a match the policy acts for one team. Names need it, and policies of paths are checked against
+            it.
+        deterministic: whether a trained policy acts with its mean actions. It also does if its file or a shipped
+            policy's card says so.
 
     Returns:
         A `TrainedPolicy` or a `Mixture` for a shipped one or a path, else a `SimplePolicy`.
@@ -221,7 +222,7 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
 
 
 def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
-    """Returns the parameters, and the control mode, in which what policies need differs from a task's defaults.
+    """Returns the parameters and the control mode that policies need and that differ from a task's defaults.
 
     These include the sensors of policies that see them.
 

@@ -27,7 +27,7 @@ class Translated(Composed):
     own: Commander = dataclasses.field(repr=False)
     here: Commander = dataclasses.field(repr=False)
     sensed: slice | None = None
-    """Where the policy's observations have the last action, as it means here; None if they lack it."""
+    """Place of the last action, as it means here, in the policy's observations; None if they lack it."""
 
     _parts = property(lambda self: (self.policy,))
 
@@ -109,7 +109,7 @@ def _changed(env: QuadrupedEnv, **attributes: Any) -> QuadrupedEnv:
 def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns the skills and the command ranges with which policies of different skills can meet, each with its own.
 
-    Empty where all have the same skill. Policies are given by their `Needs.by_name()`.
+    Empty if all have the same skill. Policies are given by their `Needs.by_name()`.
     """
     skills = [needs["skill"] for needs in every]
     if len({*skills}) < 2:

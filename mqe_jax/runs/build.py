@@ -1,4 +1,4 @@
-"""Settings to environments and learners: what users name becomes a training, or the players of an episode."""
+"""Environments, learners and players from the names and settings that users pass."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -97,8 +97,8 @@ def make_learner(
         ```
 
     Args:
-        task: as `mqe_jax.learn`, and so are config, env and impl.
-        config: settings; the evaluation during training is left to the caller.
+        task: as in `mqe_jax.learn`, and so are config, env and impl.
+        config: settings; nothing is evaluated during training.
         env: task parameters.
         impl: physics engine.
         seeds: number of states under an outer `jax.vmap`, for which buffers are sized.
@@ -121,7 +121,7 @@ def make_env(
 ) -> tuple[Any, VectorEnv]:
     """Returns a task and its vectorised environment with automatic reset; `copies` and `final` as in `VectorEnv`.
 
-    The task is an id, or an environment whose class and engine count; `parameters_of` returns its parameters.
+    The task is an id or an environment, of which only class and engine are used (`parameters_of` has the rest).
     """
     check("set", overrides, Parameters)
     device = platform()
@@ -210,7 +210,7 @@ def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None
 
 
 def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv, config: TrainConfig) -> None:
-    """Raises an InputError if a policy that is trained in a task could not act in it as it is evaluated."""
+    """Raises an InputError if a policy trained in a task could not act in its evaluation."""
     differing = needs_of(training, config).mismatches(needs_of(env, config))
     for name, (value, evaluated) in differing.items():
         fail(f"train_env.{name}", value, f"that of env, {evaluated!r}, in which the policy is evaluated")
@@ -270,9 +270,9 @@ def players(
 ) -> Players:
     """Returns what is evaluated, rendered and viewed; arguments and errors as `mqe_jax.evaluate`.
 
-    `sensors` gives the robots those of the set `onboard`, unless they have some.
+    With `sensors`, robots that have none get the sensors of the set `onboard`.
 
-    A run has its own task, parameters and policy. Without a policy and parameters, a task has its shipped policy, on
+    A run brings its own task, parameters and policy. Without a policy and parameters, a task has its shipped policy, on
     both sides of a match. Otherwise it has its scripted one, or `forward`, or `random` if actions are not commands. A
     task by its id has the parameters that trained policies need, such as their skill.
     """
@@ -320,7 +320,7 @@ def run_config(target: str) -> TrainConfig:
 
 
 def settings_of(task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Returns the settings passed to `mqe_jax.learn`, without task parameters, whose sensors select others."""
+    """Returns the settings that `config` of `mqe_jax.learn` stands for, without the task and its parameters."""
     if isinstance(config, TrainConfig):
         return config
     changes = dict(config) if isinstance(config, Mapping) else {"config": config}

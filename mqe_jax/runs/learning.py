@@ -45,11 +45,11 @@ class Run:
     policy: TrainedPolicy
     """The newest policy."""
     metrics: dict[str, np.ndarray]
-    """The columns of metrics.csv, one entry an update (U,)."""
+    """The columns of metrics.csv, one entry per update (U,)."""
     evaluations: list[dict[str, Any]]
     """Evaluations during training: `env_steps`, `episodes`, and results under `sampled` and `deterministic` actions."""
     absolute: dict[str, Any] | None = None
-    """The absolute metric: an evaluation of the best policy over more episodes; None unless a training has ended."""
+    """The absolute metric: an evaluation of the best policy over more episodes; None before the end of a training."""
 
     def __post_init__(self) -> None:
         check("policy", self.policy, TrainedPolicy)
@@ -150,8 +150,8 @@ def learn(
 
     Args:
         task: id, environment, or a batch of environments, which is trained on as it is.
-        config: a shipped name, a file, settings, or a mapping of changes of the task's default settings; the mapping's
-            `config` and `algorithm` name others to change. Default: those of `mqe train`.
+        config: a shipped name, a file, settings, or a mapping of changes of the task's default settings. In a mapping,
+            `config` and `algorithm` name other settings to change. Default: those of `mqe train`.
         env: task parameters.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         seed: random seed. Default: that of the settings, 0 unless they name one.
@@ -181,7 +181,7 @@ def learn_seeds(
     dump_diverged: str | Path | None = None,
     stages: type[Stages] = Stages,
 ) -> list[Run]:
-    """Trains several seeds in one program, each equivalent to a `learn` up to rounding; its arguments and errors.
+    """Trains several seeds in one program, each as `learn` would up to rounding; arguments and errors as there.
 
     Example:
         ```python

@@ -26,7 +26,7 @@ MEASURES = {
     "double_oracle": "mqe_jax.runs.exploiting:double_oracle",
     "pool_of_mates": "mqe_jax.runs.pooling:pool_of_mates",
 }
-"""Functions by the name in `measure`. Those with a folder get that of the measurement."""
+"""Functions by the name in `measure`. Those with an argument `folder` get the measurement's folder."""
 RESULT, RATES = "result.json", "rates.csv"
 
 
@@ -74,7 +74,7 @@ def _with_files(name: str, value: Any) -> Any:
 def measure(
     part: Measurement, folder: Path, impl: str = "auto", cells: Sequence[str] = (), *, dry_run: bool = False
 ) -> dict[str, Any]:
-    """Makes the measurements of a part whose results are not there, and tabulates the rates; see `sweep`.
+    """Makes the measurements of a part that have no results yet, and tabulates the rates; see `sweep`.
 
     With `cells`, it makes only those whose names, TASK/VARIANT, match a pattern.
     """

@@ -56,20 +56,20 @@ def evaluate(
 
     Args:
         task: id, environment, or the run folder or policy file of a trained policy, which brings its task.
-        policy: a policy, or what `load_policy` accepts. Default: the run's; of a task the shipped one, else the
-            scripted one, else `forward`, or `random` if actions are not commands. A task by its id gets the skill,
-            gait, command ranges, control mode and robot that a trained policy needs.
+        policy: a policy, or what `load_policy` accepts. Default: the run's policy, else the shipped, scripted or
+            `forward` one (`random` if actions are not commands). A task by its id gets the skill, gait, command ranges,
+            control mode and robot that a trained policy needs.
         opponent: policy of the other team of a match, or a population (`mqe_jax.policies.zoo.population`), whose
-            members play `episodes` each. Default: that of the first team if it is the shipped one by
-            default, else `idle`.
+            members play `episodes` each. Default: the shipped policy if `policy` is the shipped one by default, else
+            `idle`.
         env: task parameters.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         episodes: number of episodes.
         sides: of a match, whether the policy is the task's team 0 in all episodes (`first`), or team 1 in half of them
             (`both`).
         num_envs: environments in parallel, at most.
-        deterministic: whether trained policies act with their mean actions; a shipped one does so too where its card
-            declares it.
+        deterministic: whether trained policies act with their mean actions. A shipped one also does if its card says
+            so.
         seed: random seed.
         dump_diverged: folder for recordings of environments whose physics diverges (see `mqe replay`).
 
@@ -116,9 +116,9 @@ def tournament(
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `load_policy` accepts, and populations. In a match scripted, idle and random play too; ratings
-            are relative to scripted, or idle without it. In a task of one team, agent 0 follows each policy with each
-            as its mates, scripted and idle ones too.
+        policies: what `load_policy` accepts, and populations. In a match, scripted, idle and random play too; ratings
+            are relative to scripted, else to idle. In a task of one team, agent 0 follows each policy with each one as
+            its mates; scripted and idle play too.
         episodes: episodes of each pair on each side, or of each team.
 
     Returns:
@@ -176,14 +176,14 @@ def render(
 
     Args:
         task: as `evaluate`, and so are policy, opponent, env, impl, deterministic and seed.
-        episodes: number of episodes, of which the clip is the best one, by success, then reward.
+        episodes: number of episodes. The clip shows the best one, by success, then reward.
         seconds: length of the clip, s, at most.
         view: camera: `follow` (tracks robots and objects), `near` (fixed, frames their trajectories), `scene` (fixed,
-            whole scene), `side` (tracks the first robot). Default: `follow`, of an image `scene`.
+            whole scene), `side` (tracks the first robot). Default: `follow`, for an image `scene`.
         width: image width, pixels, at 16:9. Default: 960 for .mp4, 480 for .webp, .gif and notebooks, 1280 for .png.
         fps: frames per second. Default: 25 for .mp4, else 12.5.
         speed: playback speed; 0.5 is slow motion.
-        sensors: whether to draw what the robots sense, by the sensors of `senses`, or of the set `onboard`.
+        sensors: whether to draw what the sensors of `senses` measure, else those of the set `onboard`.
 
     Raises:
         InputError: as `evaluate`.

@@ -1,4 +1,4 @@
-"""What a team gains with mates that it does not know by training with a pool of mates (`pool_of_mates`)."""
+"""How a pool of mates in training helps a team with mates that it does not know (`pool_of_mates`)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,15 +29,15 @@ def pool_of_mates(
     total_steps: int = 15_000_000,
     episodes: int = 64,
 ) -> dict[str, Any]:
-    """Trains a team on with a pool of mates, and mixes the teams before and after with other policies.
+    """Continues the training of a team with a pool of mates, and mixes the old and the new team with other policies.
 
-    Another call resumes what was interrupted.
+    Call it again to resume.
 
     Args:
         task: id of a task of one team.
         start: policy of the team before.
         mates: policies of the pool.
-        others: policies that are mates in the episodes, but not in the training.
+        others: policies that are mates in the episodes, but not in training.
         folder: of the run (a sweep's folder, `mqe_jax.sweep`).
         settings: further settings of the training.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
@@ -45,7 +45,7 @@ def pool_of_mates(
         episodes: of each mixed team.
 
     Returns:
-        `start`, `mates`, and the `tournament` of the team after, that before, and the others, in this order.
+        `start`, `mates`, and the `tournament` of the new team, the old team and the others, in this order.
 
     Raises:
         InputError: for a task, a policy, settings or a folder that is not allowed, or if the training failed.

@@ -52,12 +52,12 @@ def named_config(name: str, task: str) -> TrainConfig:
 def base_config(
     task: str, name: str | None, algorithm: str | None = None, env: Mapping[str, Any] = FrozenMapping()
 ) -> TrainConfig:
-    """Returns the settings of a file or a shipped name, with the presets of the algorithm and of the task parameters.
+    """Returns the settings of a file or a shipped name, changed by an algorithm and by task parameters.
 
-    The default is paper/ALGORITHM if an algorithm is given, else tuned/TASK if it exists, else league for a match and
-    paper/mappo for other tasks. If the parameters name sensors and the settings no group of observations, a policy that
-    sees the sensors gets the settings of `onboard.yaml`. A given parameter counts in training too: it replaces that of
-    `train_env`. InputError for a file or an algorithm that is not allowed.
+    The default is paper/ALGORITHM for an algorithm, else tuned/TASK if it exists, else league for a match and
+    paper/mappo for other tasks. If the parameters have sensors and the settings name no group of observations,
+    `onboard.yaml` changes the settings. Parameters also replace those of `train_env`. InputError for a file or an
+    algorithm that is not allowed.
     """
     task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
     if name is None and algorithm is not None:
@@ -71,7 +71,7 @@ def base_config(
 
 
 def _without(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested values but for those of which the others have one too."""
+    """Returns nested values without those that others have too."""
     kept: dict[str, Any] = {}
     for name, value in merge({}, values).items():
         if name not in others:

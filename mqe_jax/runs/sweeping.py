@@ -38,7 +38,7 @@ def sweep(
 ) -> dict[str, Any]:
     """Trains all combinations of tasks, algorithms, variants and seeds, and reports, as `mqe sweep`.
 
-    A part with `measure` evaluates policies instead. Another call resumes what was interrupted.
+    A part with `measure` evaluates policies instead. Call it again to resume.
 
     Example:
         ```python
@@ -62,8 +62,8 @@ def sweep(
         `left`: the remaining trainings, `jobs`, and their `steps_left` and estimated `seconds`; `report`: files.
 
     Raises:
-        InputError: for a file, a cell, a seed or a folder that is not allowed, or after all if trainings failed.
-        NonFiniteError: after all, if the first that failed became non-finite.
+        InputError: for a file, a cell, a seed or a folder that is not allowed, or at the end if trainings failed.
+        NonFiniteError: at the end, if the first training that failed became non-finite.
     """
     settings, folder, began = load_part(Path(file), part), Path(folder), time.monotonic()
     if isinstance(settings, Measurement):
@@ -106,7 +106,7 @@ def sweep(
 
 
 def train_runs(plan: Sweep, folder: Path, file: str, impl: str) -> list[Path]:
-    """Trains all runs of a sweep, which it writes into a file of its folder, and returns theirs, cell by cell.
+    """Trains all runs of a sweep, which it also writes to a file; returns their folders, cell by cell.
 
     InputError if trainings failed or are left to other processes.
     """

@@ -35,7 +35,7 @@ class DemonstratedState(State[Any]):
 
 
 class Demonstrated(VectorEnv):
-    """A batch of environments whose episodes start, with the probability `assistance`, in states of a demonstrator's.
+    """A batch of environments whose episodes start in states of a demonstrator's with probability `assistance`.
 
     Such an episode has the time that was left to the demonstrator. The states are the same in all runs of a task.
     """

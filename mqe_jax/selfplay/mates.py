@@ -28,9 +28,9 @@ class MatesState(WrappedState):
 class Mates(Wrapper):
     """N environments in K + 1 blocks: in the first the whole team learns, in the others with one of K mates.
 
-    Environment i belongs to block i mod (K + 1). The mate of a block acts for one agent, which is each of the team in
-    turn from one environment of the block to the next. Like the learning policy it acts for the whole team; all but
-    that agent's action is dropped. A training ignores its samples (`state.learners`) but pays the team's reward.
+    Environment i belongs to block i mod (K + 1). The mate of a block acts for one agent, another one in each successive
+    environment of the block. Its policy acts for the whole team; only this agent's action is used. Training ignores
+    this agent's samples (`state.learners`) and pays the team's reward.
 
     Source: partners from a frozen population, fictitious co-play (Strouse et al., arXiv 2110.08176).
     """

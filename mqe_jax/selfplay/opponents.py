@@ -48,7 +48,7 @@ class OpponentState:
 class TeamState(EnvironmentState):
     """State of M environments of one team of T agents, in N matches of A agents; metrics are those of team 0.
 
-    Every (M / N)th of `step` and `assistance` is that of a match; `key` is that of the opponents' actions.
+    `step[::M // N]` and `assistance[::M // N]` hold one entry per match; `key` is for the opponents' actions.
     """
 
     match: EnvironmentState  # state of the matches, leading axis N
@@ -200,8 +200,8 @@ def versus(
 ) -> Versus:
     """Returns matches as environments of team 0, against opponents that control team 1.
 
-    The environments meet the opponents, policies or what `load_policy` accepts, in turn, equally many each. Trained
-    policies act as they are loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`). A draw adds
+    Opponents are policies or what `load_policy` accepts; equally many environments meet each of them. Trained policies
+    act as they are loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`). A draw adds
     `draw_reward`. InputError for a task that is not a match, and for a policy of another task.
 
     Example:
@@ -219,7 +219,7 @@ def versus(
 
 
 class Mirror(OneTeam):
-    """N matches as 2 N environments of one team, the two of each match side by side: one policy learns as both.
+    """N matches as 2 N environments of one team, two in a row per match: one policy learns as both teams.
 
     The privileged observation has one more number, the index of the team. Outcome and metrics are those of team 0;
     `diverged` and `overflow` are counted for the first.

@@ -66,7 +66,7 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
 
 @check_arguments(path=PathText, metadata=Mapping[str, Any], kind=Kind)
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
-    """Writes a pytree of arrays with JSON metadata, whose same content gives the same bytes, as a file of a kind."""
+    """Writes a pytree of arrays with JSON metadata as a file of a kind; equal content gives equal bytes."""
     try:
         text = json.dumps(dict(metadata), sort_keys=True)
     except (TypeError, ValueError):

@@ -37,8 +37,8 @@ class PPO:
     minibatches: PositiveInt = 1
     """Minibatches per epoch."""
     groups: PositiveInt = 1
-    """Groups of environments with equal shares of every minibatch: a multiple of the number of processes. Runs with
-    equally many groups are equal on any number of processes."""
+    """Groups of environments with equal shares of every minibatch, a multiple of the number of processes. Runs with
+    equal `groups` are equal on any number of processes."""
     ratio: Literal["agent", "dimension", "joint"] = "agent"
     """Probability ratio that is clipped: per agent, per action dimension (OpenRL's MAPPO), or joint (JRPO)."""
     value: Literal["agent", "joint"] = "agent"
@@ -76,8 +76,8 @@ class OptimizerSettings:
     anneal: Annotated[float, Gt(0), Le(1)] = 1.0
     """Final fraction of the run over which the linear schedule falls."""
     target_kl: Positive | None = None
-    """Target KL divergence per minibatch of the adaptive learning rate, which does not rise while the schedule falls;
-    none uses the schedule alone."""
+    """KL divergence per minibatch to which the learning rate adapts; it does not rise while the schedule falls. None:
+    only the schedule."""
     eps: Positive = 1e-5
     """Adam's epsilon."""
     max_grad_norm: Positive | None = 10.0
@@ -93,8 +93,8 @@ class Curriculum:
     assistance_until: Positive = 0.5
     """Fraction of training after which the assistance is 0."""
     demonstrator: str | None = None
-    """Policy whose episodes provide initial states, with the probability `assistance`: scripted, a run folder or a
-    policy file; none starts all episodes as the task does."""
+    """Policy whose episodes provide initial states: scripted, a run folder or a policy file. An episode starts in one
+    with probability `assistance`. None: all episodes start as the task does."""
     failure_bootstrap: Fraction = 0.0
     """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
     only its penalty, not the future return, which encourages exploration."""
@@ -110,8 +110,8 @@ class Imitation:
     """
 
     teacher: str | None = None
-    """Policy that sees its own group of observations: scripted, the task (its shipped policy), a run folder or a policy
-    file; none disables imitation. Other task parameters are those that it needs."""
+    """Policy to imitate: scripted, the task (its shipped policy), a run folder or a policy file. It sees its own group
+    of observations, and the task gets the parameters that it needs. None disables imitation."""
     weight: NonNegative = 1.0
     """Initial weight of the loss, annealed linearly to 0."""
     until: Positive = 0.5
@@ -141,9 +141,9 @@ class LeagueSettings:
     snapshot_steps: Steps = 3_000_000
     """Environment steps after which the policy becomes a member."""
     snapshot_win_rate: Fraction = 0.7
-    """Mean win rate against the members at which the policy joins them after a quarter of these steps."""
+    """Mean win rate against the members at which the policy joins them after only a quarter of these steps."""
     episodes: Episodes = 200
-    """Episodes of a block of environments against a member until it plays another one."""
+    """Episodes that a block of environments plays against a member before another one is drawn."""
 
 
 @settings_class

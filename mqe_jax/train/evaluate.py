@@ -59,7 +59,7 @@ class Rate(NamedTuple):
 
     @property
     def percent(self) -> str:
-        """The percentages alone, such as 97.3 (95.5 to 98.4)."""
+        """The percentages, such as 97.3 (95.5 to 98.4)."""
         return repr(self).replace("%", "").replace("100.0", "100")
 
     @classmethod
@@ -109,7 +109,7 @@ class Result:
     about: dict[str, Any] = field(default_factory=dict)
     """Who acted, by name: policy, actions, opponent, sides, seed."""
     by_opponent: "dict[str, Result]" = field(default_factory=dict)
-    """Results against each member of a population, of which the others are means."""
+    """Results against each member of a population; the other fields are their means."""
 
     @property
     def success(self) -> Rate:
@@ -199,7 +199,7 @@ def _plain_words(name: str) -> str:
 
 
 def pool(results: Mapping[str, Result], opponent: str) -> Result:
-    """Returns the results against the members of a population, by name, as one, in which each counts the same."""
+    """Returns the mean of results against the members of a population, by name."""
     every = list(results.values())
     summed, fixed = ("episodes", "overflow", "diverged"), ("task", "about", "by_opponent")
     means = [{name: x for name, x in vars(each).items() if name not in (*summed, *fixed)} for each in every]
@@ -263,10 +263,10 @@ def evaluate_batch(
 ) -> Result:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
-    Each environment contributes its first `episodes // N` episodes, every few of them one more; later ones are ignored,
-    so the sample is not biased by episode length. `policy` may be a function like a policy's `act`, and `memory` its
-    initial recurrent state, leading axis N. A compiled call makes `block` steps. InputError for a policy of another
-    task, and for episodes that do not end within `max_steps`.
+    Each environment contributes its first `episodes // N` episodes, some of them one more. Later ones are ignored:
+    short episodes are not over-represented. `policy` may be a function like a policy's `act`, and `memory` its initial
+    recurrent state, leading axis N. A compiled call makes `block` steps. InputError for a policy of another task, and
+    for episodes that do not end within `max_steps`.
     """
     act, memory = acting(policy, env, env.num_envs, memory)
     evaluator = Evaluator(env, lambda params, *seen: act(*seen), memory, block=block, max_steps=max_steps)

@@ -32,7 +32,7 @@ _OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of thei
 
 @contextlib.contextmanager
 def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
-    """Creates and locks run folders; raises an InputError for one that holds a run, or what `resume` cannot resume."""
+    """Creates and locks run folders; InputError for one with a run, or with `resume` one that cannot be resumed."""
     with contextlib.ExitStack() as locks:
         check_folders(folders, resume)
         for folder in folders:
@@ -43,7 +43,7 @@ def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
 
 
 def check_folders(folders: Sequence[Path], resume: bool) -> None:
-    """Raises an InputError for folders in which no training, or with `resume` no resumed one, could start."""
+    """Raises an InputError for folders in which a training could not start or, with `resume`, continue."""
     for folder in folders:
         check_links(folder)
         check_alone(folder)
@@ -86,7 +86,7 @@ def check_links(run_dir: Path) -> None:
 
 
 def check_alone(run_dir: Path) -> None:
-    """Raises an InputError for a folder in that of another run, or around runs of several seeds."""
+    """Raises an InputError for a folder inside another run's, or one that holds the runs of several seeds."""
     seeds = [folder for folder in sorted(run_dir.glob("seed*")) if latest(folder)]
     others = [run_dir.parent] * (latest(run_dir.parent) is not None) + seeds
     if others:

@@ -231,7 +231,7 @@ class ProgressLog:
 
     @contextlib.contextmanager
     def doing(self, what: str) -> Iterator[None]:
-        """Shows that something else than an update is being done, and for how long."""
+        """Shows what is done between updates, and for how long."""
         now = time.perf_counter()
         if what != self._doing:
             self._doing, self._began = what, now
@@ -244,7 +244,7 @@ class ProgressLog:
         self._since += time.perf_counter() - now
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Shows steps, speed and the remaining time, and what there is of reward per step (else return) and success."""
+        """Shows steps, speed, remaining time, reward per step (else return) and success."""
         now, first = time.perf_counter(), not self._numbers
         self._seconds += now - self._since
         self._since, self._step, self._active = now, int(row["env_steps"]), False

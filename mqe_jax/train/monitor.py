@@ -72,7 +72,7 @@ class Monitor:
     ) -> list[dict[str, Any]]:
         """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with mean actions.
 
-        Those of the `absolute` metric are other episodes than those by which its policy was chosen.
+        The `absolute` metric has other episodes than the evaluations that chose its policy.
         """
         stacked = _twice([policy.arrays for policy in policies])
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))

@@ -12,7 +12,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 
 ACTIONS = ("robot", "control", "skill", "gait", "commands", "command_ranges", "position_scale")
-"""What tells the meaning of actions, by the names of task parameters."""
+"""Task parameters that say what actions mean."""
 
 
 @settings_class

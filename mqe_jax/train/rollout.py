@@ -91,8 +91,8 @@ def rollout(
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
 
     The environment receives `action_scale` times the sampled action. A teacher, which sees its own group of
-    observations, says in every step what it would do. Metrics are means over steps and environments,
-    but `diverged` and `overflow` are counts; `ended` has the number of `episodes` that ended and means over them.
+    observations, labels every step with its action. Metrics are means over steps and environments, but `diverged` and
+    `overflow` are counts; `ended` has the number of `episodes` that ended and means over them.
     """
 
     def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:

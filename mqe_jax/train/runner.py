@@ -44,8 +44,8 @@ def train(
 ) -> TrainState:
     """Trains until `config.total_steps` and returns the last state; without a `run_dir`, nothing is written.
 
-    `resume` resumes the run in the folder from its newest checkpoint; an empty one starts a new run. `on_update` gets
-    the state and the row of metrics.csv of every update. `eval_env` has an environment for each of
+    `resume` continues the run in the folder from its newest checkpoint; in an empty folder a new run starts.
+    `on_update` gets the state and the row of metrics.csv of every update. `eval_env` has an environment for each of
     `config.evaluation.episodes`, `teacher` is the policy that `config.imitation` imitates.
 
     InputError, before anything is changed, for a folder that cannot be written, is in use, or holds a run that cannot
@@ -68,8 +68,8 @@ def train_seeds(
 ) -> list[TrainState]:
     """Trains several seeds in one program, equivalently to separate runs, each with its own run folder; see `train`.
 
-    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all. If `stop()`
-    before an update, they are saved and end, to be resumed.
+    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all. If `stop()` is
+    true before an update, they are saved and end.
     """
     with open_training(env, configs, run_dirs, resume, eval_env, league, teacher) as training:
         return training.run(on_update, stop)

@@ -30,7 +30,7 @@ class Stages:
         self.optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
 
     def value_mask(self, learners: jax.Array) -> jax.Array:
-        """Returns which values (..., V) count, of agents of which some are learners (..., A)."""
+        """Returns which values (..., V) count; `learners` (..., A) says from which agents the policy learns."""
         return jnp.any(learners, axis=-1, keepdims=True) if self.config.ppo.value == "joint" else learners
 
     def advantages(

@@ -24,7 +24,7 @@ from mqe_jax.train.stages import Stages
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
-"""Settings of a network that the policy to start from may have otherwise."""
+"""Settings of the network in which the policy to start from may differ."""
 
 
 def initial_key(config: TrainConfig) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Scripted policies (`--policy scripted`), one per task, acting like learned ones, and their steering."""
+"""Scripted policies (`--policy scripted`), at least one per task, and their steering."""
 
 import functools
 from collections.abc import Callable, Mapping

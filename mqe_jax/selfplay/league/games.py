@@ -167,7 +167,7 @@ def resample(counts: NDArray[Any], random: np.random.Generator) -> Array:
 
 
 def games_of(results: NDArray[Any]) -> Array:
-    """Returns results with one drawn game more for every pair, so that few games that all end alike leave doubt."""
+    """Returns results with one more drawn game for every pair, so that a few equal games leave doubt."""
     return results + _DRAW
 
 
@@ -181,9 +181,9 @@ class Analysis(NamedTuple):
     """What the results of P policies say about each; payoffs are wins minus losses of a game."""
 
     payoff: Estimate
-    """Payoff of each policy against each, on both sides together (P, P). Intervals are those of other episodes."""
+    """Payoff of each policy against each, on both sides together (P, P). Intervals are over episodes."""
     mean: Estimate
-    """Mean payoff against the others (P,). Its interval is that of other opponents and episodes."""
+    """Mean payoff against the others (P,). Its interval is over opponents and episodes."""
     worst: Estimate
     """Lowest payoff against one of the others (P,)."""
     weight: Estimate

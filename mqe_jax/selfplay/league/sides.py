@@ -11,7 +11,7 @@ from mqe_jax.envs.wrappers import Wrapper
 
 
 class BothSides(Wrapper):
-    """Matches, in the second half of which team 0 is the task's team 1; outcomes and rewards are the new teams'.
+    """Matches; in the second half of them team 0 is the task's team 1. Outcomes and rewards are the new teams'.
 
     The privileged observation has one more number: 1 if the teams have changed places, else 0. It makes a difference
     even if a match is symmetric under a reflection: mirrored robots do not walk exactly alike.
