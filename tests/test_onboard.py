@@ -112,7 +112,7 @@ def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
         seen = jnp.concatenate([*(layout.split(here) | {"action": last}).values()], axis=-1)
         last, own = policy.act(seen, own)
         assert action.shape == (3, 2, 4) and np.abs(last).max() > 0.01
-        np.testing.assert_allclose(action, met.here.translated(last, met.own), atol=1e-6)  # pyright: ignore
+        np.testing.assert_allclose(action, met.here.translate(last, met.own), atol=1e-6)  # pyright: ignore
 
 
 def test_other_sensors_are_named_with_both_values() -> None:

@@ -26,7 +26,7 @@ from mqe_jax.train.normalize import (
     value_normalize,
     value_update,
 )
-from mqe_jax.train.optim import adam, begun_anew
+from mqe_jax.train.optim import adam, restart
 from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.schedules import current_values
 from tests.training import random_params, settings
@@ -246,8 +246,8 @@ def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() ->
     for _ in range(500):
         params, state, _ = update({"a": jnp.zeros(())}, state, params, 0.1)
     gradient = {"a": jnp.float32(0.5)}
-    assert float(update(gradient, begun_anew(state, False), params, 0.1)[0]["a"]) < -0.15
-    again = begun_anew(state, jnp.bool_(True))
+    assert float(update(gradient, restart(state, False), params, 0.1)[0]["a"]) < -0.15
+    again = restart(state, jnp.bool_(True))
     assert float(update(gradient, again, params, 0.1)[0]["a"]) == pytest.approx(-0.1, rel=1e-4)
 
 

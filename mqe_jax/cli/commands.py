@@ -89,7 +89,7 @@ class Tasks:
 
 @settings_class
 class Zoo:
-    """List the shipped teams and how good they are; of one task, also how its team was trained."""
+    """List the shipped teams and how good they are; with TASK, also how its team was trained."""
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """Id of a task, whose team's card is printed."""
@@ -167,8 +167,8 @@ class Eval(PolicyOptions):
     """Side of the policy in a match: the task's team 0 in all episodes (first), or in half of them (both)."""
     dump_diverged: DumpDiverged = None
     export: RobotFile = None
-    """Graph of one robot, in place of a policy; `mqe export` writes it with `--per-robot`. Each robot is a process
-    that has this file and its own readings only. The file determines whether actions are sampled."""
+    """Graph of one robot, in place of a policy; `mqe export --per-robot` writes it. Each robot is a process that has
+    only this file and its own readings. The file determines whether actions are sampled."""
     opponent_export: RobotFile = None
     """The same for the robots of the opponents."""
 
@@ -253,7 +253,7 @@ class Replay:
 
 @settings_class
 class Bench(TaskOptions):
-    """Measure throughput in environment steps per second: with walk policy and resets, and for physics alone."""
+    """Measure throughput in environment steps per second: of whole steps with skill and resets, and of physics only."""
 
     task: tyro.conf.Positional[str] = "go1gate"
     """Id of the task."""

@@ -23,10 +23,10 @@ class Export:
     onnx: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write (.onnx)."""
     per_robot: bool = False
-    """Write the graph of one robot, for any of the team: from its own readings to its action, without the walk policy.
-    `mqe eval` runs it with `--export`."""
+    """Write the graph that each robot of the team can run: from its own readings to its action, without the walk
+    policy. `mqe eval --export` runs it."""
     sampled: bool = False
-    """Of one robot: let it sample its actions, as the policy does by default in `mqe eval`; else they are means."""
+    """With --per-robot: sample the actions, as `mqe eval` does by default. Default: mean actions."""
     json: Json = False
 
     def run(self) -> dict[str, Any]:
@@ -67,7 +67,7 @@ class Export:
 
 @settings_class
 class PlaySite:
-    """Write a web page on which policies play in the reader's browser; it needs no server but one for files."""
+    """Write a web page on which policies play in the reader's browser; any server of files can serve it."""
 
     runs: Annotated[tyro.conf.Positional[list[str]], tyro.conf.arg(metavar="TASK|RUN")] = field(default_factory=list)
     """Tasks with their shipped and scripted policies, tasks of other sizes with the scripted one

@@ -72,8 +72,8 @@ class PolicyOptions(TaskOptions):
     """Policy of team 1 in a match: what --policy accepts. Default: the shipped one if team 0 has it by default, else
     idle."""
     deterministic: bool = False
-    """Use mean actions of trained policies, in a match of both teams; otherwise they are sampled, as in training, or as
-    a shipped policy's card declares."""
+    """Use mean actions of trained policies, in a match of both teams. Default: sampled actions, as in training, or as a
+    shipped policy's card says."""
     seed: Seed = 0
 
     @property

@@ -19,7 +19,7 @@ class Render(PolicyOptions):
     """File to write: .mp4, .webp, .gif or .png."""
     json: Json = False
     best_of: Candidates = 1
-    """Number of episodes, of which the best is rendered (by success, then reward)."""
+    """Number of episodes; the best one is rendered (by success, then reward)."""
     seconds: ClipLength = 20.0
     """Maximum length of the clip, s."""
     width: Annotated[ImageWidth | None, tyro.conf.arg(metavar="INT")] = None
@@ -35,7 +35,7 @@ class Render(PolicyOptions):
     at: Annotated[Time | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Time of an image in the episode, s. Default: its middle."""
     sensors: bool = False
-    """Draw what the robots sense, by the sensors of the parameter senses, or of its set onboard."""
+    """Draw what the sensors of the parameter senses measure, else those of its set onboard."""
 
     def run(self) -> dict[str, Any]:
         """Renders an episode to a file; returns the object for `--json`, with all episodes."""

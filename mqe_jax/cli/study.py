@@ -27,10 +27,10 @@ class SweepCommand:
     folder: Path | None = None
     """Folder of the sweep. Default: runs/PART, or runs/NAME of the file."""
     cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(default_factory=list)
-    """Train these cells only: TASK/ALGORITHM, followed by +VARIANT in a sweep with variants; of a part that measures,
-    TASK/VARIANT. May be a pattern such as '*/mat', and may be repeated."""
+    """Train only these cells: TASK/ALGORITHM, in a sweep with variants TASK/ALGORITHM+VARIANT, in a part that measures
+    TASK/VARIANT. May be a pattern such as '*/mat'; may be repeated."""
     seeds: Annotated[list[int], Repeated, tyro.conf.arg(metavar="SEED")] = field(default_factory=list)
-    """Train these seeds only; may be repeated."""
+    """Train only these seeds; may be repeated."""
     time_limit: Annotated[Positive | None, tyro.conf.arg(metavar="MINUTES")] = None
     """Save the run in training after this time, min, and end; the same command resumes it."""
     dry_run: bool = False

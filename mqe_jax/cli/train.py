@@ -28,7 +28,7 @@ class Source:
     """Where the settings come from that flags then change."""
 
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
-    """YAML file of settings, which have the defaults of `TrainConfig` if missing, or the name of a shipped one: demo,
+    """YAML file of settings (missing ones have the defaults of `TrainConfig`), or the name of a shipped one: demo,
     league, sizes, tuned/TASK, paper/ALGORITHM. Default: with --algorithm, the paper's settings; else the task's tuned
     ones, else league (a match) or the paper's MAPPO."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None

@@ -25,7 +25,7 @@ class View(PolicyOptions):
     num_envs: Annotated[int, Ge(1), Le(16)] = 1
     """Number of environments, side by side: 1 to 16."""
     sensors: bool = False
-    """Draw what a robot senses, by the sensors of the parameter senses, or of its set onboard."""
+    """Draw what a robot's sensors of the parameter senses measure, else those of its set onboard."""
     host: str = "127.0.0.1"
     """Address or name to listen on; the default is reachable from this machine only. There is no authentication."""
     port: Port = 8080

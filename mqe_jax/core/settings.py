@@ -361,11 +361,11 @@ def _fields(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _record_in(hint: Any) -> Any:
+def _settings_in(hint: Any) -> Any:
     """Returns the settings class within an annotated or optional type, or None."""
     if is_settings(hint):
         return hint
-    return next((found for part in typing.get_args(hint) if (found := _record_in(part)) is not None), None)
+    return next((found for part in typing.get_args(hint) if (found := _settings_in(part)) is not None), None)
 
 
 def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
@@ -378,7 +378,7 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
         return InputError(".".join([*(places[:-1] if named else places), str(raised)]))
     if first["type"] == "unexpected_keyword_argument":
         for part in places[:-1]:
-            kind = _record_in(hints_of(kind)[part])
+            kind = _settings_in(hints_of(kind)[part])
         known = list(hints_of(kind))
         hint = f"{nearest(places[-1], known)}; allowed: {', '.join(known)}"
         return InputError(f"{'.'.join(places)}: unknown name (value {short_repr(value)}){hint}")

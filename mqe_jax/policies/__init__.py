@@ -286,7 +286,7 @@ def _constant(shape: tuple[int, ...], first: float, obs: jax.Array, key: jax.Arr
 def _act_scripted(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) -> jax.Array:
     part = env.controller.skill.parts[0]
     own = Commander(part, env.params.commands, part.default_commands(), {})
-    action = env.controller.translated(jax.vmap(scripted_policy(env, name))(obs), own)
+    action = env.controller.translate(jax.vmap(scripted_policy(env, name))(obs), own)
     silent = jnp.zeros((*action.shape[:-1], env.action_size - action.shape[-1]))
     return jnp.concatenate([action, silent], axis=-1) if silent.shape[-1] else action
 

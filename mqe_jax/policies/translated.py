@@ -41,13 +41,13 @@ class Translated(Composed):
         """Returns the actions; see `Policy`."""
         if self.sensed is None:
             action, memory = self.policy.act(obs, memory, key)
-            return self.here.translated(action, self.own), memory
+            return self.here.translate(action, self.own), memory
         seen, (memory, last), group = Observations.at(obs), memory, self.policy.needs.group
         here = seen.group(group) if isinstance(obs, Observations) else obs
         own = jnp.concatenate([here[..., : self.sensed.start], last, here[..., self.sensed.stop :]], axis=-1)
         seen = dataclasses.replace(seen, groups={**seen.groups, group: own})
         action, memory = self.policy.act(seen, memory, key)
-        return self.here.translated(action, self.own), (memory, action)
+        return self.here.translate(action, self.own), (memory, action)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Throughput in environment steps per second: of whole steps with skill and resets, and of physics alone."""
+"""Throughput in environment steps per second: of whole steps with skill and resets, and of physics only."""
 
 import os
 import time
@@ -18,7 +18,7 @@ from mqe_jax.sensors.suite import ONBOARD
 WARM_UP = 4  # calls after the compiling one that are not counted: episodes spread, clocks settle
 
 
-def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, list[float], Any]:
+def time_calls(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, list[float], Any]:
     """Returns the seconds of the first call, which compiles, those of `repeats` calls after `WARM_UP` ones, the state.
 
     `run(state) -> state`; each call continues from the previous state and is synchronised.
@@ -37,7 +37,7 @@ def timed(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, l
 def programs(
     env: QuadrupedEnv, vector: VectorEnv, steps: int, seen: Callable[[Any], Any]
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Returns what is timed, neither jitted: whole environment steps, and physics alone.
+    """Returns what is timed, neither jitted: whole environment steps, and physics only.
 
     The first maps a state and a random key to those `steps` later under random actions, and returns `seen` of each
     state. The second maps a physics state to a later one under its constant control.
@@ -100,8 +100,8 @@ def bench(
     key = jax.random.PRNGKey(seed)
     state = jax.block_until_ready(jax.jit(batch.reset)(key))
     walk = jax.jit(lambda carry: whole(carry[0]))
-    first, full_s, (_, overflow) = timed(walk, ((state, key), jnp.zeros(steps)), repeats)
-    _, bare_s, _ = timed(jax.jit(bare), jax.tree.map(jnp.copy, state.data), repeats)
+    first, full_s, (_, overflow) = time_calls(walk, ((state, key), jnp.zeros(steps)), repeats)
+    _, bare_s, _ = time_calls(jax.jit(bare), jax.tree.map(jnp.copy, state.data), repeats)
     full_rate, bare_rate = num_envs * steps / median(full_s), num_envs * steps / median(bare_s)
     return {
         "task": batch.name,

@@ -50,13 +50,13 @@ class Sensor:
     """Engines on which it works; empty: all."""
 
     name: str = ""
-    """Name in the registry; of a subclass, a `Literal` with its value as the default."""
+    """Name in the registry. A subclass has a `Literal` here, with its value as the default."""
     pipeline: Mapping[str, Pipeline] = FrozenMapping()
-    """What happens to the readings of its blocks, by their names; of those not named, what `all` has."""
+    """What happens to the readings of its blocks, by their names; `all` stands for those that are not named."""
 
     @property
     def action_size(self) -> int:
-        """Length of what it adds to an agent's action, after what moves the robot; one sensor of a task may."""
+        """Number of entries that it appends to an agent's action; at most one sensor of a task appends some."""
         return 0
 
     def pipeline_of(self, block: Block) -> Pipeline:
@@ -105,7 +105,7 @@ def register(sensor: S) -> S:
     """Registers a settings class under the default of its field `name`, and returns it; a class decorator.
 
     Raises:
-        InputError: for anything else, without a name, or if another class is registered under it.
+        InputError: for anything else, a class without a name, or a name of another class.
     """
     if not (isinstance(sensor, type) and issubclass(sensor, Sensor) and is_settings(sensor)):
         fail("sensor", sensor, "a class derived from Sensor, below @register and @settings_class")

@@ -44,7 +44,7 @@ class Depth(Sensor):
     width: Side = 32
     """Width of the image, pixels."""
     range: Length = 5.0
-    """Distance that reads 1, as does all that is further, m."""
+    """Distance from which on a pixel reads 1, m."""
     field_of_view: Angle = 60.0
     """Vertical field of view, degrees."""
     mount: tuple[float, float, float] = (0.3, 0.0, 0.05)

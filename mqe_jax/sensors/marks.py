@@ -45,7 +45,7 @@ def marks(
     area: jax.Array | None = None,
     bold: bool = False,
 ) -> Marks:
-    """Returns marks of A agents at their heights (A,), m; arguments as the fields of `Marks`, of x and y alone.
+    """Returns marks of A agents at their heights (A,), m; arguments as the fields of `Marks`, with x and y only.
 
     An opacity is of the shape (A, L) or (A, P), or the same for all.
     """

@@ -96,7 +96,8 @@ class SensedScene:
 
     @functools.cached_property
     def mates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Each agent's teammates, padded by itself to the size of the largest team (A, count), and which are some."""
+        """Each agent's teammates, padded by itself to the largest team's size (A, count), and which entries are
+        real."""
         count = max(map(len, self.teams)) - 1
         rows = [
             [*(mate for mate in team if mate != agent), *[agent] * count][:count]

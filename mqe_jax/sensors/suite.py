@@ -43,7 +43,7 @@ SETS: dict[str, tuple[Sensor, ...]] = {
         Lidar(pipeline={"all": Pipeline(noise=0.02)}),
     ),
 }
-"""Sensors by the names that the parameter `senses` has for them; `full` are the task's own observations alone."""
+"""Sets of sensors by name, for the parameter `senses`; `full` has none, only the task's own observations."""
 
 _ALLOWED = f"{', '.join(SETS)}, or a list of sensors, such as [proprioception, lidar]"
 

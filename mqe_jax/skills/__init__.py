@@ -97,7 +97,7 @@ class Skill(abc.ABC):
         return ()
 
     def with_choice(self, name: str, commands: jax.Array) -> jax.Array:
-        """Returns the commands (N, C) with which the skill of this name acts by its own ones (N, C')."""
+        """Returns the commands (N, C) that make the skill of this name act with its own commands (N, C')."""
         return commands
 
     # -- common to all skills -----------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ class Commander:
         (low, high), (least, most) = other.limits.T, self.limits[: len(names)].T
         return bool(np.all((low >= least - 1e-6) & (high <= most + 1e-6)))
 
-    def translated(self, action: jax.Array, other: Commander) -> jax.Array:
+    def translate(self, action: jax.Array, other: Commander) -> jax.Array:
         """Computes the actions that give here the commands of actions (..., n) of `other`, which this one `admits`."""
         entries = self.skill.select(other.skill.name)
         if not entries and np.array_equal(self.changes, other.changes):

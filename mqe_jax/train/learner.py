@@ -40,7 +40,7 @@ from mqe_jax.train.normalize import (
     value_normalize,
     value_update,
 )
-from mqe_jax.train.optim import AdamState, begun_anew
+from mqe_jax.train.optim import AdamState, restart
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, normalize_obs, rollout
 from mqe_jax.train.schedules import Scheduled, current_values
 from mqe_jax.train.stages import Metrics, Stages
@@ -148,7 +148,7 @@ def make_learner(
         if teacher is not None:
             shown = moving(transitions.teacher_action) / config.action_scale
             batch = batch._replace(teacher_action=chunks(shown, network.chunk_length))
-        carry = state.params, begun_anew(state.optimizer, now.actor_begins), state.learning_rate
+        carry = state.params, restart(state.optimizer, now.actor_begins), state.learning_rate
         carry, loss_metrics = algorithm.update(carry, batch, now, epoch_key)
         params, optimizer_state, learning_rate = carry
         loss_metrics["learning_rate"] = learning_rate * now.learning_rate_factor

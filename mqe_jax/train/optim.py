@@ -26,7 +26,7 @@ class Optimizer(NamedTuple):
     update: Callable[[PyTree, AdamState, PyTree, jax.Array | float], tuple[PyTree, AdamState, jax.Array]]
 
 
-def begun_anew(state: AdamState, when: jax.Array | bool) -> AdamState:
+def restart(state: AdamState, when: jax.Array | bool) -> AdamState:
     """Returns the initial state where `when` is true, else the state itself.
 
     After updates with gradients of 0, without corrections of the moments, the first real steps would be too long.

@@ -178,8 +178,8 @@ def render_episode(
 
     Defaults: .mp4 960 x 540 at 25 frames/s, .gif and .webp 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow`
     for a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the
-    middle). A legend tells the teams' colours.
-    Without GL, the packages required for 3-D rendering are printed to standard error.
+    middle). A legend names the teams' colours. Without GL, the packages required for 3-D rendering are printed to
+    standard error.
 
     Example:
         ```python
