@@ -20,7 +20,7 @@ from tyro.conf import Positional
 
 from mqe_jax import evaluate, load_policy
 from mqe_jax.core.types import Observations
-from mqe_jax.export.robot_graph import checked_robot_onnx
+from mqe_jax.export.robot_graph import verify_robot
 from mqe_jax.export.robot_team import RobotTeam, open_team
 from mqe_jax.export.task import readings_function
 from mqe_jax.policies.mixture import Trained
@@ -72,7 +72,7 @@ def measure(
     policy = load_policy(target).acting(not sampled)
     task, seed = str(policy.config.task), 0
     env, _ = make_env(task, "c", policy.config.env, 1)
-    model, error = checked_robot_onnx(policy, env)
+    model, error = verify_robot(policy, env)
     options: dict[str, Any] = {"env": policy.config.env, "impl": "c", "episodes": episodes, "num_envs": num_envs}
     begun = time.perf_counter()
     inside = evaluate(task, policy, opponent, **options)

@@ -29,7 +29,7 @@ from tests.training import random_params
 pytest.importorskip("jax2onnx")
 pytest.importorskip("onnxruntime")
 
-from mqe_jax.export.robot_graph import checked_robot_onnx, robot_onnx
+from mqe_jax.export.robot_graph import robot_onnx, verify_robot
 from mqe_jax.export.robot_team import open_team
 
 SENSES = {"control": "position", "senses": ["proprioception", "messages"], "episode_length": 0.2}
@@ -117,7 +117,7 @@ def test_a_process_that_ends_is_reported_in_a_line(files: Any) -> None:
 )
 def test_robots_that_cannot_act_alone_are_refused(network: dict[str, Any], said: str) -> None:
     env = make("go1gate", impl="c", num_envs=1, control="position")
-    refuses(said, checked_robot_onnx, new_policy(env, "position", **network).acting(True), env)
+    refuses(said, verify_robot, new_policy(env, "position", **network).acting(True), env)
 
 
 def test_what_is_no_file_of_a_robot_is_refused(policy: Any, files: Any, tmp_path: Path, monkeypatch: Any) -> None:

@@ -16,7 +16,7 @@ import pytest
 from mqe_jax.core.errors import InputError, one_line
 from mqe_jax.core.literal import to_html, to_markdown
 from mqe_jax.study import statistics
-from mqe_jax.study.estimates import band, evaluated, group, score_matrices
+from mqe_jax.study.estimates import band, group, score_matrices, select_evaluated
 from mqe_jax.study.report import markdown, write_report
 from mqe_jax.study.runs import REWARD, Cell, Reference, Run
 from tests.inputs import refuses
@@ -112,7 +112,7 @@ def test_single_seeds_without_evaluation_are_reported(tmp_path: Path) -> None:
 def test_evaluations_take_the_place_of_training_rewards() -> None:
     runs = [made_up(Cell("go1gate", "mat", "tuned"), 0), made_up(Cell("go1gate", "mat"), 0, evaluated=False)]
     cells = group(runs, REFERENCE)
-    ((cell, (run,)),) = evaluated(cells).items()
+    ((cell, (run,)),) = select_evaluated(cells).items()
     assert cell.variant == "tuned" and list(run.curve["env_steps"]) == [20_000_000, 40_000_000]
 
 

@@ -167,8 +167,8 @@ class Eval(PolicyOptions):
     """Side of the policy in a match: the task's team 0 in all episodes (first), or in half of them (both)."""
     dump_diverged: DumpDiverged = None
     export: RobotFile = None
-    """Graph of one robot, in place of a policy; `mqe export --per-robot` writes it. Each robot is a process that has
-    only this file and its own readings. The file determines whether actions are sampled."""
+    """Graph of one robot, in place of a policy; `mqe export` writes it with `--per-robot`. Each robot is a process that
+    has only this file and its own readings. The file determines whether actions are sampled."""
     opponent_export: RobotFile = None
     """The same for the robots of the opponents."""
 

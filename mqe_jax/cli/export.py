@@ -24,7 +24,7 @@ class Export:
     """File to write (.onnx)."""
     per_robot: bool = False
     """Write the graph that each robot of the team can run: from its own readings to its action, without the walk
-    policy. `mqe eval --export` runs it."""
+    policy. `mqe eval` runs it with `--export`."""
     sampled: bool = False
     """With --per-robot: sample the actions, as `mqe eval` does by default. Default: mean actions."""
     json: Json = False
@@ -45,15 +45,15 @@ class Export:
         if task is None:
             raise InputError(f"{self.run_dir}: its settings have no 'task' entry")
 
-        from mqe_jax.export.check import STEPS, checked_onnx
+        from mqe_jax.export.check import STEPS, verify_policy
         from mqe_jax.export.policy import shapes
-        from mqe_jax.export.robot_graph import checked_robot_onnx
+        from mqe_jax.export.robot_graph import verify_robot
 
         env, _ = make_env(task, "auto", policy.config.env, 1)
         if self.per_robot:
-            model, error = checked_robot_onnx(policy if self.sampled else policy.acting(True), env)
+            model, error = verify_robot(policy if self.sampled else policy.acting(True), env)
         else:
-            model, error = checked_onnx(policy, env)
+            model, error = verify_policy(policy, env)
         write_atomically(self.onnx, model.SerializeToString())
         sizes = shapes(model)
         echo(f"mqe: wrote {self.onnx}, {self.onnx.stat().st_size / 1e6:.1f} MB")

@@ -206,7 +206,7 @@ def build(kind: type[T], values: Mapping[str, Any]) -> T:
 
 
 def override(settings: T, changes: Mapping[str, Any]) -> T:
-    """Returns settings with fields replaced, named as in `build`; mappings are `joined`. InputError as `build`."""
+    """Returns settings with fields replaced, named as in `build`; mappings are merged. InputError as `build`."""
     if not is_settings(settings):
         fail("settings", settings, "an instance of a settings class, such as TrainConfig()")
     return type(settings)(**_joined(type(settings), _fields(settings), changes))

@@ -27,14 +27,14 @@ zero at +-pi."""
 Arrays = dict[str, np.ndarray]
 
 
-def checked_onnx(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
+def verify_policy(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above `LARGEST_ERROR`."""
     model = to_onnx(policy, env)
     return model, check_errors(model, *record_actions(policy, env, STEPS), f"{STEPS} steps of {env.name}")
 
 
 def verify(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays) -> onnx.ModelProto:
-    """Returns the graph of a function after comparing both for inputs with leading axis N; errors as `checked_onnx`."""
+    """Returns the graph of a function, compared with it for inputs with leading axis N; errors as `verify_policy`."""
     model = translate(function, shapes, name)
     expected = jax.device_get(jax.jit(jax.vmap(function))(inputs))
     check_errors(model, inputs, expected, name)

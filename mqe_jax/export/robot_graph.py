@@ -45,7 +45,7 @@ def robot_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
     return translate(act, sizes, f"{env.name.replace('-', '_')}_robot", about)
 
 
-def checked_robot_onnx(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
+def verify_robot(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of `robot_onnx` and its largest error against JAX in `STEPS` steps.
 
     Raises:

@@ -16,7 +16,7 @@ from mqe_jax.core.settings import fail
 from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy
 from mqe_jax.study.runs import table
-from mqe_jax.study.sweep import Measurement, for_task, matching
+from mqe_jax.study.sweep import Measurement, for_task, match_names
 from mqe_jax.train.policy import TrainedPolicy
 
 MEASURES = {
@@ -80,7 +80,7 @@ def measure(
     """
     items = plan(part, folder, impl)
     names = {f"{item.task}/{item.variant}": item for item in items}
-    chosen = [names[name] for name in matching(names, cells, "*/plain")]
+    chosen = [names[name] for name in match_names(names, cells, "*/plain")]
     for item in chosen:
         if dry_run or item.file.is_file():
             continue

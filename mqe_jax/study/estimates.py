@@ -76,7 +76,7 @@ def absolute(run: Run, name: str) -> float:
     return math.nan if value is None else float(value)
 
 
-def evaluated(cells: Cells) -> Cells:
+def select_evaluated(cells: Cells) -> Cells:
     """Returns the cells whose runs all have evaluations, with these, of the unmodified task, as curves."""
     chosen: dict[Cell, list[Run]] = {}
     for cell, runs in cells.items():

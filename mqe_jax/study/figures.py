@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mqe_jax.core.literal import to_label
-from mqe_jax.study.estimates import Array, Cells, band, estimate, evaluated, names, score_matrices
+from mqe_jax.study.estimates import Array, Cells, band, estimate, names, score_matrices, select_evaluated
 from mqe_jax.study.runs import Cell, Reference, Run
 from mqe_jax.study.statistics import performance_profile
 
@@ -79,7 +79,7 @@ def draw_evaluations(cells: Cells, reference: Reference) -> bytes:
 
     Every panel has its own legend.
     """
-    tasks, chosen = names(cells, "task"), evaluated(cells)
+    tasks, chosen = names(cells, "task"), select_evaluated(cells)
     figure = _figure(max(5.0, 3.7 * min(2, len(tasks))), 2.7 * -(-len(tasks) // 2) + 0.6)
     for axes, task in _panels(figure, tasks):
         drawn = [cell for cell in chosen if cell.task == task]

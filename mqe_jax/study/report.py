@@ -7,7 +7,7 @@ from typing import Any
 
 from mqe_jax.core.files import check_folder, write_atomically
 from mqe_jax.core.literal import to_markdown
-from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, evaluated, final_rows, group
+from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, final_rows, group, select_evaluated
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
 from mqe_jax.study.runs import Reference, Run, read_runs, table
 from mqe_jax.train.logs import number
@@ -32,7 +32,7 @@ def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> lis
     label = [f"`reference`: {to_markdown(reference.label)}."] if reference.values else []
     text = ["# Results", "", _EXPLANATION, *label, ""]
     text += [markdown(finals), "", "![Training curves](curves.png)", ""]
-    if with_evaluations := evaluated(cells):
+    if with_evaluations := select_evaluated(cells):
         files["evaluations.png"] = draw_evaluations({cell: cells[cell] for cell in with_evaluations}, reference)
         text += ["![Evaluations during training](evaluations.png)", ""]
     aggregates = aggregate_tables(cells)

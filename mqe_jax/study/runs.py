@@ -63,7 +63,7 @@ class Run:
     """The absolute metric, an evaluation of the best checkpoint; None without evaluations."""
 
 
-def finished(run_dir: Path) -> bool:
+def is_finished(run_dir: Path) -> bool:
     """Returns whether a run has its last policy and, if it is evaluated, its absolute metric."""
     if not (run_dir / CONFIG_FILE).is_file() or not (run_dir / POLICY_FILE).is_file():
         return False
@@ -81,7 +81,7 @@ def read_runs(folder: Path) -> list[Run]:
     """Reads the finished runs of a sweep's folder, ordered by path and seed; InputError without any."""
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
-        if path.parent.name.removeprefix("seed").isdecimal() and finished(path.parent):
+        if path.parent.name.removeprefix("seed").isdecimal() and is_finished(path.parent):
             seed = int(path.parent.name.removeprefix("seed"))
             evaluations = read_evaluations(path.parent)
             curve, config = read_curve(path.parent / CSV_FILE), load_run_config(path.parent)

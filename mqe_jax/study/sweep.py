@@ -23,7 +23,7 @@ from mqe_jax.core.files import check_folder, lock, write_atomically
 from mqe_jax.core.limits import Seed, SeedCount
 from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, settings_class, to_mapping
 from mqe_jax.core.types import Cast
-from mqe_jax.study.runs import PLAIN, Cell, finished, read_curve
+from mqe_jax.study.runs import PLAIN, Cell, is_finished, read_curve
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_folders
@@ -131,10 +131,10 @@ def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
     """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all without patterns."""
     product = itertools.product(sweep.tasks, sweep.algorithms, sweep.variants)
     cells = {cell.path.as_posix(): cell for cell in itertools.starmap(Cell, product)}
-    return [cells[name] for name in matching(cells, patterns, "*/mat")]
+    return [cells[name] for name in match_names(cells, patterns, "*/mat")]
 
 
-def matching(names: Iterable[str], patterns: Sequence[str], example: str) -> list[str]:
+def match_names(names: Iterable[str], patterns: Sequence[str], example: str) -> list[str]:
     """Returns the names of cells that match a pattern, all without patterns; InputError for one that matches none."""
     known, wanted = [*names], set[str]()
     for pattern in patterns or ("*",):
@@ -170,7 +170,7 @@ def plan(
         if "{task}" in str(named):
             config = override(config, for_task(named, cell.task))
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
-        left = [seed for seed in wanted if not finished(_run(folder, cell, seed))]
+        left = [seed for seed in wanted if not is_finished(_run(folder, cell, seed))]
         size = sweep.seeds_together or len(sweep.seeds)
         try:
             check(config, min(size, len(wanted)))
@@ -287,7 +287,7 @@ def run(
 
 def _train(job: Job, environments: MakeEnvironments, stop: Callable[[], bool]) -> None:
     """Trains a job, if no other process has finished it since the jobs were planned."""
-    if all(map(finished, job.folders)):
+    if all(map(is_finished, job.folders)):
         return
     with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
         for run_dir in job.folders:

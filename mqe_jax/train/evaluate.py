@@ -220,7 +220,7 @@ class _Progress(NamedTuple):
     diverged: jax.Array  # counted episodes that ended because the physics diverged (N,)
 
 
-def acting(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
+def make_act(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
     """Returns the function of a policy of all agents, or a function itself, and its initial recurrent state."""
     either: Any = policy
     if not hasattr(either, "act"):
@@ -268,7 +268,7 @@ def evaluate_batch(
     recurrent state, leading axis N. A compiled call makes `block` steps. InputError for a policy of another task, and
     for episodes that do not end within `max_steps`.
     """
-    act, memory = acting(policy, env, env.num_envs, memory)
+    act, memory = make_act(policy, env, env.num_envs, memory)
     evaluator = Evaluator(env, lambda params, *seen: act(*seen), memory, block=block, max_steps=max_steps)
     return evaluator(None, episodes, key[None])[0]
 

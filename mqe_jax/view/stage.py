@@ -11,7 +11,7 @@ from mjviser.conversions import is_fixed_body, merge_geoms
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.sizes import HIGH
 from mqe_jax.physics.appearance import GROUND_GROUP
-from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, posed, rendering_model
+from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, pose_frames, rendering_model
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
@@ -205,7 +205,7 @@ def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, 
 def _wall_boxes(model: mujoco.MjModel, episode: Episode, geoms: list[int]) -> tuple[np.ndarray, ...]:
     """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, clipped at the side walls."""
     clipped = rendering_model(model, episode)
-    data = next(posed(clipped, episode, [0]))
+    data = next(pose_frames(clipped, episode, [0]))
     turns = np.zeros((len(geoms), 4))
     for row, geom in enumerate(geoms):
         mujoco.mju_mat2Quat(turns[row], data.geom_xmat[geom])

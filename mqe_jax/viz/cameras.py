@@ -7,7 +7,7 @@ import numpy as np
 
 from mqe_jax.core.errors import known_name
 from mqe_jax.viz.framing import Camera, fit, goal_points, hidden, smooth, targets
-from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, posed, shown_bases
+from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, pose_frames, shown_bases
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
@@ -51,7 +51,7 @@ def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
     bodies, robots = targets(model, episode), len(shown_bases(model))
     local, frames = body_boxes(model, bodies), []
     margins = _MARGIN * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    for data in posed(model, episode, range(len(episode))):
+    for data in pose_frames(model, episode, range(len(episode))):
         boxes = pose_boxes(data, bodies, local)
         boxes[:robots] = data.xpos[bodies[:robots], None] + margins
         frames.append(boxes.reshape(-1, 3))
@@ -80,7 +80,7 @@ def _direction(
 def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> float:
     """Returns how much robots are behind each other in the view of a camera, 0 to 1; `right` (3,) is its direction."""
     robots, values = shown_bases(model), []
-    for data in posed(model, episode, range(len(episode))):
+    for data in pose_frames(model, episode, range(len(episode))):
         apart = (data.xpos[robots][:, None] - data.xpos[robots])[np.triu_indices(len(robots), 1)][:, :2]
         across = np.abs(apart @ right[:2]) / np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         values.append(1.0 - across.mean() if len(across) else 0.0)
@@ -102,7 +102,7 @@ def _following(
 
 def _beside(model: mujoco.MjModel, episode: Episode) -> list[Camera]:
     robot, views = shown_bases(model)[0], []
-    for data in posed(model, episode, range(len(episode))):
+    for data in pose_frames(model, episode, range(len(episode))):
         x, y, _ = data.xpos[robot]
         views.append(Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0))
     return smooth(views, max(1, round(0.3 / episode.dt)))

@@ -15,7 +15,7 @@ from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.sensors.marks import Marks
-from mqe_jax.viz.geometry import box_corners, extent, posed, robot_color, scenery_geoms, shown_bases
+from mqe_jax.viz.geometry import box_corners, extent, pose_frames, robot_color, scenery_geoms, shown_bases
 from mqe_jax.viz.recording import Episode
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
         colour = robot_color(model, body)
         patch = axes.add_patch(Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4))
         robots.append((body, patch))
-    for index, data in enumerate(posed(model, episode, range(len(episode)))):
+    for index, data in enumerate(pose_frames(model, episode, range(len(episode)))):
         marks = [artist for mark in episode.marks for artist in _sensed(axes, mark, index)]
         for geom, patch in scenery:
             points = box_corners(model, data, geom)[:, :2]

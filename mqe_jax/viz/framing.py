@@ -11,7 +11,15 @@ from PIL import Image, ImageDraw, ImageFont
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GOAL_SITE, HIDDEN_GROUP
 from mqe_jax.sensors.marks import Marks
-from mqe_jax.viz.geometry import body_boxes, moving_bodies, pose_boxes, posed, robot_bases, robot_color, shown_bases
+from mqe_jax.viz.geometry import (
+    body_boxes,
+    moving_bodies,
+    pose_boxes,
+    pose_frames,
+    robot_bases,
+    robot_color,
+    shown_bases,
+)
 from mqe_jax.viz.recording import Episode
 
 _ROOM = 1.07  # factor of the distance at which the points would reach the image's edges
@@ -128,7 +136,7 @@ def targets(model: mujoco.MjModel, episode: Episode) -> list[int]:
 
 def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
     """Returns the goals' points (P, 3), m; of several goals those of the one next to the objects at the end."""
-    data = next(posed(model, episode, [len(episode) - 1]))
+    data = next(pose_frames(model, episode, [len(episode) - 1]))
     sites = [site for site in range(model.nsite) if model.site(site).name.startswith(f"{GOAL_SITE}/")]
     points, objects = data.site_xpos[sites].reshape(-1, 3), moving_bodies(model, episode)
     if not len(points) or not objects:
@@ -149,7 +157,7 @@ def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> 
     local = body_boxes(model, bodies)
     groups = np.array([group != HIDDEN_GROUP for group in range(mujoco.mjNGROUP)], np.uint8)
     rows = []
-    for camera, data in zip(views, posed(model, episode, range(len(views))), strict=True):
+    for camera, data in zip(views, pose_frames(model, episode, range(len(views))), strict=True):
         boxes = pose_boxes(data, bodies, local)
         span = 0.35 * np.ptp(boxes, axis=1) * (0, 0, 1)
         span[:trunks] = _SPAN * data.xmat[bodies[:trunks]].reshape(-1, 3, 3)[:, :, 0]

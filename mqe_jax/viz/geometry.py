@@ -72,7 +72,7 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: in
     mujoco.mj_kinematics(model, data)
 
 
-def posed(model: mujoco.MjModel, episode: Episode, frames: Iterable[int]) -> Iterator[mujoco.MjData]:
+def pose_frames(model: mujoco.MjModel, episode: Episode, frames: Iterable[int]) -> Iterator[mujoco.MjData]:
     """Yields one workspace, set to each of some frames of an episode by `pose`."""
     data = mujoco.MjData(model)
     for index in frames:
@@ -142,7 +142,7 @@ def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
     the robots and sliding objects that take no part in the episode.
     """
     model = copy.deepcopy(model)
-    data = next(posed(model, episode, [0]))
+    data = next(pose_frames(model, episode, [0]))
     _hide(model, [body for body in robot_bases(model) if data.xpos[body, 2] > HIGH])
     box = int(mujoco.mjtGeom.mjGEOM_BOX)
     shown = [geom for geom in scenery_geoms(model) if int(model.geom_type[geom]) == box]

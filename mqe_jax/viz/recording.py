@@ -17,7 +17,7 @@ from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.suite import ONBOARD
-from mqe_jax.train.evaluate import Act, acting
+from mqe_jax.train.evaluate import Act, make_act
 from mqe_jax.train.policy import Policy, groups_of
 
 _DRAWN = 2048  # numbers that the marks of an agent take, about
@@ -97,7 +97,7 @@ def record_episodes(
     if 4 * numbers > CLIP_BYTES:
         fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
     length = 50
-    act, memory = acting(policy, env, episodes)
+    act, memory = make_act(policy, env, episodes)
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)

@@ -34,7 +34,7 @@ class Scenario:
 
     duration: float = 20.0  # duration of an episode, s
     velocity: tuple[float, float, float] | None = None
-    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from `Trainee.evaluated`."""
+    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from `Trainee.evaluation_range`."""
     period: float = 0.0  # interval at which commands are sampled anew, s; 0 keeps them
     gait: str = "trot"  # name of the gait
     frequency: float = 3.0  # commanded gait frequency, Hz
@@ -77,7 +77,7 @@ def sample_velocities(trainee: trainees.Trainee, scenario: Scenario, key: jax.Ar
     """Samples commanded velocities (episodes, 3); those beyond the skill's `turn` again."""
     if scenario.velocity is not None:
         return jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
-    low, high = jnp.asarray(trainee.evaluated, jnp.float32).T
+    low, high = jnp.asarray(trainee.evaluation_range, jnp.float32).T
     turn = trainee.skill.turn or math.inf
     velocity = jax.random.uniform(key, (episodes, 3), minval=low, maxval=high)
     for _ in range(20 if math.isfinite(turn) else 0):

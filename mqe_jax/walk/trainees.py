@@ -31,7 +31,7 @@ class Trainee(abc.ABC):
         self.robot = robot
 
     @property
-    def evaluated(self) -> np.ndarray:
+    def evaluation_range(self) -> np.ndarray:
         """Lowest and highest velocity command in evaluations (3, 2), m/s and rad/s: those of the training."""
         return self.skill.trained_ranges(VELOCITY)
 
@@ -58,7 +58,7 @@ class Walk(Trainee):
         self.skill = WalkPolicy(robot)
 
     @property
-    def evaluated(self) -> np.ndarray:
+    def evaluation_range(self) -> np.ndarray:
         return np.array([(-1.0, 1.0), (-0.6, 0.6), (-1.0, 1.0)])
 
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
