@@ -290,7 +290,7 @@ REFUSED = [
     (BALL, {"num_agents": 6, "fewest_agents": 3}, "fewest_agents: 3 .* at most num_agents, 6, and even"),
     ("go1gate", {"fewest_agents": 3}, "fewest_agents: 3 .* at most num_agents, 2"),
     (SHEEP, {"fewest_sheep": 10}, "fewest_sheep: 10 .* at most 9, the number of sheep"),
-    (SHEEP, {"fewest_sheep": 5, "senses": "onboard"}, "senses: .* empty where teams or flocks vary"),
+    (SHEEP, {"fewest_sheep": 5, "senses": "onboard"}, "senses: .* empty if teams or flocks vary"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""A match against a fixed opponent as an environment of team 0 alone; `opponents.Versus` is its batched form."""
+"""A match against a fixed opponent as an environment of team 0; `opponents.Versus` is its batched form."""
 
 import dataclasses
 import hashlib

@@ -100,7 +100,7 @@ class Launch:
             if not os.environ.get(name, "0").isdecimal():
                 fail(name, os.environ[name], "a number, which srun or mpirun sets")
         if self.devices:
-            fail("devices", ", ".join(map(str, self.devices)), "left out where srun or mpirun starts the processes")
+            fail("devices", ", ".join(map(str, self.devices)), "left out if srun or mpirun starts the processes")
         if not self._sweeps:
             return {MEMBER: AUTO}
         index, visible = int(os.environ.get(names[1], "0")), os.environ.get(_DEVICES)
@@ -228,7 +228,7 @@ class _Process:
             stdout=None if prefix else subprocess.DEVNULL,  # a training writes none, but JAX does
             text=True,
             errors="replace",
-            process_group=0,  # a terminal's Ctrl-C comes through `launch` alone
+            process_group=0,  # a terminal's Ctrl-C comes only through `launch`
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -310,7 +310,7 @@ def _wait(processes: Sequence[_Process], pause: Callable[[], None]) -> int:
 
 
 def _cause(processes: Sequence[_Process]) -> _Process | None:
-    """Returns the process that has failed, if any: where another one's end has ended some, the other one."""
+    """Returns the process that has failed, if any; of several, the one whose end has ended the others."""
     ended = [process for process in processes if process.popen.poll()]
     for process in ended:
         process.read()

@@ -19,7 +19,7 @@ def hasten() -> None:
 
 
 def import_mujoco() -> None:
-    """Imports MuJoCo without a GL library, whatever MUJOCO_GL is: `viz.render` loads one where something is drawn.
+    """Imports MuJoCo without a GL library, whatever MUJOCO_GL is: `viz.render` loads one to draw.
 
     A missing library fails while MuJoCo is imported, and its search for GLFW starts a process.
     """

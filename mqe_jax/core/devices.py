@@ -31,7 +31,7 @@ PEER = re.compile(
     r".*([Gg]loo|NCCL|[Cc]onnection (reset|closed)|coordination|distributed service)",
     re.DOTALL,
 )
-"""Matches what JAX says where another process has ended."""
+"""Matches what JAX says if another process has ended."""
 PEER_ENDED = "another process of the training, or its host, has ended"
 
 _WHOLE = PartitionSpec()
@@ -104,7 +104,7 @@ def alone() -> Iterator[None]:
 
 @contextlib.contextmanager
 def translate_errors() -> Iterator[None]:
-    """Turns JAX's error of a collective, where another process has ended, into a ConnectionError of one line."""
+    """Turns JAX's error of a collective, if another process has ended, into a ConnectionError of one line."""
     try:
         yield
     except (jax.errors.JaxRuntimeError, ValueError) as error:  # either, by where the collective was called

@@ -151,7 +151,7 @@ def parse_json(text: str, name: str) -> Any:
 class _Loader(yaml.SafeLoader):
     """Loader of a text, whose depth and number of values it counts while it reads.
 
-    PyYAML alone keeps the last of two values of one name, and lets aliases make a few bytes as large as memory.
+    PyYAML itself keeps the last of two values of one name, and lets aliases make a few bytes as large as memory.
     """
 
     depth = values = 0

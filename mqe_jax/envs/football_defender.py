@@ -30,9 +30,9 @@ class DefenderRewards:
     approach: float = 0.0
     """Per m of decrease of the distance between the ball and the nearest robot. Not in the paper: shaping."""
     first_goal: float = 0.0
-    """In the step of an episode's first goal. Not in the paper: for training, where `goal` favours early goals."""
+    """In the step of an episode's first goal. Not in the paper: for training, as `goal` favours early goals."""
     fall: float = 0.0
-    """In steps in which an attacker has fallen. Not in the paper: for training, where `first_goal` pays only once."""
+    """In steps in which an attacker has fallen. Not in the paper: for training, as `first_goal` pays only once."""
 
 
 @settings_class

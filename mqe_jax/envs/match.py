@@ -134,7 +134,7 @@ class Match(QuadrupedEnv[S, P]):
         return {x: jnp.where(self.team_of[:, None] == 1, image[x], blocks[x]) for x in blocks}
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
-        """Reflects the actions (A, action_size) of team 1 where its frame is reflected."""
+        """Reflects the actions (A, action_size) of team 1 if its frame is reflected."""
         if self.symmetry == "turn":
             return action
         if self.control == "command":

@@ -57,7 +57,7 @@ class Randomization:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RandomizedParams:
-    """Randomised physics parameters of one environment (R robots); the model's values where not randomised."""
+    """Randomised physics parameters of one environment (R robots); the model's values if not randomised."""
 
     friction: jax.Array
     """Sliding friction (R,)."""

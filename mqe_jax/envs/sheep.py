@@ -79,7 +79,7 @@ class SheepEasyParams(TaskParams):
     flock_center: tuple[Coordinate, Coordinate] = (3.0, 0.0)
     """Centre of the flock at reset, m."""
     flock_spacing: Distance = 1.5
-    """Distance between neighbouring sheep at reset, m; a flock of `num_sheep` is closer where it needs to be."""
+    """Distance between neighbouring sheep at reset, m; a flock of `num_sheep` is closer if there is no room."""
     flock_noise: Distance = 0.3
     """Half-width of the uniform noise on each sheep's position, m."""
     restlessness: NonNegative = 0.08

@@ -56,7 +56,7 @@ def check_sizes(env: Any) -> None:
         even = ", and even, for two equal teams" if len(env.teams) > 1 else ""
         fail("fewest_agents", fewest, f"at most num_agents, {params.num_agents}{even}")
     if env.varies and params.senses:
-        fail("senses", [sensor.name for sensor in params.senses], "empty where teams or flocks vary in size")
+        fail("senses", [sensor.name for sensor in params.senses], "empty if teams or flocks vary in size")
 
 
 class Sizes:

@@ -44,7 +44,7 @@ class Mixture:
     """
 
     members: tuple[TrainedPolicy, ...]
-    """Policies with equal needs; each samples its actions or acts with the means, as it does alone."""
+    """Policies with equal needs; each samples its actions or acts with the means, as its file says."""
     weights: tuple[float, ...]
     """Probability of each member; the sum is 1."""
     metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)

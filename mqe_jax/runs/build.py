@@ -222,7 +222,7 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
     if len(env.teams) > 1 and config.mates:
         fail("mates", list(config.mates), f"empty: {env.name} is a match, whose opponents are `opponents`")
     if config.both_sides and not config.opponents:
-        fail("both_sides", True, "false where there are no opponents")
+        fail("both_sides", True, "false without opponents")
     if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 

@@ -69,4 +69,4 @@ def check_divisible(config: TrainConfig, network: Network, processes: int = 1) -
         wanted = f"a divisor of num_envs ({config.num_envs}) that leaves each a multiple of ppo.minibatches chunks"
         fail("ppo.groups", groups, f"{wanted} ({config.ppo.minibatches}), of {chunks} in all")
     if config.ppo.minibatches > 1 and groups % processes:
-        fail("ppo.groups", groups, f"a multiple of the number of processes, {processes}, where there are minibatches")
+        fail("ppo.groups", groups, f"a multiple of the number of processes, {processes}, if there are minibatches")

@@ -239,7 +239,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.curriculum.demonstrator is not None and not self.curriculum.assistance:
-            fail("curriculum.assistance", self.curriculum.assistance, "above 0 where curriculum.demonstrator is set")
+            fail("curriculum.assistance", self.curriculum.assistance, "above 0 if curriculum.demonstrator is set")
         if self.ppo.ratio == "joint" and self.ppo.value != "joint":
             fail("ppo.value", self.ppo.value, "'joint' when ppo.ratio is 'joint'")
         shares = len(self.opponents) or 1

@@ -27,7 +27,7 @@ class Optimizer(NamedTuple):
 
 
 def restart(state: AdamState, when: jax.Array | bool) -> AdamState:
-    """Returns the initial state where `when` is true, else the state itself.
+    """Returns the initial state if `when` is true, else the state itself.
 
     After updates with gradients of 0, without corrections of the moments, the first real steps would be too long.
     """

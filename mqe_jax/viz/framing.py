@@ -97,7 +97,7 @@ def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
 def legend(env: QuadrupedEnv, size: tuple[int, int], marks: Sequence[Marks] = ()) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3) uint8.
 
-    One robot alone needs none; with `marks` it says what they are.
+    It names teams and `marks`; a single robot without marks has none.
     """
     labels = entries(env) + [(mark.label, [tuple(round(255 * part) for part in mark.color)]) for mark in marks]
     if sum(len(dots) for _, dots in labels) < 2:

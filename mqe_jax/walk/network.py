@@ -66,7 +66,7 @@ class Form:
 
     networks: Networks  # its networks and their files
     rows: np.ndarray  # rows of the history that it sees, from the oldest on; the last one is the newest
-    row_size: int  # numbers of an observation that a row has; the others are of the newest observation alone
+    row_size: int  # numbers of an observation that a row has; the others are only of the newest observation
     infer: Callable[..., tuple[jax.Array, Any]]
     """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an adaptation network."""
     mirror: Reflect  # of an input

@@ -29,7 +29,7 @@ LINKS = ("trunk", *JOINTS)
 # Body parts of collision shapes.
 PARTS = ("trunk", "hip", "thigh", "calf", "foot")
 
-# Sets of collision shapes: the whole body, or trunk and feet alone.
+# Sets of collision shapes: the whole body, or only trunk and feet.
 CONTACTS: dict[str, tuple[str, ...]] = {"full": PARTS, "minimal": ("trunk", "foot")}
 
 Vector = tuple[float, float, float]
