@@ -42,7 +42,7 @@ class EnvironmentState:
     truncated: jax.Array
     """Whether the episode was truncated at the time limit () bool."""
     outcome: Outcome
-    """How the episode ended, if it did in the last step; else as if it had."""
+    """Outcome of the episode; before its last step, as if it ended there."""
     metrics: dict[str, jax.Array]
     """`reward/<name>` and the task's own, () each."""
     step: jax.Array

@@ -48,7 +48,7 @@ class SimplePolicy:
     plan: Callable[[jax.Array, jax.Array], jax.Array] = dataclasses.field(repr=False)
     """Observations (N, A, O) and a key to actions (N, A, D)."""
     name: str = ""
-    """The name by which `load_policy` knows it; empty for another one."""
+    """Name for `load_policy`; empty if it has none."""
 
     @check_arguments(num_envs=PositiveInt | None)
     def initial_memory(self, num_envs: int | None = None) -> Memory:

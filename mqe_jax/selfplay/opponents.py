@@ -151,8 +151,8 @@ class Versus(OneTeam):
     def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
         """Returns the state with another opponent in a block, a trained policy of the same architecture.
 
-        Each environment keeps its opponent until its episode ends, unless `at_once`. While environments still wait for
-        an earlier change, only the opponent for which they wait is replaced, even if it already plays.
+        Each environment keeps its opponent until its episode ends, unless `at_once`. Another change before that
+        replaces only the waiting opponent, also in environments in which it already plays.
         """
         if not block < len(self.opponents):
             fail("block", block, f"below {len(self.opponents)}, the number of blocks")

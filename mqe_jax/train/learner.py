@@ -146,8 +146,8 @@ def make_learner(
         )
         batch, value_normalizer, batch_metrics = _prepare(algorithm, now, state, transitions, features)
         if teacher is not None:
-            shown = moving(transitions.teacher_action) / config.action_scale
-            batch = batch._replace(teacher_action=chunks(shown, network.chunk_length))
+            labels = moving(transitions.teacher_action) / config.action_scale
+            batch = batch._replace(teacher_action=chunks(labels, network.chunk_length))
         carry = state.params, restart(state.optimizer, now.actor_begins), state.learning_rate
         carry, loss_metrics = algorithm.update(carry, batch, now, epoch_key)
         params, optimizer_state, learning_rate = carry

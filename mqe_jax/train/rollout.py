@@ -104,11 +104,11 @@ def rollout(
         action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key, active)
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
         _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None], active[None])
-        shown, teacher_memory = (), ()
+        label, teacher_memory = (), ()
         if teacher is not None:
             teacher_memory = where_rows(state.is_first, teacher.initial_memory(env.num_envs), state.teacher_memory)
             seen_by_teacher = observations(before).to(teacher)
-            shown, teacher_memory = teacher.act(seen_by_teacher, teacher_memory, jax.random.fold_in(key, 1))
+            label, teacher_memory = teacher.act(seen_by_teacher, teacher_memory, jax.random.fold_in(key, 1))
         after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
         transition = Transition(
@@ -125,7 +125,7 @@ def rollout(
             learners=learners_of(before),
             terminated=after.terminated,
             done=done,
-            teacher_action=shown,
+            teacher_action=label,
         )
         episode_steps = state.episode_steps + 1
         episode_return = state.episode_return + mean_of_team(after.reward, active)

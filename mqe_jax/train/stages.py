@@ -65,12 +65,12 @@ class Stages:
         seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
         evaluate = lambda action: network.evaluate(params, *seen, action, batch.active)  # noqa: E731
         if config.imitation.teacher is None:
-            new, taught = evaluate(batch.action), None
+            new, teacher_log_prob = evaluate(batch.action), None
         else:  # what depends on no action is computed once
             size = batch.teacher_action.shape[-1]
-            shown = batch.action.at[..., :size].set(batch.teacher_action)
-            both = jax.vmap(evaluate)(jnp.stack([batch.action, shown]))
-            new, taught = jax.tree.map(lambda x: x[0], both), both.log_prob[1, ..., :size]
+            label = batch.action.at[..., :size].set(batch.teacher_action)
+            both = jax.vmap(evaluate)(jnp.stack([batch.action, label]))
+            new, teacher_log_prob = jax.tree.map(lambda x: x[0], both), both.log_prob[1, ..., :size]
         old, now_taken = (jnp.where(learners[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
         log_ratio = RATIOS[ppo.ratio](now_taken, old)
         surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
@@ -88,8 +88,8 @@ class Stages:
         }
         metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
         actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
-        if taught is not None:
-            metrics["loss/imitation"] = -_mean(jnp.sum(taught, axis=-1), learners)
+        if teacher_log_prob is not None:
+            metrics["loss/imitation"] = -_mean(jnp.sum(teacher_log_prob, axis=-1), learners)
             actor_loss += now.imitation * metrics["loss/imitation"]
         return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
 
