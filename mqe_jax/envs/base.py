@@ -286,7 +286,7 @@ class QuadrupedEnv(Task[S, P]):
         return dataclasses.replace(state, reward=clean(reward), **ended, outcome=outcome, metrics=metrics)
 
     def observe_privileged(self, state: State[S], robot_state: RobotState) -> jax.Array:
-        """Returns the privileged observation (P,), whose blocks are those of `privileged_layout`."""
+        """Returns the privileged observation (P,), in the blocks of `privileged_layout`."""
         return self.privileged.observe(robot_state, state, self.controller.clock(state.control))
 
     def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:

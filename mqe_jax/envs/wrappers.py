@@ -23,7 +23,7 @@ class WrappedState(EnvironmentState):
 
 
 class Outer(EnvBatch):
-    """A batch of environments around another, `inner`, whose attributes it has by default."""
+    """A batch of environments around another one, `inner`, which has all further attributes."""
 
     def __init__(self, inner: Any) -> None:
         self.inner, self.env, self.name, self.num_envs = inner, inner.env, inner.name, inner.num_envs

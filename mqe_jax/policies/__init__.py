@@ -226,9 +226,9 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
 
     These include the sensors of policies that see them.
 
-    Policies of different skills get those with which they can meet. The sources are policies, or what `load_policy`
-    accepts. Only trained policies of the task need something, and the scripted member of a population: it always has
-    the task's default skill.
+    Policies of different skills get parameters with which they can meet. The sources are policies, or what
+    `load_policy` accepts. Only trained policies of the task need something, and the scripted member of a population: it
+    always has the task's default skill.
     """
     params: dict[str, Any] = {}
     every: list[Needs] = []

@@ -107,7 +107,7 @@ def _changed(env: QuadrupedEnv, **attributes: Any) -> QuadrupedEnv:
 
 
 def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns the skills and the command ranges with which policies of different skills can meet, each with its own.
+    """Returns the skills and command ranges that let policies of different skills meet, each acting with its own.
 
     Empty if all have the same skill. Policies are given by their `Needs.by_name()`.
     """

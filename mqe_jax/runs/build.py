@@ -136,7 +136,7 @@ def make_env(
 
 
 def parameters_of(task: str | QuadrupedEnv) -> dict[str, Any]:
-    """Returns the parameters and the control mode in which an environment differs from its task's; none of an id."""
+    """Returns the parameters, with the control mode, that differ from the task's defaults; empty for an id."""
     if not isinstance(task, QuadrupedEnv):
         return {}
     control = {} if task.control == "command" else {"control": task.control}
@@ -332,7 +332,7 @@ def settings_of(task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any]
 
 
 def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Returns the settings with a task and its parameters; says so if they are those of another task.
+    """Returns the settings with a task and its parameters; prints a line if they are for another task.
 
     A task by its id gets the parameters that the teacher and the policy to start from need, unless they are passed.
     """

@@ -203,7 +203,7 @@ def render(
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Clip:
-    """Recorded episodes, of which the best one is shown.
+    """Recorded episodes; the clip shows the best one.
 
     Example:
         ```python

@@ -94,7 +94,7 @@ def _kind(entities: Entities) -> str:
 def pool(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
     """Returns maxima and means of the features of the entities that are there: (..., block) -> (..., 2 W); 0 if none.
 
-    What a mask hides has no effect, and neither has the order of the entities, but for rounding.
+    Masked entities have no effect. The order of entities has none beyond rounding.
     """
     rows = x.reshape(*x.shape[:-1], entities.count, -1)
     there = rows[..., -1:] > 0.5 if entities.masked else jnp.ones_like(rows[..., :1], bool)

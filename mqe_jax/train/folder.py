@@ -79,7 +79,7 @@ def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
 
 
 def check_links(run_dir: Path) -> None:
-    """Raises an InputError for a folder in which something that a training replaces or removes is a link."""
+    """Raises an InputError if something in the folder that a training replaces or removes is a link."""
     for name in (*RUN_FILES, *_FOLDERS):
         if (run_dir / name).is_symlink():
             raise InputError(f"run_dir: {run_dir / name} is a symbolic link; it must be in the run folder itself")

@@ -190,7 +190,7 @@ def check_loggers(names: tuple[str, ...]) -> None:
 class ProgressLog:
     """Progress: a live bar on a terminal or in a notebook, otherwise a plain line on standard error every ten seconds.
 
-    The time left is that of the updates to come: compiling and evaluating do not count.
+    The time left leaves out compilation and evaluation.
     """
 
     def __init__(self, title: str, total_steps: int, *, shown: bool = True) -> None:

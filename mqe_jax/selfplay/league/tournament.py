@@ -94,7 +94,7 @@ def scores(results: NDArray[Any]) -> Array:
 
 @check_arguments(results=Results, reference=NonNegativeInt)
 def rate(results: NDArray[Any], reference: int) -> Estimate:
-    """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,), of which that of `reference` is 0.
+    """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,); `reference` has 0.
 
     A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
     of a Bayesian bootstrap of all these games.
