@@ -1,7 +1,6 @@
 """Charts of docs/drawings, drawn from results/ by tools/drawings.py."""
 
 import csv
-import gzip
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,16 +15,10 @@ BLUE, ORANGE, GREEN, VIOLET, GREY = "#2f7fd6", "#d9731a", "#2e8b57", "#7a55c7", 
 
 
 def curves() -> Figure:
-    """Success in evaluations during trainings with tuned settings, but `network.openrl_layers: false`."""
-    with gzip.open(RESULTS / "paper" / "evaluations.csv.gz", "rt", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if (row["variant"], row["kind"]) == ("tuned", "training")]
-    return _curves(
-        rows,
-        "sampled/success_rate",
-        {"go1gate": "Narrow Gate, plain layers", "go1pushbox": "Push Box, plain layers"},
-        2.8,
-        (0, 102),
-    )
+    """Success in evaluations during trainings with the default settings: results/curves.csv."""
+    with (RESULTS / "curves.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return _curves(rows, "success", {"go1gate": "Narrow Gate", "go1pushbox": "Push Box"}, 2.8, (0, 102))
 
 
 def students() -> Figure:
@@ -71,23 +64,27 @@ def _curves(
 
 
 def levers() -> Figure:
-    """Rates with and without each setting, with their intervals: results/levers.csv."""
+    """Success of each seed with the default settings, and with one change: results/levers.csv."""
     with (RESULTS / "levers.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    figure = Figure((WIDTH / 100, 2.7), layout="constrained")
+    usual = {
+        task: [row for row in rows if (row["task"], row["change"]) == (task, "")] for task in {r["task"] for r in rows}
+    }
+    changes = list(dict.fromkeys((row["task"], row["change"]) for row in rows if row["change"]))
+    figure = Figure((WIDTH / 100, 0.9 + 0.42 * len(changes)), layout="constrained")
     axes = figure.subplots()
-    for place, row in enumerate(rows):
-        for end, color, shift in (("", BLUE, -0.15), ("_without", ORANGE, 0.15)):
-            value, low, high = (float(row[f"{name}{end}"]) for name in ("rate", "low", "high"))
-            axes.plot([low, high], [place + shift] * 2, color=color, lw=2.5, solid_capstyle="round")
-            axes.plot(value, place + shift, "o", color=color, ms=5)
-    axes.set_yticks(range(len(rows)), [f"{row['task']}: {row['lever']}" for row in rows], fontsize=9.5)
-    axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5))
-    axes.set_xlabel("success, or wins, %", fontsize=10.5)
+    for place, case in enumerate(changes):
+        own = [row for row in rows if (row["task"], row["change"]) == case]
+        for seeds, color, shift in ((usual[case[0]], BLUE, -0.15), (own, ORANGE, 0.15)):
+            values = [100 * float(row["success"]) for row in seeds]
+            axes.plot(values, [place + shift] * len(values), "o", color=color, ms=6, alpha=0.7, mec="none")
+    axes.set_yticks(range(len(changes)), [f"{task}: {change}" for task, change in changes], fontsize=9.5)
+    axes.set(xlim=(-2, 102), ylim=(len(changes) - 0.5, -0.5))
+    axes.set_xlabel("success, %", fontsize=10.5)
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    for color, label in ((BLUE, "with, worst seed"), (ORANGE, "without, best seed")):
-        axes.plot([], [], "o-", color=color, label=label)
+    for color, label in ((BLUE, "default settings"), (ORANGE, "with the change")):
+        axes.plot([], [], "o", color=color, label=label)
     figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=10)
     return figure
 

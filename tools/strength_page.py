@@ -312,14 +312,11 @@ def tables() -> dict[str, str]:
 
 def pictures() -> dict[str, bytes]:
     """Returns the pictures by file name."""
-    alone, met, fixed = rates("cooperative"), rates("matches"), rates("population")
-    teams: dict[str, dict[str, Sequence[Rate]]] = {
-        task: {each: (alone[task, each, "success_rate"],) for each in ("shipped", "scripted")} for task in COOPERATIVE
-    }
-    teams |= {t: {f"vs {x}": against(met, t, x) for x in ("scripted", "idle", "random", "copy")} for t in MATCHES}
+    met, fixed = rates("matches"), rates("population")
+    teams = {t: {x: against(met, t, x) for x in ("scripted", "idle", "random", "copy")} for t in MATCHES}
     label = "wins (blue), draws (grey) and losses (red), %"
     return {
-        "strength.png": draw_rates(teams, f"success, or {label}"),
+        "strength.png": draw_rates(teams, label),
         "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
         "mates.png": draw_rates({task: drawn_mates(task) for task in COOPERATIVE}, "success, %"),
         "pools.png": draw_rates({task: drawn_pool(task) for task in POOLS}, "success, %"),
