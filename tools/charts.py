@@ -12,46 +12,44 @@ RESULTS = Path(__file__).parents[1] / "results"
 WIDTH = 640  # px, of every drawing; a phone shows it at half the size
 INK, FAINT, LINE = "#23252b", "#5f6672", "#8a93a3"
 BLUE, ORANGE, GREEN, VIOLET, GREY = "#2f7fd6", "#d9731a", "#2e8b57", "#7a55c7", "#6b7280"
+TITLES = {
+    "go1gate": "Narrow Gate",
+    "go1seesaw": "Seesaw",
+    "go1sheep-easy": "Sheep Dog (Easy)",
+    "go1sheep-hard": "Sheep Dog (Hard)",
+    "go1pushbox": "Push Box",
+    "go1football-defender": "Football (2 vs 1)",
+}
 
 
 def curves() -> Figure:
     """Success in evaluations during trainings with the default settings: results/curves.csv."""
     with (RESULTS / "curves.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    return _curves(rows, "success", {"go1gate": "Narrow Gate", "go1pushbox": "Push Box"}, 2.8, (0, 102))
+    return _curves(rows, ["go1gate", "go1seesaw", "go1pushbox"], 2.8, (0, 102))
 
 
 def students() -> Figure:
     """Success of training episodes while teams with sensors imitate the shipped ones: results/students.csv."""
     with open(RESULTS / "students.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    titles = {
-        "go1gate": "Narrow Gate",
-        "go1seesaw": "Seesaw",
-        "go1sheep-easy": "Sheep Dog, one",
-        "go1sheep-hard": "Sheep Dog, nine",
-        "go1pushbox": "Push Box",
-        "go1football-defender": "Football, 2 vs 1",
-    }
-    return _curves(rows, "success", titles, 4.6, (70, 101))
+    return _curves(rows, [*TITLES], 4.6, (70, 101))
 
 
-def _curves(
-    rows: Sequence[dict[str, str]], rate: str, titles: dict[str, str], height: float, limits: tuple[float, float]
-) -> Figure:
-    """Draws a rate of each task over its environment steps: each seed and their mean."""
-    figure, columns = Figure((WIDTH / 100, height), layout="constrained"), min(3, len(titles))
-    panels = figure.subplots(-(-len(titles) // columns), columns, sharex=True, sharey=True, squeeze=False)
-    for axes, (task, title) in zip(panels.flat, titles.items(), strict=True):
+def _curves(rows: Sequence[dict[str, str]], tasks: Sequence[str], height: float, limits: tuple[float, float]) -> Figure:
+    """Draws the success of each task over its environment steps: each seed and their mean."""
+    figure, columns = Figure((WIDTH / 100, height), layout="constrained"), min(3, len(tasks))
+    panels = figure.subplots(-(-len(tasks) // columns), columns, sharex=True, sharey=True, squeeze=False)
+    for axes, task in zip(panels.flat, tasks, strict=True):
         own = [row for row in rows if row["task"] == task]
         table: dict[float, list[float]] = {}
         for seed in sorted({row["seed"] for row in own}):
-            points = [(float(x["env_steps"]) / 1e6, 100 * float(x[rate])) for x in own if x["seed"] == seed]
+            points = [(float(x["env_steps"]) / 1e6, 100 * float(x["success"])) for x in own if x["seed"] == seed]
             axes.plot(*zip(*points, strict=True), color=BLUE, alpha=0.35, lw=1.2)
             for step, success in points:
                 table.setdefault(step, []).append(success)
         axes.plot([*table], [np.mean(values) for values in table.values()], color=BLUE, lw=2.4)
-        axes.set_title(title, fontsize=12, color=INK, loc="left", weight="bold")
+        axes.set_title(TITLES[task], fontsize=12, color=INK, loc="left", weight="bold")
         axes.set(xlim=(0, None), ylim=limits)
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
@@ -59,7 +57,7 @@ def _curves(
     figure.supylabel("success, % of the episodes", fontsize=10.5)
     panels.flat[-1].plot([], [], color=BLUE, alpha=0.35, lw=1.2, label="one seed")
     panels.flat[-1].plot([], [], color=BLUE, lw=2.4, label="mean of three")
-    panels.flat[-1].legend(loc="lower right", frameon=False, fontsize=10)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=10)
     return figure
 
 
@@ -67,20 +65,19 @@ def levers() -> Figure:
     """Success of each seed with the default settings, and with one change: results/levers.csv."""
     with (RESULTS / "levers.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    usual = {
-        task: [row for row in rows if (row["task"], row["change"]) == (task, "")] for task in {r["task"] for r in rows}
-    }
-    changes = list(dict.fromkeys((row["task"], row["change"]) for row in rows if row["change"]))
-    figure = Figure((WIDTH / 100, 0.9 + 0.42 * len(changes)), layout="constrained")
+    seeds: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        seeds.setdefault((row["task"], row["change"]), []).append(100 * float(row["success"]))
+    changes = [case for case in seeds if case[1]]
+    figure = Figure((WIDTH / 100, 0.9 + 0.4 * len(changes)), layout="constrained")
     axes = figure.subplots()
-    for place, case in enumerate(changes):
-        own = [row for row in rows if (row["task"], row["change"]) == case]
-        for seeds, color, shift in ((usual[case[0]], BLUE, -0.15), (own, ORANGE, 0.15)):
-            values = [100 * float(row["success"]) for row in seeds]
-            axes.plot(values, [place + shift] * len(values), "o", color=color, ms=6, alpha=0.7, mec="none")
-    axes.set_yticks(range(len(changes)), [f"{task}: {change}" for task, change in changes], fontsize=9.5)
-    axes.set(xlim=(-2, 102), ylim=(len(changes) - 0.5, -0.5))
-    axes.set_xlabel("success, %", fontsize=10.5)
+    for place, (task, change) in enumerate(changes):
+        for name, color, shift in (("", BLUE, -0.14), (change, ORANGE, 0.14)):
+            values = seeds[task, name]
+            axes.plot(values, [place + shift] * len(values), "o", color=color, ms=7, alpha=0.65, mec="none")
+    axes.set_yticks(range(len(changes)), [f"{TITLES[task]}: {change}" for task, change in changes], fontsize=9.5)
+    axes.set(xlim=(-3, 103), ylim=(len(changes) - 0.5, -0.5))
+    axes.set_xlabel("success, %; a dot is a seed", fontsize=10.5)
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     for color, label in ((BLUE, "default settings"), (ORANGE, "with the change")):
