@@ -99,8 +99,15 @@ def architecture() -> Figure:
             VIOLET,
             "Act for the other team:\nscripted, trained, or\nearlier versions.",
         ),
-        (left, middle, "Policy", "policies/", BLUE, "A robot's observation\nto its action, which lies\nin [-1, 1]."),
-        (right, middle, "Skill", "skills/", BLUE, "A frozen network turns\nvelocity commands into\njoint targets."),
+        (left, middle, "Policy", "policies/", BLUE, "A robot's observation\nto its action, in [-1, 1]."),
+        (
+            right,
+            middle,
+            "Skill",
+            "skills/",
+            BLUE,
+            "Turns an action into a\nvelocity command, and this\ninto joint targets.",
+        ),
         (left, bottom, "Task", "envs/", GREEN, "Scene, observation,\nrewards, and when an\nepisode ends."),
         (right, bottom, "Engine", "physics/", GREEN, "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."),
     )
@@ -111,7 +118,7 @@ def architecture() -> Figure:
         ((inner, middle + 56), (right, middle + 56), BLUE, "actions", (mid, middle + 70), "center"),
         ((down, middle), (down, bottom + 112), BLUE, "joint targets", (down + 10, 222), "left"),
         ((right, bottom + 56), (inner, bottom + 56), GREEN, "poses, velocities,\ncontacts", (mid, 156), "center"),
-        ((left + 150, bottom + 112), (left + 150, middle), GREEN, "observations", (left + 140, 222), "right"),
+        ((left + 150, bottom + 112), (left + 150, middle), GREEN, "observations,\nrewards", (left + 140, 222), "right"),
         (
             (left + 40, middle + 112),
             (left + 40, top),
@@ -121,7 +128,7 @@ def architecture() -> Figure:
             "left",
         ),
         ((left + 190, top), (left + 190, middle + 112), VIOLET, "weights", (left + 200, 402), "left"),
-        ((inner, top + 56), (right, top + 56), VIOLET, "copies", (mid, top + 70), "center"),
+        ((inner, top + 56), (right, top + 56), VIOLET, "copies of the policy", (mid, top + 70), "center"),
         ((down, top), (down, middle + 112), VIOLET, "actions of the\nother team", (down + 10, 402), "left"),
     )
     for start, end, color, text, at, side in arrows:
@@ -129,8 +136,8 @@ def architecture() -> Figure:
         arrow(axes, start, end, color, lw=2.6 if loop else 1.8)
         write(axes, at, text, 11, color, ha=side, weight="bold" if loop else "normal")
     write(axes, (mid, 228), "one environment\nstep: 20 ms", 11.5, INK, weight="bold")
-    note = "The loop is a pure function of one environment. jax.vmap makes thousands of it,\n"
-    note += "and jax.jit compiles an update into one program, the loop included."
+    note = "A step is a pure function of one environment's state. jax.vmap runs thousands\n"
+    note += "at once, and jax.jit compiles rollout and update into one program."
     write(axes, (mid, 34), note, 10.5, FAINT)
     return figure
 
