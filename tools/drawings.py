@@ -106,7 +106,7 @@ def architecture() -> Figure:
             "Skill",
             "skills/",
             BLUE,
-            "Turns an action into a\nvelocity command, and this\ninto joint targets.",
+            "Turns an action into a\nvelocity command, then\ninto joint targets.",
         ),
         (left, bottom, "Task", "envs/", GREEN, "Scene, observation,\nrewards, and when an\nepisode ends."),
         (right, bottom, "Engine", "physics/", GREEN, "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."),
