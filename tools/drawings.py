@@ -99,7 +99,7 @@ def architecture() -> Figure:
             VIOLET,
             "Act for the other team:\nscripted, trained, or\nearlier versions.",
         ),
-        (left, middle, "Policy", "policies/", BLUE, "A robot's observation\nto its action, in [-1, 1]."),
+        (left, middle, "Policy", "train/", BLUE, "Maps each robot's\nobservation to its action,\nin [-1, 1]."),
         (
             right,
             middle,
@@ -108,7 +108,7 @@ def architecture() -> Figure:
             BLUE,
             "Turns an action into a\nvelocity command, then\ninto joint targets.",
         ),
-        (left, bottom, "Task", "envs/", GREEN, "Scene, observation,\nrewards, and when an\nepisode ends."),
+        (left, bottom, "Task", "envs/", GREEN, "Sets the scene, computes\nobservations and rewards,\nends episodes."),
         (right, bottom, "Engine", "physics/", GREEN, "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."),
     )
     for x, y, title, room, color, body in boxes:
@@ -118,15 +118,8 @@ def architecture() -> Figure:
         ((inner, middle + 56), (right, middle + 56), BLUE, "actions", (mid, middle + 70), "center"),
         ((down, middle), (down, bottom + 112), BLUE, "joint targets", (down + 10, 222), "left"),
         ((right, bottom + 56), (inner, bottom + 56), GREEN, "poses, velocities,\ncontacts", (mid, 156), "center"),
-        ((left + 150, bottom + 112), (left + 150, middle), GREEN, "observations,\nrewards", (left + 140, 222), "right"),
-        (
-            (left + 40, middle + 112),
-            (left + 40, top),
-            VIOLET,
-            "observations,\nactions, rewards",
-            (left + 50, 402),
-            "left",
-        ),
+        ((left + 150, bottom + 112), (left + 150, middle), GREEN, "observations", (left + 140, 222), "right"),
+        ((left + 40, middle + 112), (left + 40, top), VIOLET, "transitions", (left + 50, 402), "left"),
         ((left + 190, top), (left + 190, middle + 112), VIOLET, "weights", (left + 200, 402), "left"),
         ((inner, top + 56), (right, top + 56), VIOLET, "copies of the policy", (mid, top + 70), "center"),
         ((down, top), (down, middle + 112), VIOLET, "actions of the\nother team", (down + 10, 402), "left"),
