@@ -78,7 +78,7 @@ def levers() -> Figure:
             values = seeds[task, name]
             axes.plot(values, [place + shift] * len(values), "o", color=color, ms=7, alpha=0.65, mec="none")
     axes.set(xlim=(-3, 103), ylim=(len(changes) - 0.55, -0.6), yticks=[])
-    axes.set_xlabel("success, %; a dot is a seed", fontsize=10.5)
+    axes.set_xlabel("success, %; a dot is a seed, dots may coincide", fontsize=10.5)
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "left", "right"]].set_visible(False)
     for color, label in ((BLUE, "default settings"), (ORANGE, "with the change")):

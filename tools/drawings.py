@@ -87,7 +87,7 @@ def robot(axes: Axes, pose: tuple[float, float, float], color: str, scale: float
 def architecture() -> Figure:
     """The loop of an environment step through four of the six boxes, and what training adds."""
     figure, axes = canvas(560)
-    left, right, size = 16, 404, (220, 112)
+    left, right, size = 40, 414, (216, 112)
     top, middle, bottom = 436, 256, 76
     boxes = (
         (left, top, "Learner", "train/", VIOLET, "PPO: improves the policy.\nKnows no task, no robot,\nno physics."),
@@ -108,27 +108,30 @@ def architecture() -> Figure:
             BLUE,
             "Turns an action into a\nvelocity command, then\ninto joint targets.",
         ),
-        (left, bottom, "Task", "envs/", GREEN, "Sets the scene, computes\nobservations and rewards,\nends episodes."),
+        (left, bottom, "Task", "envs/", GREEN, "Sets the scene, observes,\nrewards, ends episodes."),
         (right, bottom, "Engine", "physics/", GREEN, "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."),
     )
     for x, y, title, room, color, body in boxes:
         box(axes, (x, y), size, title, body, color, room)
     inner, mid, down = left + size[0], WIDTH / 2, right + 70
     arrows = (  # from, to, what, where that is written, whether to the left, the middle or the right
-        ((inner, middle + 56), (right, middle + 56), BLUE, "actions", (mid, middle + 70), "center"),
+        ((inner, middle + 56), (right, middle + 56), BLUE, "actions", (mid + 12, middle + 70), "center"),
         ((down, middle), (down, bottom + 112), BLUE, "joint targets", (down + 10, 222), "left"),
-        ((right, bottom + 56), (inner, bottom + 56), GREEN, "poses, velocities,\ncontacts", (mid, 156), "center"),
+        ((right, bottom + 56), (inner, bottom + 56), GREEN, "poses,\nvelocities,\ncontacts", (mid + 12, 164), "center"),
         ((left + 150, bottom + 112), (left + 150, middle), GREEN, "observations", (left + 140, 222), "right"),
-        ((left + 40, middle + 112), (left + 40, top), VIOLET, "transitions", (left + 50, 402), "left"),
+        ((left + 40, middle + 112), (left + 40, top), VIOLET, "observations,\nactions", (left + 50, 402), "left"),
         ((left + 190, top), (left + 190, middle + 112), VIOLET, "weights", (left + 200, 402), "left"),
-        ((inner, top + 56), (right, top + 56), VIOLET, "copies of the policy", (mid, top + 70), "center"),
+        ((inner, top + 56), (right, top + 56), VIOLET, "copies of\nthe policy", (mid + 12, top + 78), "center"),
         ((down, top), (down, middle + 112), VIOLET, "actions of the\nother team", (down + 10, 402), "left"),
     )
     for start, end, color, text, at, side in arrows:
         loop = color != VIOLET
         arrow(axes, start, end, color, lw=2.6 if loop else 1.8)
         write(axes, at, text, 11, color, ha=side, weight="bold" if loop else "normal")
-    write(axes, (mid, 228), "one environment\nstep: 20 ms", 11.5, INK, weight="bold")
+    axes.plot([left, 16, 16], [bottom + 56, bottom + 56, top + 56], color=VIOLET, lw=1.8, solid_joinstyle="round")
+    arrow(axes, (16, top + 56), (left, top + 56), VIOLET)
+    write(axes, (29, middle + 56), "rewards", 11, VIOLET, rotation=90)
+    write(axes, (mid + 12, 228), "one environment\nstep: 20 ms", 11.5, INK, weight="bold")
     note = "A step is a pure function of one environment's state. jax.vmap runs thousands\n"
     note += "at once, and jax.jit compiles rollout and update into one program."
     write(axes, (mid, 34), note, 10.5, FAINT)
