@@ -27,6 +27,7 @@ from mqe_jax.cli.arguments import COMMANDS, parse
 from mqe_jax.core.settings import override
 from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_SCRIPTED
+from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.runs import build
 from mqe_jax.train.config import TrainConfig
@@ -41,7 +42,7 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.m
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
-SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar"}
+SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar", "jupyter"}
 
 
 def read(page: str) -> str:
@@ -94,6 +95,9 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_python_blocks_run(page: str) -> None:
     namespace: dict[str, Any] = {"__name__": "__main__"}
     tasks = {*TASKS}
+    if "Robot(\"robot.onnx\")" in read(page):  # which its commands write
+        graph = pytest.importorskip("mqe_jax.export.robot_graph").robot_onnx(load_policy("go1gate"), make("go1gate"))
+        Path("robot.onnx").write_bytes(graph.SerializeToString())
     try:
         for block in blocks(read(page), "python"):
             exec(compile(block, page, "exec", dont_inherit=True), namespace)
