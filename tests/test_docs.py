@@ -95,7 +95,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_python_blocks_run(page: str) -> None:
     namespace: dict[str, Any] = {"__name__": "__main__"}
     tasks = {*TASKS}
-    if "Robot(\"robot.onnx\")" in read(page):  # which its commands write
+    if 'Robot("robot.onnx")' in read(page):  # which its commands write
         graph = pytest.importorskip("mqe_jax.export.robot_graph").robot_onnx(load_policy("go1gate"), make("go1gate"))
         Path("robot.onnx").write_bytes(graph.SerializeToString())
     try:
