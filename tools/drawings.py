@@ -131,7 +131,7 @@ def architecture() -> Figure:
     axes.plot([left, 16, 16], [bottom + 56, bottom + 56, top + 56], color=VIOLET, lw=1.8, solid_joinstyle="round")
     arrow(axes, (16, top + 56), (left, top + 56), VIOLET)
     write(axes, (29, middle + 56), "rewards", 11, VIOLET, rotation=90)
-    write(axes, (mid + 12, 228), "one environment\nstep: 20 ms", 11.5, INK, weight="bold")
+    write(axes, (mid + 12, 228), "one round:\n20 ms", 11.5, INK, weight="bold")
     note = "A step is a pure function of one environment's state. jax.vmap runs thousands\n"
     note += "at once, and jax.jit compiles an update, rollout included, into one program."
     write(axes, (mid, 34), note, 10.5, FAINT)
