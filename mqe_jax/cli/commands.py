@@ -82,7 +82,7 @@ class Tasks:
         if self.long:
             print("\nobservation: numbers that an agent sees; privileged: that a critic may see")
         else:
-            print("\nsizes: numbers of robots that --set num_agents=N allows, even in matches")
+            print("\nsizes: numbers N of robots for --set num_agents=N; in matches N must be even")
             print("Watch one: mqe render go1gate -o gate.gif")
         return {"tasks": rows}
 
