@@ -226,7 +226,7 @@ def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeyp
     with pytest.raises(InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge"):
         load_policy("ahead", make("go1tug", impl="c", num_envs=1))
     refuses("already registered for go1wrestling", register_scripted, "go1wrestling", "ahead", lambda obs: obs["base"])
-    refuses("unknown task 'go1sumo'", register_scripted, "go1sumo", "ahead", ahead)
+    refuses("^task: unknown 'go1sumo'.*; allowed: go1plane, go1gate", register_scripted, "go1sumo", "ahead", ahead)
 
 
 # -- skills ------------------------------------------------------------------------------------------------------------

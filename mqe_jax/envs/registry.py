@@ -40,7 +40,7 @@ class Shipped(NamedTuple):
     time_limit: float
     """Time limit, s."""
     sizes: tuple[int, int] | None = None
-    """Least and greatest `num_agents`, even in matches; None if it is fixed."""
+    """Least and greatest `num_agents`, which must be even in matches; None if it is fixed."""
 
 
 SHIPPED = {
@@ -115,8 +115,7 @@ def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
     """
     if not name:
         fail("name", name, "a text that is not empty")
-    if task not in TASKS:
-        raise InputError(f"policy {name!r}: unknown task {task!r}; allowed: {', '.join(TASKS)}")
+    known_name("task: unknown", task, TASKS)
     if NAMED_SCRIPTED.setdefault(task, {}).setdefault(name, policy) is not policy:
         raise InputError(f"policy: the name {name!r} is already registered for {task}")
 
