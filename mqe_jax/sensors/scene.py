@@ -96,8 +96,7 @@ class SensedScene:
 
     @functools.cached_property
     def mates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Each agent's teammates, padded by itself to the largest team's size (A, count), and which entries are
-        real."""
+        """Each agent's teammates (A, count), padded by itself to the largest team's size, and which are real."""
         count = max(map(len, self.teams)) - 1
         rows = [
             [*(mate for mate in team if mate != agent), *[agent] * count][:count]
