@@ -8,7 +8,7 @@ import functools
 import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -72,6 +72,7 @@ class FakeEnv:
     dt = 0.02
     robot_x = np.array([0, 19])
     params = SimpleNamespace(senses=())
+    labels: ClassVar = {}
     overflow_x = 1.21  # m; a step that ends with the first robot beyond it overflows
 
     def __init__(self) -> None:

@@ -260,6 +260,10 @@ def test_a_table_of_a_match_has_what_happened() -> None:
         ("both touched", "0.5"),
         ("diverged episodes", "1"),
     ]
+    labelled = dataclasses.replace(result, labels={"both_touched": "goal touched by all", "one": "not in this task"})
+    rows = [row.split("  ")[0] for row in str(labelled).splitlines()]
+    assert rows[6:10] == ["win", "draw", "loss", "goal touched by all"] and not {"both touched", "one"} & {*rows}
+    assert labelled.to_dict() == result.to_dict()
     against = dataclasses.replace(result, by_opponent={"population/1/response-champion": result})
     assert max(map(len, str(against).splitlines())) <= 80
 

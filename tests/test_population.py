@@ -126,6 +126,7 @@ def test_an_evaluation_has_the_mean_and_the_worst_case(fake: Path, monkeypatch: 
     result = mqe_jax.evaluate(TASK, "random", "population/1", sides="both", **options)
     assert (result.episodes, result.diverged, result.about["opponent"]) == (8, 2, "population/1")
     assert result.about["sides"] == "both" and result.terms == {"win": 1.25}
+    assert [*result.match] == ["win_rate", "draw_rate", "loss_rate"]
     shown, rows = result.to_dict(), result.rows()
     assert {name: shown[name] for name in shown if name.split("/")[0].endswith(("win_rate", "loss_rate"))} == {
         "win_rate": 0.625,

@@ -254,6 +254,7 @@ class Go1Football1vs1(
     name = "go1football-1vs1"
     title = "Football (1 vs 1)"
     aim = "Score in the opponents' goal."
+    labels: ClassVar = {"both_touched": "goal touched by all"}
     Params = FootballMatchParams
     variable_num_agents = True
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +72,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     name = "go1football-defender"
     title = "Football (2 vs 1)"
     aim = "Score in the goal behind the defender."
+    labels: ClassVar = {"both_touched": "goal touched by both"}
     Params = DefenderParams
     ball_spot = (5.0, -2.1)
     npc_varied = ("vx", "vy", "yaw_rate")

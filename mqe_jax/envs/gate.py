@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -81,6 +82,7 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
     name = "go1gate"
     title = "Narrow Gate"
     aim = "Get all robots through the gap, which is wide enough for one. Touch nothing."
+    labels: ClassVar = {"one": "at least one through"}
     Params = GateParams
     variable_num_agents = True
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -167,6 +167,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     name = "go1sheep-easy"
     title = "Sheep Dog (Easy)"
     aim = "Drive the sheep through the gate."
+    labels: ClassVar = {"through": "sheep through"}
     Params = SheepEasyParams
     variable_num_agents = True
 

@@ -43,6 +43,8 @@ class Task(Sensing, Generic[S, P]):
     """Display title: the paper's name if the task is in the paper."""
     aim: ClassVar[str] = ""
     """What a team has to do, in one line, for somebody who drives a robot."""
+    labels: ClassVar[Mapping[str, str]] = {}
+    """Words for the further results of `outcome` that are rates, by name: `mqe eval` prints these with intervals."""
     Params: ClassVar[type[Any]] = TaskParams
     """Class of the task's parameters, P."""
     npc_varied: ClassVar[tuple[str, ...]] = ()

@@ -92,7 +92,7 @@ def evaluate(
         batch, about["sides"] = BothSides(batch), sides
     with guard(batch, dump_diverged) as guarded:
         result = evaluate_batch(guarded, playing.policy, episodes, jax.random.PRNGKey(seed))
-    return dataclasses.replace(result, about={**about, "seed": seed})
+    return dataclasses.replace(result, about={**about, "seed": seed}, labels=playing.env.labels)
 
 
 @check_arguments(policies=Annotated[Sequence[str], MinLen(1)], episodes=Candidates, deterministic=bool, seed=Seed)

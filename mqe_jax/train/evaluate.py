@@ -3,7 +3,7 @@
 import functools
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -110,6 +110,8 @@ class Result:
     """Who acted, by name: policy, actions, opponent, sides, seed."""
     by_opponent: "dict[str, Result]" = field(default_factory=dict)
     """Results against each member of a population; the other fields are their means."""
+    labels: Mapping[str, str] = field(default_factory=dict)
+    """Words for those of `outcomes` that are rates, by name."""
 
     @property
     def success(self) -> Rate:
@@ -140,7 +142,7 @@ class Result:
 
         `intervals` has the ends of the 95% interval of each rate.
         """
-        mappings = ("task", "about", "endings", "outcomes", "match", "by_opponent")
+        mappings = ("task", "about", "endings", "outcomes", "match", "by_opponent", "labels")
         values = {k: v for k, v in vars(self).items() if k not in mappings}
         named = {"ending": self.endings, "success": self.outcomes}
         flat = {f"{kind}/{name}": value for kind, values in named.items() for name, value in values.items()}
@@ -175,8 +177,11 @@ class Result:
         rates = {name: rate for name, rate in self.rates.items() if name not in hidden}
         if self.match:
             rates.pop("success_rate", None)  # that of `win`
-        rates = {_plain_words(name): rate for name, rate in rates.items()}
-        outcomes = {_plain_words(name): mean for name, mean in self.outcomes.items()}
+        first = {name: rates[name] for name in ("success_rate", *self.match) if name in rates}
+        shares = {text: self.outcomes[name] for name, text in self.labels.items() if name in self.outcomes}
+        named = {text: Rate.of(min(share, 1.0), self.episodes) for text, share in shares.items()}  # rounding
+        rates = {_plain_words(name): rate for name, rate in {**first, **named, **rates}.items()}
+        outcomes = {_plain_words(name): mean for name, mean in self.outcomes.items() if name not in self.labels}
         means = {"steps per episode": self.episode_length, "return": self.episode_return, **outcomes}
         faults = {"diverged episodes": self.diverged, "overflowing steps": self.overflow}
         means |= {name: count for name, count in faults.items() if count}
@@ -201,12 +206,19 @@ def _plain_words(name: str) -> str:
 def pool(results: Mapping[str, Result], opponent: str) -> Result:
     """Returns the mean of results against the members of a population, by name."""
     every = list(results.values())
-    summed, fixed = ("episodes", "overflow", "diverged"), ("task", "about", "by_opponent")
-    means = [{name: x for name, x in vars(each).items() if name not in (*summed, *fixed)} for each in every]
-    mean = jax.tree.map(lambda *values: math.fsum(values) / len(values), *means)
+    summed, fixed = ("episodes", "overflow", "diverged"), ("task", "about", "by_opponent", "labels")
+    names = [name for name in vars(every[0]) if name not in (*summed, *fixed)]
+    means = {name: _mean([getattr(each, name) for each in every]) for name in names}
     sums = {name: sum(getattr(each, name) for each in every) for name in summed}
     about = {**every[0].about, "opponent": opponent}
-    return replace(every[0], **mean, **sums, about=about, by_opponent=dict(results))
+    return replace(every[0], **means, **sums, about=about, by_opponent=dict(results))
+
+
+def _mean(values: Sequence[Any]) -> Any:
+    """Returns the mean of numbers, or that of mappings by name, in the first one's order."""
+    if isinstance(values[0], Mapping):
+        return {name: _mean([each[name] for each in values]) for name in values[0]}
+    return math.fsum(values) / len(values)
 
 
 class _Progress(NamedTuple):
