@@ -4,6 +4,7 @@ import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,18 +23,24 @@ TITLES = {
 }
 
 
+def read_rows(name: str) -> list[dict[str, str]]:
+    """Returns the rows of a table of results/."""
+    return list(csv.DictReader((RESULTS / name).read_text("utf-8").splitlines()))
+
+
+def read_measurements() -> dict[str, Any]:
+    """Returns the entries of results/measurements.json by name."""
+    return json.loads((RESULTS / "measurements.json").read_text("utf-8"))
+
+
 def curves() -> Figure:
     """Success in evaluations during trainings with the default settings: results/curves.csv."""
-    with (RESULTS / "curves.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return _curves(rows, ["go1gate", "go1seesaw", "go1pushbox"], 2.8, (0, 102))
+    return _curves(read_rows("curves.csv"), ["go1gate", "go1seesaw", "go1pushbox"], 2.8, (0, 102))
 
 
 def students() -> Figure:
     """Success of training episodes while teams with sensors imitate the shipped ones: results/students.csv."""
-    with open(RESULTS / "students.csv", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return _curves(rows, [*TITLES], 4.6, (70, 101))
+    return _curves(read_rows("students.csv"), [*TITLES], 4.6, (70, 101))
 
 
 def _curves(rows: Sequence[dict[str, str]], tasks: Sequence[str], height: float, limits: tuple[float, float]) -> Figure:
@@ -63,10 +70,8 @@ def _curves(rows: Sequence[dict[str, str]], tasks: Sequence[str], height: float,
 
 def levers() -> Figure:
     """Success of each seed with the default settings, and with one change: results/levers.csv."""
-    with (RESULTS / "levers.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
     seeds: dict[tuple[str, str], list[float]] = {}
-    for row in rows:
+    for row in read_rows("levers.csv"):
         seeds.setdefault((row["task"], row["change"]), []).append(100 * float(row["success"]))
     changes = [case for case in seeds if case[1]]
     figure = Figure((WIDTH / 100, 0.9 + 0.6 * len(changes)), layout="constrained")
@@ -89,7 +94,7 @@ def levers() -> Figure:
 
 def sizes() -> Figure:
     """Robot steps/s: by engine against the number of robots, and on Warp against the number of environments."""
-    entries = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))
+    entries = read_measurements()
     rates: dict[tuple[str, int, int], list[float]] = {}  # by engine and task, number of robots, number of environments
     for row in (row for name in ("c", "mjx", "warp") for row in entries[f"sizes/{name}"]["rows"]):
         kind, robots, sparse = f"{row['impl']} {row['task']}", row["num_agents"], row.get("sparse_solver", False)
@@ -129,9 +134,9 @@ def sizes() -> Figure:
 
 def performance() -> Figure:
     """Environment steps/s of Narrow Gate by hardware and engine, with the slowest and the fastest call."""
-    entries = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))
-    bench = entries["bench_idle"]["rows"][:3]  # the fourth row is another skill
-    warp = [(row["num_envs"], *(row[x] for x in ("env_steps_per_s", "slowest", "fastest"))) for row in bench]
+    entries = read_measurements()
+    walk = [row for row in entries["bench_idle"]["rows"] if row["skill"] == "walk"]
+    warp = sorted(tuple(row[x] for x in ("num_envs", "env_steps_per_s", "slowest", "fastest")) for row in walk)
     rows = [row for row in entries["bench_h100"] if row["impl"] == "jax"]
     mjx = sorted((int(row["num_envs"]), *[float(row["env_steps_per_s"])] * 3) for row in rows)
     cores = [(environments, *[rate] * 3) for environments, rate, _ in entries["bench_c16"]["sizes"]]
