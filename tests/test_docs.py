@@ -71,6 +71,16 @@ def test_drawings_are_made_from_the_code(tmp_path: Path, monkeypatch: pytest.Mon
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
 
 
+@pytest.mark.parametrize("name", ["curves", "levers", "performance", "sizes", "students"])
+def test_charts_show_the_published_data(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawings, published = importlib.import_module("drawings"), read(f"docs/drawings/{name}.svg")
+    if f"Matplotlib v{matplotlib.__version__}," not in published:
+        pytest.skip("another version of matplotlib drew them")
+    monkeypatch.setattr(drawings, "DRAWINGS", {name: drawings.DRAWINGS[name]})
+    drawings.main(tmp_path)
+    assert (tmp_path / f"{name}.svg").read_text(encoding="utf-8") == published, "run python tools/drawings.py"
+
+
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Trainings of two updates and episodes of 20 steps, of examples as a user writes them, in an empty folder.

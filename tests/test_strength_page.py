@@ -54,6 +54,22 @@ def test_the_pages_show_the_published_data() -> None:
     assert not tables
 
 
+def test_the_page_on_settings_shows_the_worst_of_three_seeds() -> None:
+    """It has a row for each change, in the order of the data, whose variant `usual` are the default settings."""
+    seeds: dict[tuple[str, str], list[Rate]] = {}
+    with (strength_page.ROOT / "results" / "levers.csv").open(encoding="utf-8", newline="") as stream:
+        for row in csv.DictReader(stream):
+            rate = Rate(*(float(row[name]) for name in ("success", "low", "high")))
+            seeds.setdefault((row["task"], row["variant"]), []).append(rate)
+    assert {*map(len, seeds.values())} == {3}
+    worst = {case: min(rates).percent for case, rates in seeds.items()}
+    page = (strength_page.PAGES / "levers.md").read_text("utf-8")
+    header, *shown = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    cells = [dict(zip(header, row, strict=True)) for row in shown]
+    expected = [(f"`{task}`", worst[task, "usual"], worst[task, name]) for task, name in worst if name != "usual"]
+    assert [(row["task"], row["default"], row["changed"]) for row in cells] == expected
+
+
 @pytest.mark.parametrize("task", strength_page.COOPERATIVE)
 def test_mixed_teams_of_a_page_are_those_of_their_rates(task: str) -> None:
     """All act alike, and the published means are those of the published rates."""
