@@ -133,7 +133,7 @@ def architecture() -> Figure:
     write(axes, (29, middle + 56), "rewards", 11, VIOLET, rotation=90)
     write(axes, (mid + 12, 228), "one round:\n20 ms", 11.5, INK, weight="bold")
     note = "A step is a pure function of one environment's state. jax.vmap runs thousands\n"
-    note += "at once; jax.jit compiles an update into one program, which calls the C engine."
+    note += "at once, and jax.jit compiles a whole update into one program."
     write(axes, (mid, 34), note, 10.5, FAINT)
     return figure
 
