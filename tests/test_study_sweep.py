@@ -190,12 +190,16 @@ def test_folders_are_checked_before_the_first_cell_trains(make: Any, message: An
 
 
 @pytest.mark.parametrize(
-    ("part", "cell", "seed"),
-    [("published", "go1seesaw/*", 10), pytest.param("matches", "go1bridge/*", 10, marks=pytest.mark.soak)],
+    ("file", "part", "cell", "seed"),
+    [
+        ("zoo", "published", "go1seesaw/*", 10),
+        pytest.param("zoo", "matches", "go1bridge/*", 10, marks=pytest.mark.soak),
+        *(("levers", task, "*", 0) for task in ("go1gate", "go1seesaw", "go1sheep-easy", "go1pushbox")),
+    ],
 )
-def test_the_shipped_policies_can_be_planned_on_a_gpu(part: str, cell: str, seed: int, monkeypatch: Any) -> None:
+def test_published_sweeps_can_be_planned_on_a_gpu(file: str, part: str, cell: str, seed: int, monkeypatch: Any) -> None:
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    sweep = sweeps.load_sweep(CONFIGS / "zoo.yaml", part)
+    sweep = sweeps.load_sweep(CONFIGS / f"{file}.yaml", part)
     assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=setup.check_start)
 
 
