@@ -237,6 +237,8 @@ def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -
     axes = figure.subplots(-(-len(groups) // 2), 2, sharex=True, squeeze=False)
     for empty in axes.ravel()[len(groups) :]:
         empty.remove()
+    for lowest in axes.ravel()[max(len(groups) - 2, 0) : len(groups)]:
+        lowest.tick_params(axis="x", labelbottom=True)
     for each, (title, values) in zip(axes.ravel(), groups.items(), strict=False):
         for i, pair in enumerate(values.values()):
             each.barh(i, 100 * (len(pair) > 1), height=0.62, color=GREY)
