@@ -11,7 +11,7 @@ PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 pytho
   $(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
 # Number of parallel test processes.
 TEST_JOBS ?= 2
-SOURCES := $(wildcard mqe_jax tests examples tools)
+SOURCES := $(wildcard mqe_jax tests examples tools lab)
 
 .PHONY: help install demo test soak docs audit release check fmt clean system browser npm
 

@@ -1,4 +1,5 @@
-"""Trains Climb on Seesaw with Brax's own PPO through the Brax adapter; prints and writes its evaluations.
+"""Trains Climb on Seesaw with Brax's own PPO through the Brax adapter; prints and writes its
+evaluations.
 
     python examples/brax_ppo.py --csv brax_ppo.csv
 
@@ -19,7 +20,8 @@ from mqe_jax.adapters.brax import Env, wrap
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 
-NUM_ENVS, EVAL_ENVS = 64, 64
+NUM_ENVS = 64
+EVAL_ENVS = 64
 
 
 def train(
@@ -31,7 +33,9 @@ def train(
     num_envs: int = NUM_ENVS,
     eval_envs: int = EVAL_ENVS,
 ) -> list[dict[str, float]]:
-    """Trains once; returns rows of seed, environment steps, mean and standard error of the return, length."""
+    """Trains once; returns rows of seed, environment steps, mean and standard error of the return,
+    length.
+    """
     rows = []
 
     def evaluated(env_steps: int, metrics: Mapping[str, Any]) -> None:
@@ -47,7 +51,9 @@ def train(
         rows.append(row)
 
     networks = functools.partial(
-        ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=(64, 64), value_hidden_layer_sizes=(64, 64)
+        ppo_networks.make_ppo_networks,
+        policy_hidden_layer_sizes=(64, 64),
+        value_hidden_layer_sizes=(64, 64),
     )
     ppo.train(
         environment=env,

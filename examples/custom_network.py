@@ -1,7 +1,9 @@
-"""A custom network: each actor's input is the agent's observation and the mean of all agents' encoded observations.
+"""A custom network: each actor's input is the agent's observation and the mean of all agents'
+encoded observations.
 
-`python examples/custom_network.py` trains it for a minute on a CPU, on the environment of foreign_env.py. Once
-registered, it is selected by `network: {name: mean_field}` in YAML like the package's networks.
+`python examples/custom_network.py` trains it for a minute on a CPU, on the environment of
+foreign_env.py. Once registered, it is selected by `network: {name: mean_field}` in YAML like the
+package's networks.
 """
 
 from __future__ import annotations
@@ -34,7 +36,10 @@ class MeanField(NetworkSettings):
                 "critic": (2 * self.width, self.width, 1),
             }
             keys = jax.random.split(key, 3)
-            params = {name: nn.mlp_init(k, sizes[name], final_scale=0.1) for k, name in zip(keys, sizes, strict=True)}
+            params = {
+                name: nn.mlp_init(k, sizes[name], final_scale=0.1)
+                for k, name in zip(keys, sizes, strict=True)
+            }
             return {**params, "log_std": jnp.full(dims.action, -0.5)}
 
         def encode(params, obs, active):
@@ -44,7 +49,11 @@ class MeanField(NetworkSettings):
 
         def act(params, memory, obs, key, active=None):
             mean = nn.mlp(params["actor"], encode(params, obs, active))
-            noise = 0.0 if key is None else jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape)
+            noise = (
+                0.0
+                if key is None
+                else jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape)
+            )
             return mean + noise, log_prob(mean + noise, mean, params["log_std"]), memory
 
         def value(params, memory, is_first, obs, privileged, active=None):
@@ -59,9 +68,13 @@ class MeanField(NetworkSettings):
         def policy_params(params):
             return {name: params[name] for name in ("encoder", "actor", "log_std")}
 
-        return Network(init, policy_params, lambda num_envs: NetworkMemory((), ()), act, value, evaluate)
+        return Network(
+            init, policy_params, lambda num_envs: NetworkMemory((), ()), act, value, evaluate
+        )
 
 
 if __name__ == "__main__":
     history = foreign_env.main(network={"name": "mean_field", "width": 64})
-    print(f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after")
+    print(
+        f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after"
+    )

@@ -1,6 +1,8 @@
-"""Trains on an environment outside the package: two points on a plane that must meet, without robots or physics engine.
+"""Trains on an environment outside the package: two points on a plane that must meet, without
+robots or physics engine.
 
-`python examples/foreign_env.py` prints the distance at the end of episodes before and after; a minute on a CPU.
+`python examples/foreign_env.py` prints the distance at the end of episodes before and after; a
+minute on a CPU.
 """
 
 from __future__ import annotations
@@ -49,13 +51,19 @@ def distance(position: jax.Array) -> jax.Array:
 
 
 class Meeting:
-    """Agents start within 1 m of the origin and move by at most 0.1 m a step; the episode is truncated after 20 steps.
+    """Agents start within 1 m of the origin and move by at most 0.1 m a step; the episode is
+    truncated after 20 steps.
 
-    Observation: one-hot agent 2, own position 2, offset to the other agent 2. Reward, shared: minus the distance.
+    Observation: one-hot agent 2, own position 2, offset to the other agent 2. Reward, shared: minus
+    the distance.
     """
 
-    name, num_agents, action_size, max_episode_steps = "meeting", 2, 2, 20
-    observation_size, privileged_observation_size = 6, 4
+    name = "meeting"
+    num_agents = 2
+    action_size = 2
+    max_episode_steps = 20
+    observation_size = 6
+    privileged_observation_size = 4
 
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs
@@ -72,13 +80,19 @@ class Meeting:
         position = jax.random.uniform(draw, (self.num_envs, 2, 2), minval=-1.0)
         obs, privileged = self.observe(position)
         zero = jnp.zeros(self.num_envs)
-        done, step, reward = zero > 0, zero.astype(jnp.int32), jnp.zeros((self.num_envs, 2))
+        done = zero > 0
+        step = zero.astype(jnp.int32)
+        reward = jnp.zeros((self.num_envs, 2))
         results = self.outcome(zero), {"average_step_reward": zero}
-        return State(position, step, key, obs, privileged, obs, privileged, reward, done, done, *results)
+        return State(
+            position, step, key, obs, privileged, obs, privileged, reward, done, done, *results
+        )
 
     def outcome(self, apart: jax.Array) -> Outcome:
         """Returns success, and the distance, m, of the only team (N, 1) each."""
-        return Outcome(success=(apart < 0.1).astype(jnp.float32)[:, None], further={"distance": apart[:, None]})
+        return Outcome(
+            success=(apart < 0.1).astype(jnp.float32)[:, None], further={"distance": apart[:, None]}
+        )
 
     def step(self, state: State, action: jax.Array) -> State:
         """Moves the agents, with automatic reset."""
@@ -121,10 +135,17 @@ def main(num_envs: int = 64, updates: int = 100, **settings: object) -> list[flo
     )
     distances: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
-        train(Meeting(num_envs), config, folder, on_update=lambda _, row: distances.append(row["success/distance"]))
+        train(
+            Meeting(num_envs),
+            config,
+            folder,
+            on_update=lambda _, row: distances.append(row["success/distance"]),
+        )
     return distances
 
 
 if __name__ == "__main__":
     history = main()
-    print(f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after")
+    print(
+        f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after"
+    )

@@ -1,7 +1,9 @@
-"""HAPPO: each agent has its own actor, and the actors learn one after the other (Kuba et al., arXiv 2109.11251).
+"""HAPPO: each agent has its own actor, and the actors learn one after the other (Kuba et al., arXiv
+2109.11251).
 
-The advantage of an actor's turn is multiplied by the probability ratios of the agents that have had theirs, so that it
-responds to what they do now. `python examples/happo.py` trains Narrow Gate; a few minutes on a CPU.
+The advantage of an actor's turn is multiplied by the probability ratios of the agents that have had
+theirs, so that it responds to what they do now. `python examples/happo.py` trains Narrow Gate; a
+few minutes on a CPU.
 """
 
 from __future__ import annotations
@@ -17,21 +19,30 @@ from mqe_jax.train.loss import ratio_per_agent
 from mqe_jax.train.schedules import Scheduled
 from mqe_jax.train.stages import Carry, Metrics, Stages
 
-SETTINGS = {"network.share_policy": False, "network.critic_input": "privileged", "ppo.value": "joint"}
+SETTINGS = {
+    "network.share_policy": False,
+    "network.critic_input": "privileged",
+    "ppo.value": "joint",
+}
 
 
 class Happo(Stages):
     """An update in a turn of each agent, in random order; the critic learns in every turn."""
 
-    def update(self, carry: Carry, batch: Batch, now: Scheduled, key: jax.Array) -> tuple[Carry, Metrics]:
+    def update(
+        self, carry: Carry, batch: Batch, now: Scheduled, key: jax.Array
+    ) -> tuple[Carry, Metrics]:
         agents = batch.active.shape[-1]
         order_key, key = jax.random.split(key)
         order = jax.random.permutation(order_key, agents)
 
         def turn(before: tuple[Carry, jax.Array], inputs: tuple[jax.Array, jax.Array]) -> Any:
-            (carry, factor), (agent, key) = before, inputs
+            (carry, factor) = before
+            (agent, key) = inputs
             mine = jnp.arange(agents) == agent
-            own = batch._replace(advantage=batch.advantage * factor[..., None], learners=batch.learners & mine)
+            own = batch._replace(
+                advantage=batch.advantage * factor[..., None], learners=batch.learners & mine
+            )
             learned, metrics = super(Happo, self).update(carry, own, now, key)
             learned = self._of(mine, learned, carry)
             return (learned, factor * self._ratio(learned, batch)[..., agent]), metrics
@@ -41,13 +52,18 @@ class Happo(Stages):
         return carry, jax.tree.map(jnp.mean, metrics)
 
     def _of(self, mine: jax.Array, learned: Carry, before: Carry) -> Carry:
-        """Returns what was learned, without the actors of the others (A,), whose moments would still move them."""
+        """Returns what was learned, without the actors of the others (A,), whose moments would
+        still move them.
+        """
 
         def of(new: Any, old: Any) -> Any:
             return {**new, **where_rows(mine, *map(self.network.policy_params, (new, old)))}
 
-        (params, adam, rate), (old_params, old_adam, _) = learned, before
-        adam = adam._replace(mean=of(adam.mean, old_adam.mean), square=of(adam.square, old_adam.square))
+        (params, adam, rate) = learned
+        (old_params, old_adam, _) = before
+        adam = adam._replace(
+            mean=of(adam.mean, old_adam.mean), square=of(adam.square, old_adam.square)
+        )
         return of(params, old_params), adam, rate
 
     def _ratio(self, carry: Carry, batch: Batch) -> jax.Array:
@@ -60,8 +76,12 @@ class Happo(Stages):
 
 def main(updates: int = 20, **settings: object) -> list[float]:
     """Trains, and returns the average step reward after every update."""
-    init, update = mqe_jax.make_learner("go1gate", {"config": "demo", **SETTINGS, **settings}, stages=Happo)
-    state, step, rewards = jax.jit(init)(jax.random.PRNGKey(0)), jax.jit(update), []
+    init, update = mqe_jax.make_learner(
+        "go1gate", {"config": "demo", **SETTINGS, **settings}, stages=Happo
+    )
+    state = jax.jit(init)(jax.random.PRNGKey(0))
+    step = jax.jit(update)
+    rewards = []
     for _ in range(updates):
         state, metrics = step(state)
         rewards.append(float(metrics["average_step_reward"]))

@@ -1,11 +1,13 @@
 """Football, four against four, on a CPU: one policy for four robots learns from the scripted team.
 
-`python examples/large_teams.py` prints how often the new team beats robots that stand; a few minutes on a CPU.
+`python examples/large_teams.py` prints how often the new team beats robots that stand; a few
+minutes on a CPU.
 """
 
 import mqe_jax
 
-TASK, SIZES = "go1football-1vs1", {"num_agents": 8}
+TASK = "go1football-1vs1"
+SIZES = {"num_agents": 8}
 SETTINGS = {
     "num_envs": 64,
     "rollout_steps": 32,

@@ -38,7 +38,9 @@ class Pillar(TerrainBlock):
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         center = (start + self.length / 2, 0.0, track.wall_height / 2)
-        return Layout(walls=(Wall(f"pillar{number}", center, (self.side, self.side, track.wall_height)),))
+        return Layout(
+            walls=(Wall(f"pillar{number}", center, (self.side, self.side, track.wall_height)),)
+        )
 
 
 # Step 2: an object adds one body named `object/<name>`; its joints are its generalised coordinates.
@@ -69,7 +71,9 @@ class Mouse(Object):
 
 
 def flee(mouse: jax.Array, robot: jax.Array, speed: float, sight: float = 1.5) -> jax.Array:
-    """Returns the velocity (2,), m/s, of a mouse at (2,), m, that flees from a robot nearer than `sight` m."""
+    """Returns the velocity (2,), m/s, of a mouse at (2,), m, that flees from a robot nearer than
+    `sight` m.
+    """
     away = mouse - robot
     distance = jnp.maximum(jnp.linalg.norm(away), 1e-3)
     return jnp.where(distance < sight, speed * away / distance, 0.0)
@@ -116,7 +120,9 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
     Params = CatchParams
 
     def scene(self) -> Scene:
-        track = Track(blocks=(SpawnArea(1.5), Pillar(2.0), Plane(1.5), EndWall()), width=3.0, num_robots=1)
+        track = Track(
+            blocks=(SpawnArea(1.5), Pillar(2.0), Plane(1.5), EndWall()), width=3.0, num_robots=1
+        )
         return Scene(track, num_robots=1, objects={"mouse": Mouse()})
 
     def reset_objects(
@@ -128,19 +134,28 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
 
     def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Sets the mouse's velocity."""
-        velocity = flee(self.object_pose(data, "mouse")[:2], robot_state.position_w[0, :2], self.params.mouse_speed)
+        velocity = flee(
+            self.object_pose(data, "mouse")[:2],
+            robot_state.position_w[0, :2],
+            self.params.mouse_speed,
+        )
         return data.replace(qvel=data.qvel.at[self.objects["mouse"].qvel].set(velocity))
 
     def distance(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns the horizontal distance of the robot to the mouse (), m."""
-        return jnp.linalg.norm(self.object_pose(state.data, "mouse")[:2] - robot_state.position_w[0, :2])
+        return jnp.linalg.norm(
+            self.object_pose(state.data, "mouse")[:2] - robot_state.position_w[0, :2]
+        )
 
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((Block("base", 6, BASE_INFO), Block("mouse", 2, "x, y, m")))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        return {"base": robot_state.base_info, "mouse": self.object_pose(state.data, "mouse")[:2][None]}
+        return {
+            "base": robot_state.base_info,
+            "mouse": self.object_pose(state.data, "mouse")[:2][None],
+        }
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         distance = self.distance(after.state, after.robots)
@@ -153,7 +168,9 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
         """The episode ends when the mouse is caught."""
         return self.distance(state, robot_state) < self.params.reach
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State, robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: the mouse is caught."""
         return {"success": self.ending(state, robot_state) & ~failed}
 
@@ -163,7 +180,8 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
 
 def plan_catch(obs: Observation) -> jax.Array:
     """Returns the robot's action (1, 3): past the pillar, then towards the mouse."""
-    (position, yaw), mouse = pose(obs["base"]), obs["mouse"]
+    (position, yaw) = pose(obs["base"])
+    mouse = obs["mouse"]
     side = jnp.where(mouse[:, 1:] < 0, -0.7, 0.7)
     before = position[:, :1] < 3.1
     goal = jnp.where(before, jnp.concatenate([position[:, :1] + 0.6, side], axis=-1), mouse)
@@ -178,8 +196,13 @@ def main() -> None:
     """Evaluates the scripted policy over 32 episodes and prints its success rate."""
     env = VectorEnv(make("go1catch", num_envs=32), 32)
     plan = jax.vmap(scripted_policy(env.env))
-    result = evaluate_batch(env, lambda obs, memory, _: (plan(obs), memory), 32, jax.random.PRNGKey(0))
-    print(f"caught {result.success_rate:.0%} of 32 mice, average step reward {result.average_step_reward:.3f}")
+    result = evaluate_batch(
+        env, lambda obs, memory, _: (plan(obs), memory), 32, jax.random.PRNGKey(0)
+    )
+    print(
+        f"caught {result.success_rate:.0%} of 32 mice, average step reward "
+        f"{result.average_step_reward:.3f}"
+    )
 
 
 if __name__ == "__main__":

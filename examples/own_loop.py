@@ -1,4 +1,5 @@
-"""Your own training loop: three seeds as one compiled program under `jax.vmap`, without files and logs.
+"""Your own training loop: three seeds as one compiled program under `jax.vmap`, without files and
+logs.
 
 `python examples/own_loop.py` prints each seed's reward after every update; two minutes on a CPU.
 """
@@ -12,7 +13,8 @@ def main(seeds: int = 3, updates: int = 10, **settings: object) -> list[list[flo
     """Trains, and returns the average step reward of each seed after every update."""
     init, update = mqe_jax.make_learner("go1gate", {"config": "demo", **settings}, seeds=seeds)
     states = jax.jit(jax.vmap(init))(jax.random.split(jax.random.PRNGKey(0), seeds))
-    step, rewards = jax.jit(jax.vmap(update)), []
+    step = jax.jit(jax.vmap(update))
+    rewards = []
     for _ in range(updates):
         states, metrics = step(states)
         rewards.append(metrics["average_step_reward"].tolist())

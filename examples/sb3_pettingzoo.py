@@ -1,4 +1,5 @@
-"""Trains Climb on Seesaw with Stable-Baselines3's PPO, one policy for all agents, through PettingZoo and SuperSuit.
+"""Trains Climb on Seesaw with Stable-Baselines3's PPO, one policy for all agents, through
+PettingZoo and SuperSuit.
 
     pip install -e '.[pettingzoo]' stable-baselines3 supersuit
     python examples/sb3_pettingzoo.py --csv sb3.csv
@@ -16,13 +17,16 @@ import numpy as np
 
 from mqe_jax.adapters import pettingzoo
 
-NUM_ENVS, ROLLOUT = 8, 256
+NUM_ENVS = 8
+ROLLOUT = 256
 COLUMNS = {"return": "r", "episode_length": "l"}
 """Columns of the curve and their names in Stable-Baselines3's records of episodes."""
 
 
 def vectorised(task: str, **settings: Any) -> Any:
-    """Returns agents of several environments as one Stable-Baselines3 vector environment, observations normalised."""
+    """Returns agents of several environments as one Stable-Baselines3 vector environment,
+    observations normalised.
+    """
     # Imported by name: neither library is an extra of mqe-jax.
     supersuit: Any = import_module("supersuit")
     wrappers: Any = import_module("stable_baselines3.common.vec_env")
@@ -32,7 +36,8 @@ def vectorised(task: str, **settings: Any) -> Any:
 
 
 def train(env: Any, steps: int, rollout: int = ROLLOUT) -> list[dict[str, Any]]:
-    """Trains; returns rows of environment steps, and return and length of the last 100 episodes of agents.
+    """Trains; returns rows of environment steps, and return and length of the last 100 episodes of
+    agents.
 
     Args:
         env: of `vectorised`.
@@ -52,7 +57,10 @@ def train(env: Any, steps: int, rollout: int = ROLLOUT) -> list[dict[str, Any]]:
         episodes = model.ep_info_buffer
         if episodes:
             row: dict[str, Any] = {"env_steps": model.num_timesteps // agents}
-            row |= {name: round(float(np.mean([x[key] for x in episodes])), 3) for name, key in COLUMNS.items()}
+            row |= {
+                name: round(float(np.mean([x[key] for x in episodes])), 3)
+                for name, key in COLUMNS.items()
+            }
             rows.append(row)
             print(rows[-1], flush=True)
     return rows

@@ -1,7 +1,8 @@
-"""Self-play: trains Sumo Wrestling against a frozen snapshot of the policy itself and a scripted opponent.
+"""Self-play: trains Sumo Wrestling against a frozen snapshot of the policy itself and a scripted
+opponent.
 
-`python examples/self_play.py` prints the results against both, after a minute or two on a CPU. 41,000 steps teach
-little: `mqe train go1wrestling` takes 150 million.
+`python examples/self_play.py` prints the results against both, after a minute or two on a CPU.
+41,000 steps teach little: `mqe train go1wrestling` takes 150 million.
 """
 
 from __future__ import annotations
@@ -20,20 +21,28 @@ from mqe_jax.train.policy import policy_of
 
 
 def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5) -> np.ndarray:
-    """Trains, and returns wins, draws and losses against the last snapshot and the scripted policy (2, 3)."""
+    """Trains, and returns wins, draws and losses against the last snapshot and the scripted policy
+    (2, 3).
+    """
     network = {"recurrent": False, "hidden_sizes": [64, 64]}
     settings = {"num_envs": num_envs, "rollout_steps": 64, "ppo": {"epochs": 4}, "network": network}
-    config = build(TrainConfig, {**settings, "total_steps": updates * num_envs * 64, "stagger_episodes": True})
-    matches = VectorEnv(make("go1wrestling", rewards={"push": 3.0, "approach": 1.0}, num_envs=num_envs), num_envs)
+    config = build(
+        TrainConfig, {**settings, "total_steps": updates * num_envs * 64, "stagger_episodes": True}
+    )
+    matches = VectorEnv(
+        make("go1wrestling", rewards={"push": 3.0, "approach": 1.0}, num_envs=num_envs), num_envs
+    )
 
-    one_team = versus(matches, ["idle"])  # for the sizes of a policy; its first snapshot is untrained
+    # for the sizes of a policy; its first snapshot is untrained
+    one_team = versus(matches, ["idle"])
     learner = make_learner(one_team, config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     snapshot = policy_of(state, one_team, config)
 
     env = versus(matches, [snapshot, "scripted"])  # half of the environments each
     learner = make_learner(env, config)
-    state, update = jax.jit(learner.init)(jax.random.PRNGKey(0)), jax.jit(learner.update)
+    state = jax.jit(learner.init)(jax.random.PRNGKey(0))
+    update = jax.jit(learner.update)
     for i in range(updates):
         if i % snapshot_every == 0:
             snapshot = policy_of(state, env, config)

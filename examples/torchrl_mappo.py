@@ -1,4 +1,5 @@
-"""Trains a task with TorchRL's multi-agent PPO, a central critic and shared parameters, through PettingZoo.
+"""Trains a task with TorchRL's multi-agent PPO, a central critic and shared parameters, through
+PettingZoo.
 
     pip install -e '.[pettingzoo]' torchrl
     python examples/torchrl_mappo.py --csv torchrl.csv
@@ -14,13 +15,18 @@ from typing import Any
 
 from mqe_jax.adapters import pettingzoo
 
-BATCH, EPOCHS, MINIBATCHES = 2000, 8, 4
+BATCH = 2000
+EPOCHS = 8
+MINIBATCHES = 4
 GROUP = "robot"
 """TorchRL's group of the agents robot_0, robot_1, ..."""
 
 
-def train(task: str = "go1seesaw", steps: int = 26_000, batch: int = BATCH, **settings: Any) -> list[float]:
-    """Trains; returns the mean return of an agent over the episodes that ended in each batch, NaN without any.
+def train(
+    task: str = "go1seesaw", steps: int = 26_000, batch: int = BATCH, **settings: Any
+) -> list[float]:
+    """Trains; returns the mean return of an agent over the episodes that ended in each batch, NaN
+    without any.
 
     Args:
         task: id.
@@ -38,7 +44,9 @@ def train(task: str = "go1seesaw", steps: int = 26_000, batch: int = BATCH, **se
     total = (GROUP, "episode_reward")
     env = envs.TransformedEnv(env, envs.RewardSum(in_keys=[env.reward_key], out_keys=[total]))
     actor, critic = networks(env)
-    loss = objectives.ClipPPOLoss(actor, critic, clip_epsilon=0.2, entropy_coeff=1e-3, normalize_advantage=True)
+    loss = objectives.ClipPPOLoss(
+        actor, critic, clip_epsilon=0.2, entropy_coeff=1e-3, normalize_advantage=True
+    )
     loss.set_keys(
         reward=env.reward_key,
         action=env.action_key,
@@ -56,11 +64,15 @@ def train(task: str = "go1seesaw", steps: int = 26_000, batch: int = BATCH, **se
         for _ in range(EPOCHS):
             with torch.no_grad():
                 loss.value_estimator(
-                    data, params=loss.critic_network_params, target_params=loss.target_critic_network_params
+                    data,
+                    params=loss.critic_network_params,
+                    target_params=loss.target_critic_network_params,
                 )
             for part in data[torch.randperm(len(data))].chunk(MINIBATCHES):
                 values = loss(part)
-                (values["loss_objective"] + values["loss_critic"] + values["loss_entropy"]).backward()
+                (
+                    values["loss_objective"] + values["loss_critic"] + values["loss_entropy"]
+                ).backward()
                 torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
                 optimizer.zero_grad()
@@ -72,10 +84,16 @@ def networks(env: Any) -> tuple[Any, Any]:
     torch: Any = import_module("torch")
     tensordict: Any = import_module("tensordict.nn")
     modules: Any = import_module("torchrl.modules")
-    observation, action = (GROUP, "observation"), env.full_action_spec_unbatched[env.action_key]
+    observation = (GROUP, "observation")
+    action = env.full_action_spec_unbatched[env.action_key]
     agents, size = action.shape
     settings = {"n_agent_inputs": env.observation_spec[observation].shape[-1], "n_agents": agents}
-    settings |= {"share_params": True, "depth": 2, "num_cells": 64, "activation_class": torch.nn.Tanh}
+    settings |= {
+        "share_params": True,
+        "depth": 2,
+        "num_cells": 64,
+        "activation_class": torch.nn.Tanh,
+    }
     mean = modules.MultiAgentMLP(n_agent_outputs=2 * size, centralised=False, **settings)
     mean = torch.nn.Sequential(mean, tensordict.NormalParamExtractor())
     parameters = [(GROUP, "loc"), (GROUP, "scale")]
@@ -88,7 +106,9 @@ def networks(env: Any) -> tuple[Any, Any]:
         return_log_prob=True,
     )
     value = modules.MultiAgentMLP(n_agent_outputs=1, centralised=True, **settings)
-    critic = tensordict.TensorDictModule(value, in_keys=[observation], out_keys=[(GROUP, "state_value")])
+    critic = tensordict.TensorDictModule(
+        value, in_keys=[observation], out_keys=[(GROUP, "state_value")]
+    )
     return actor, critic
 
 

@@ -25,18 +25,20 @@ def flock(
 
         v += 2 s N(0, I) + (s / 1.5) (c - p) / |c - p| + sum over robots of 0.2 r / q^1.4
 
-    p are the sheep's positions (S, 2), m, c their centre, v their velocities, s the restlessness, m/s. With
-    r = p - p_robot and q = |r squared elementwise|, robots beyond q = 9 have no effect. One sheep has no c. Each
-    component is then clipped to the top speed. Half of the speed that ground friction removes in a step is subtracted
-    before this and half after it: the sheep moves at the step's mean speed. Sheep that are not `there` (S,) stand still
-    outside the flock; by default all are there.
-    Source: paper, section III, with the constants of the released system.
+    p are the sheep's positions (S, 2), m, c their centre, v their velocities, s the restlessness,
+    m/s. With r = p - p_robot and q = |r squared elementwise|, robots beyond q = 9 have no effect.
+    One sheep has no c. Each component is then clipped to the top speed. Half of the speed that
+    ground friction removes in a step is subtracted before this and half after it: the sheep moves
+    at the step's mean speed. Sheep that are not `there` (S,) stand still outside the flock; by
+    default all are there. Source: paper, section III, with the constants of the released system.
     """
     half = friction * GRAVITY * step / 2
     velocity = slow_down(velocity, half)
     velocity += 2 * restlessness * jax.random.normal(key, position.shape)
     if len(position) > 1:
-        inward = jnp.mean(position, axis=0, where=None if there is None else there[:, None]) - position
+        inward = (
+            jnp.mean(position, axis=0, where=None if there is None else there[:, None]) - position
+        )
         velocity += restlessness / 1.5 * inward / jnp.maximum(_length(inward), 1e-6)
     away = position[:, None] - robots[None]
     nearness = jnp.maximum(_length(jnp.square(away)), 1e-3)
@@ -52,18 +54,20 @@ def slow_down(velocity: jax.Array, loss: float) -> jax.Array:
 
 
 def defend(position: jax.Array, yaw: jax.Array, ball: jax.Array, goal: jax.Array) -> jax.Array:
-    """Returns the walk commands vx, vy, yaw rate (3,), m/s and rad/s, of a robot that stays between ball and goal.
+    """Returns the walk commands vx, vy, yaw rate (3,), m/s and rad/s, of a robot that stays between
+    ball and goal.
 
     p is the robot's position, g the goal, t = 0.6 ball + 0.4 g. wrap() maps an angle to [-pi, pi].
 
-        yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3      (faces away from its goal)
-        vx       = clip(|t - g| - |p - g|, -0.5, 0.5)                       (as far from the goal as t)
-        vy       = -clip(distance of p to the left of the line g -> t, -0.5, 0.5)
+        yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3      (faces away from its
+        goal) vx       = clip(|t - g| - |p - g|, -0.5, 0.5)                       (as far from the
+        goal as t) vy       = -clip(distance of p to the left of the line g -> t, -0.5, 0.5)
 
     Positions are (2,), m, the goal's is the midpoint of its line; yaw is in rad.
     Source: paper, section III, with the constants of the released system.
     """
-    own, target = position - goal, 0.6 * (ball - goal)
+    own = position - goal
+    target = 0.6 * (ball - goal)
     distance = jnp.linalg.norm(target)
     turn = jnp.arctan2(own[1], own[0]) - yaw
     left = (target[0] * own[1] - target[1] * own[0]) / jnp.maximum(distance, 1e-6)

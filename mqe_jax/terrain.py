@@ -1,9 +1,11 @@
 """Terrain: a track is a row of blocks along x, each as wide as the track.
 
-A block is a small frozen dataclass with a length and a `layout` method. Walls whose positions differ between
-environments are attached to an anchor, which is sampled at reset and is part of the state (mocap bodies).
+A block is a small frozen dataclass with a length and a `layout` method. Walls whose positions
+differ between environments are attached to an anchor, which is sampled at reset and is part of the
+state (mocap bodies).
 
-Frame: the environment's, x along the track from its start, y across it with 0 on the centre line, z up; metres.
+Frame: the environment's, x along the track from its start, y across it with 0 on the centre line, z
+up; metres.
 """
 
 import dataclasses
@@ -14,7 +16,14 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.physics.appearance import GOAL_SITE, GROUND_GROUP, HIDDEN_GROUP, SITE_GROUP
-from mqe_jax.physics.appearance.shapes import WALL_COLOR, WALL_GROUP, Ground, Style, gate_wall, side_wall
+from mqe_jax.physics.appearance.shapes import (
+    WALL_COLOR,
+    WALL_GROUP,
+    Ground,
+    Style,
+    gate_wall,
+    side_wall,
+)
 from mqe_jax.physics.collision import GROUND_BIT, WALL_BIT
 
 _THICKNESS = 0.04  # of the side walls, m
@@ -23,7 +32,9 @@ ROW = 1.0  # m, distance between those that start one behind the other
 
 
 def rows_of(robots: int, width: float) -> tuple[int, float]:
-    """Returns how many robots start side by side on a width, and how far the last row is behind the first; m."""
+    """Returns how many robots start side by side on a width, and how far the last row is behind the
+    first; m.
+    """
     rows = math.ceil(robots / max(int(width / LANE), 1))
     return math.ceil(robots / rows), ROW * (rows - 1)
 
@@ -88,7 +99,9 @@ class TerrainBlock:
     """Extent along x, m."""
 
     def layout(self, start: float, track: "Track", number: int) -> Layout:
-        """Returns the walls and poses of the block from x = `start`, m; `number` is its index in the track."""
+        """Returns the walls and poses of the block from x = `start`, m; `number` is its index in
+        the track.
+        """
         raise NotImplementedError(f"terrain block {type(self).__name__}: layout() is not defined")
 
 
@@ -98,7 +111,8 @@ class SpawnArea(TerrainBlock):
 
     length: float = 2.0
     spawn_x: float | None = None
-    """X of the spawn poses from the block's start, m; half its length if None. Of several rows, the first."""
+    """X of the spawn poses from the block's start, m; half its length if None. Of several rows, the
+    first."""
     spacing: float | None = None
     """Distance between neighbouring spawn poses, m; the track's width / robots in a row if None."""
     columns: int | None = None
@@ -108,12 +122,17 @@ class SpawnArea(TerrainBlock):
 
     def layout(self, start: float, track: "Track", number: int) -> Layout:
         x = start + (self.length / 2 if self.spawn_x is None else self.spawn_x)
-        columns, spawn = self.columns or track.num_robots, []
+        columns = self.columns or track.num_robots
+        spawn = []
         spacing = track.width / columns if self.spacing is None else self.spacing
         for row, first in enumerate(range(0, track.num_robots, columns)):
             count = min(columns, track.num_robots - first)
             spawn += [(x - row * ROW, (i - (count - 1) / 2) * spacing, 0.0) for i in range(count)]
-        back = (Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),) if self.back_wall else ()
+        back = (
+            (Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),)
+            if self.back_wall
+            else ()
+        )
         return Layout(barriers=back, spawn=tuple(spawn))
 
 
@@ -150,17 +169,30 @@ class Gate(TerrainBlock):
     """What sensors take the gap for."""
 
     def layout(self, start: float, track: "Track", number: int) -> Layout:
-        gap, depth, height = self.width, self.depth, track.wall_height
+        gap = self.width
+        depth = self.depth
+        height = track.wall_height
         if not 0 < gap < track.width:
-            raise InputError(f"terrain block gate: width {gap} must be between 0 and the track's width {track.width}")
+            raise InputError(
+                f"terrain block gate: width {gap} must be between 0 and the track's width "
+                f"{track.width}"
+            )
         center = (start + self.length / 2, 0.0)
-        # Long enough to reach the side wall for every sampled gap position; the overhang is hidden when rendering.
+        # Long enough to reach the side wall for every sampled gap position; the overhang is hidden
+        # when rendering.
         reach = (track.width - gap) / 2 + self.random[1]
         walls = tuple(
-            Wall(f"gate{number}_{side}", (0.0, sign * (gap + reach) / 2, height / 2), (depth, reach, height), anchor=0)
+            Wall(
+                f"gate{number}_{side}",
+                (0.0, sign * (gap + reach) / 2, height / 2),
+                (depth, reach, height),
+                anchor=0,
+            )
             for side, sign in (("right", -1.0), ("left", 1.0))
         )
-        return Layout(walls=walls, anchors=(Anchor(f"gate{number}", center, self.random, self.kind),))
+        return Layout(
+            walls=walls, anchors=(Anchor(f"gate{number}", center, self.random, self.kind),)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,7 +236,10 @@ class Track:
 
     def layout(self) -> Layout:
         """Returns the layout of all blocks; anchors are numbered over the whole track."""
-        walls, barriers, anchors, spawn = [], [], [], []
+        walls = []
+        barriers = []
+        anchors = []
+        spawn = []
         start = self.start
         for number, block in enumerate(self.blocks):
             part = block.layout(start, self, number)
@@ -216,17 +251,27 @@ class Track:
             spawn += part.spawn
             start += block.length
         if self.walled:
-            middle, half = (self.start + start) / 2, self.width / 2
+            middle = (self.start + start) / 2
+            half = self.width / 2
             barriers.append(Barrier("side_right", (middle, -half), (0.0, 1.0), start - self.start))
             barriers.append(Barrier("side_left", (middle, half), (0.0, -1.0), start - self.start))
         return Layout(tuple(walls), tuple(barriers), tuple(anchors), tuple(spawn))
 
 
 def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> Layout:
-    """Adds a track's ground and walls to a scene, moving ones as mocap bodies `wall/<name>`; returns the layout."""
+    """Adds a track's ground and walls to a scene, moving ones as mocap bodies `wall/<name>`;
+    returns the layout.
+    """
     layout = track.layout()
-    world, solid = spec.worldbody, {"contype": WALL_BIT, "conaffinity": 0}
-    ground = {"contype": GROUND_BIT, "conaffinity": 0, "condim": 3, "rgba": track.ground.color, "group": GROUND_GROUP}
+    world = spec.worldbody
+    solid = {"contype": WALL_BIT, "conaffinity": 0}
+    ground = {
+        "contype": GROUND_BIT,
+        "conaffinity": 0,
+        "condim": 3,
+        "rgba": track.ground.color,
+        "group": GROUND_GROUP,
+    }
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
     if visual:
         track.ground.add(world)
@@ -249,11 +294,13 @@ def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> 
     for wall in layout.walls:
         half = np.array(wall.size) / 2
         if wall.anchor is None:
-            body, position = world, wall.center
+            body = world
+            position = wall.center
         else:
             anchor = layout.anchors[wall.anchor]
             start = np.add(wall.center, [*anchor.position, 0.0])
-            body, position = world.add_body(name=f"wall/{wall.name}", mocap=True, pos=start), (0, 0, 0)
+            body = world.add_body(name=f"wall/{wall.name}", mocap=True, pos=start)
+            position = (0, 0, 0)
         body.add_geom(
             name=f"wall/{wall.name}",
             type=mujoco.mjtGeom.mjGEOM_BOX,

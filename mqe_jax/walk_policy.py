@@ -1,4 +1,5 @@
-"""The walk policy: velocity and gait commands to joint targets, for one robot (walk-these-ways, arXiv 2212.03238).
+"""The walk policy: velocity and gait commands to joint targets, for one robot (walk-these-ways,
+arXiv 2212.03238).
 
 A feed-forward network takes as input the last 30 observations of 70 numbers:
 
@@ -12,12 +13,13 @@ A feed-forward network takes as input the last 30 observations of 70 numbers:
 | action before it | 12 | |
 | clock | 4 | sine of each foot's phase, FL FR RL RR |
 
-adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives the action, clipped to +-10;
-the joint target is default + scale * action, both the robot's. ELU between layers. Matrix products are in float32; in
-an environment's step in TF32 on an NVIDIA GPU.
+adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives the action, clipped
+to +-10; the joint target is default + scale * action, both the robot's. ELU between layers. Matrix
+products are in float32; in an environment's step in TF32 on an NVIDIA GPU.
 
-These 2100 numbers contain every action twice, constant commands 30 times, and in most gaits one clock four times.
-`RestrictedWalkPolicy` computes the same actions from about two thirds of them, with weights changed accordingly.
+These 2100 numbers contain every action twice, constant commands 30 times, and in most gaits one
+clock four times. `RestrictedWalkPolicy` computes the same actions from about two thirds of them,
+with weights changed accordingly.
 """
 
 import dataclasses
@@ -36,23 +38,38 @@ from mqe_jax.skills.weights import ASSETS, Networks, Params, layers  # noqa: F40
 
 HISTORY = 30
 OBSERVATION_SIZE = 70
-_BLOCKS = ("gravity", "commands", "joint_position", "joint_velocity", "action", "previous_action", "clock")
-_COLUMNS = dict(zip(_BLOCKS, np.split(np.arange(OBSERVATION_SIZE), [3, 18, 30, 42, 54, 66]), strict=True))
+_BLOCKS = (
+    "gravity",
+    "commands",
+    "joint_position",
+    "joint_velocity",
+    "action",
+    "previous_action",
+    "clock",
+)
+_COLUMNS = dict(
+    zip(_BLOCKS, np.split(np.arange(OBSERVATION_SIZE), [3, 18, 30, 42, 54, 66]), strict=True)
+)
 """Positions of each block in an observation."""
 LATENT_SIZE = 2
 ADAPTATION_SIZES = (HISTORY * OBSERVATION_SIZE, 256, 128, LATENT_SIZE)
 BODY_SIZES = (HISTORY * OBSERVATION_SIZE + LATENT_SIZE, 512, 256, 128, NUM_JOINTS)
 NETWORKS = Networks("walk", "walk policy", {"adaptation": ADAPTATION_SIZES, "body": BODY_SIZES})
-init_params, load_params, save_params = NETWORKS.init, NETWORKS.load, NETWORKS.save
+init_params = NETWORKS.init
+load_params = NETWORKS.load
+save_params = NETWORKS.save
 STEP = 0.02  # s, one policy step
 ACTION_CLIP = 10.0
 JOINT_VELOCITY_SCALE = 0.05
-PRECISION = "tensorfloat32"  # of the networks' matrix products in an environment's step; float32 on a CPU
+# of the networks' matrix products in an environment's step; float32 on a CPU
+PRECISION = "tensorfloat32"
 
 
 COMMANDS = (
     Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0, trained=(-1.2, 1.2)),
-    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0, trained=(-0.7, 0.7)),
+    Command(
+        "vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0, trained=(-0.7, 0.7)
+    ),
     Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, scale=0.25, mirror=-1.0, trained=(-1.2, 1.2)),
     Command("body_height", "m above the robot's standing height", gain=0.12, limit=0.12, scale=2.0),
     Command("gait_frequency", "Hz", 3.0, gain=1.0, limit=1.0),
@@ -83,7 +100,8 @@ class WalkMemory:
     """Recurrent state of one robot's walk policy."""
 
     history: jax.Array
-    """Last observations, oldest first (30, 70), or their rows (H,), see `RestrictedWalkPolicy`; zeros after a reset."""
+    """Last observations, oldest first (30, 70), or their rows (H,), see `RestrictedWalkPolicy`;
+    zeros after a reset."""
     action: jax.Array
     """Last action (12,)."""
     previous_action: jax.Array
@@ -94,7 +112,9 @@ class WalkMemory:
 
 def _shifts(commands: Any) -> list[Any]:
     """Returns each foot's shift in the gait cycle, FL FR RL RR."""
-    phase, offset, bound = commands[5], commands[6], commands[7]
+    phase = commands[5]
+    offset = commands[6]
+    bound = commands[7]
     return [phase + offset + bound, offset, bound, phase]
 
 
@@ -102,7 +122,9 @@ def foot_phases(gait: jax.Array, commands: jax.Array) -> jax.Array:
     """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above."""
     duration = commands[8]
     raw = jnp.mod(gait + jnp.stack(_shifts(commands)), 1.0)
-    return jnp.where(raw < duration, 0.5 * raw / duration, 0.5 + 0.5 * (raw - duration) / (1.0 - duration))
+    return jnp.where(
+        raw < duration, 0.5 * raw / duration, 0.5 + 0.5 * (raw - duration) / (1.0 - duration)
+    )
 
 
 def advance_gait(gait: jax.Array, commands: jax.Array) -> jax.Array:
@@ -110,7 +132,9 @@ def advance_gait(gait: jax.Array, commands: jax.Array) -> jax.Array:
     return jnp.mod(gait + STEP * commands[4], 1.0)
 
 
-def observe(robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Proprioception) -> jax.Array:
+def observe(
+    robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Proprioception
+) -> jax.Array:
     """Builds one observation (70,), of unscaled commands (15,)."""
     clock = jnp.sin(2 * jnp.pi * foot_phases(memory.gait, commands))
     return jnp.concatenate(
@@ -126,15 +150,21 @@ def observe(robot: Robot, memory: WalkMemory, commands: jax.Array, sensed: Propr
     ).astype(jnp.float32)
 
 
-def infer(params: Params, history: jax.Array, *, precision: str = "highest") -> tuple[jax.Array, jax.Array]:
+def infer(
+    params: Params, history: jax.Array, *, precision: str = "highest"
+) -> tuple[jax.Array, jax.Array]:
     """Computes unclipped actions (..., 12) and latents (..., 2) from flattened histories (..., n).
 
-    One product of the history computes both first layers. Two columns of weights then add the latent to the body's: no
-    input of another length than the history is written. The action has no gradient through the latent.
+    One product of the history computes both first layers. Two columns of weights then add the
+    latent to the body's: no input of another length than the history is written. The action has no
+    gradient through the latent.
     """
-    adaptation, body = (params[part]["0"] for part in ("adaptation", "body"))
+    adaptation = params["adaptation"]["0"]
+    body = params["body"]["0"]
     inner, columns = jnp.split(body["weight"], [history.shape[-1]], axis=1)
-    both = jnp.matmul(history, jnp.concatenate([adaptation["weight"], inner]).T, precision=precision)
+    both = jnp.matmul(
+        history, jnp.concatenate([adaptation["weight"], inner]).T, precision=precision
+    )
     estimated, first = jnp.split(both, [len(adaptation["bias"])], axis=-1)
     latent = layers(params["adaptation"], estimated + adaptation["bias"], precision, first=1)
     first += body["bias"]
@@ -192,20 +222,27 @@ class WalkPolicy(Skill):
 class RestrictedWalkPolicy(WalkPolicy):
     """The walk policy if only some commands vary: the same actions from a shorter history.
 
-    The history is the end of a stream of rows, one per observation. A row has a one and the observation, without
-    constant commands and without the action before the last one, which the previous row has. If all feet are in step or
-    half a cycle apart, a row has only the first foot's clock, which the others equal except for the sign.
+    The history is the end of a stream of rows, one per observation. A row has a one and the
+    observation, without constant commands and without the action before the last one, which the
+    previous row has. If all feet are in step or half a cycle apart, a row has only the first foot's
+    clock, which the others equal except for the sign.
     """
 
     def __init__(self, robot: Robot, varied: Sequence[str], gait: str | None) -> None:
         """Creates the skill; commands that are not in `varied` always have the gait's defaults."""
         super().__init__(robot)
-        changing, default = np.unique(self.index(varied)), self.default_commands(gait)
-        halves = 2 * (np.array(_shifts(default)) - _shifts(default)[0])  # half cycles after the first foot
-        alike = default[8] == 0.5 and not (halves % 1).any() and not {5, 6, 7, 8} & {*changing.tolist()}
+        changing = np.unique(self.index(varied))
+        default = self.default_commands(gait)
+        # half cycles after the first foot
+        halves = 2 * (np.array(_shifts(default)) - _shifts(default)[0])
+        alike = (
+            default[8] == 0.5 and not (halves % 1).any() and not {5, 6, 7, 8} & {*changing.tolist()}
+        )
         clock = _COLUMNS["clock"][: 1 if alike else None]
         sensed = [_COLUMNS[name] for name in ("gravity", "joint_position", "joint_velocity")]
-        self._kept = np.concatenate([_COLUMNS["commands"][changing], *sensed, clock, _COLUMNS["action"]])
+        self._kept = np.concatenate(
+            [_COLUMNS["commands"][changing], *sensed, clock, _COLUMNS["action"]]
+        )
         self._width = 1 + len(self._kept)
         constant = COMMAND_SCALE * default
         constant[changing] = 0.0
@@ -214,7 +251,8 @@ class RestrictedWalkPolicy(WalkPolicy):
         self._observation[self._kept, 1:] = np.eye(len(self._kept))
         if alike:
             self._observation[_COLUMNS["clock"], -NUM_JOINTS - 1] = (-1) ** halves
-        least = HISTORY * self._width + NUM_JOINTS  # the rows, and the last action of the row before
+        # the rows, and the last action of the row before
+        least = HISTORY * self._width + NUM_JOINTS
         self._size = least + -least % 16  # 64 bytes: products of aligned rows are faster
 
     def init_memory(self) -> WalkMemory:
@@ -223,16 +261,20 @@ class RestrictedWalkPolicy(WalkPolicy):
     def _append(self, history: jax.Array, observation: jax.Array) -> jax.Array:
         extended = jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
         # Written once, not for each of its readers; on a CPU that is slower.
-        return jax.lax.platform_dependent(extended, cpu=lambda x: x, default=jax.lax.optimization_barrier)
+        return jax.lax.platform_dependent(
+            extended, cpu=lambda x: x, default=jax.lax.optimization_barrier
+        )
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
         return self.fold_history(super().load_params(path))
 
     def fold_history(self, params: Params) -> Params:
-        """Returns weights that compute from histories of rows what `params` compute from 30 observations.
+        """Returns weights that compute from histories of rows what `params` compute from 30
+        observations.
 
-        In the first layers, the weights of both occurrences of an action are added. Those of constant commands, times
-        their values, become the weight of the row's one. Those of equal clocks become one.
+        In the first layers, the weights of both occurrences of an action are added. Those of
+        constant commands, times their values, become the weight of the row's one. Those of equal
+        clocks become one.
         """
         params = {part: dict(chain) for part, chain in params.items()}
         for chain in params.values():
@@ -243,5 +285,8 @@ class RestrictedWalkPolicy(WalkPolicy):
             rows[:, 1:] = window @ self._observation
             rows[:, :-1, -NUM_JOINTS:] += window[..., _COLUMNS["previous_action"]]
             history = rows.reshape(len(weight), -1)[:, -self._size :]
-            chain["0"] = {**chain["0"], "weight": jax.device_put(np.concatenate([history, rest], axis=1))}
+            chain["0"] = {
+                **chain["0"],
+                "weight": jax.device_put(np.concatenate([history, rest], axis=1)),
+            }
         return params

@@ -1,4 +1,6 @@
-"""Shared by all tests: the CPU, a compilation cache, skip reasons of GPU and soak tests, and a fake task for `mqe`."""
+"""Shared by all tests: the CPU, a compilation cache, skip reasons of GPU and soak tests, and a fake
+task for `mqe`.
+"""
 
 import functools
 import gc
@@ -12,13 +14,16 @@ from typing import Any
 
 # Before the first import of jax; existing environment variables take precedence.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "jax"))
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "jax")
+)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import pytest
 
-# The tests compile far longer than they simulate. Unoptimised code halves their time, and XLA's fusion emitters without
-# MLIR save a third of the rest (an XLA that lacks this option ignores it). The soak runs optimised code.
+# The tests compile far longer than they simulate. Unoptimised code halves their time, and XLA's
+# fusion emitters without MLIR save a third of the rest (an XLA that lacks this option ignores it).
+# The soak runs optimised code.
 UNOPTIMISED = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
     " --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
@@ -30,19 +35,31 @@ def _soak_requested(config: pytest.Config) -> bool:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Disables XLA optimisation on the CPU, also in subprocesses; an existing XLA_FLAGS takes precedence."""
-    gc.set_threshold(50_000, 20, 50)  # tracing makes objects that stay: looking for garbage takes a third of its time
+    """Disables XLA optimisation on the CPU, also in subprocesses; an existing XLA_FLAGS takes
+    precedence.
+    """
+    # tracing makes objects that stay: looking for garbage takes a third of its time
+    gc.set_threshold(50_000, 20, 50)
     given = os.environ.get("XLA_FLAGS", "")
-    if os.environ["JAX_PLATFORMS"] == "cpu" and not _soak_requested(config) and UNOPTIMISED not in given:
+    if (
+        os.environ["JAX_PLATFORMS"] == "cpu"
+        and not _soak_requested(config)
+        and UNOPTIMISED not in given
+    ):
         os.environ["XLA_FLAGS"] = f"{UNOPTIMISED} {given}".strip()
 
 
 def _gpu_missing(config: pytest.Config) -> str:
-    """Reason for skipping GPU tests; empty if they can run. In the soak Warp runs on the CPU, where it is installed."""
+    """Reason for skipping GPU tests; empty if they can run.
+
+    In the soak Warp runs on the CPU, where it is installed.
+    """
     if os.environ["JAX_PLATFORMS"] == "cpu":
         if _soak_requested(config) and importlib.util.find_spec("warp"):
             return ""
-        return "JAX_PLATFORMS=cpu (set JAX_PLATFORMS=cuda,cpu, or install warp-lang and run the soak)"
+        return (
+            "JAX_PLATFORMS=cpu (set JAX_PLATFORMS=cuda,cpu, or install warp-lang and run the soak)"
+        )
     try:
         subprocess.run(["nvidia-smi", "-L"], check=True, capture_output=True, timeout=20)
     except (OSError, subprocess.SubprocessError):
@@ -63,7 +80,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     for item in items:
         if item.get_closest_marker("soak"):
-            item.add_marker(pytest.mark.skip(reason="long: MQE_SOAK=1 pytest, or pytest -m soak, runs it"))
+            item.add_marker(
+                pytest.mark.skip(reason="long: MQE_SOAK=1 pytest, or pytest -m soak, runs it")
+            )
 
 
 @pytest.fixture
@@ -77,7 +96,9 @@ def fake_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @functools.cache
 def _kept_programs() -> tuple[dict[Any, Any], Any, Any]:
-    """Learners by what they are made from, and `SeedBatch` with its `map`, kept until the process ends."""
+    """Learners by what they are made from, and `SeedBatch` with its `map`, kept until the process
+    ends.
+    """
     from mqe_jax.train.seeds import SeedBatch
 
     return {}, functools.cache(SeedBatch), functools.cache(SeedBatch.map)
@@ -85,7 +106,9 @@ def _kept_programs() -> tuple[dict[Any, Any], Any, Any]:
 
 @pytest.fixture(scope="module")
 def shared_programs() -> Iterator[None]:
-    """Trainings of one environment share their learner and its programs, where settings of the learner are the same."""
+    """Trainings of one environment share their learner and its programs, where settings of the
+    learner are the same.
+    """
     from mqe_jax.train import runner, start
     from mqe_jax.train.seeds import SeedBatch
 

@@ -1,8 +1,9 @@
 """Agreement of two engines on the same episodes.
 
-`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`. With `c`, `agree` measures how fast
-trajectories of one engine separate from initial positions that differ by 1e-6. Options of `record`: `--num-envs N`
-environments of standing robots and as many in play, `--seed S`, `--solver-iterations I` in place of the task's.
+`python -m tests.engines record FOLDER c`, then `... agree FOLDER jax|warp|c`. With `c`, `agree`
+measures how fast trajectories of one engine separate from initial positions that differ by 1e-6.
+Options of `record`: `--num-envs N` environments of standing robots and as many in play, `--seed S`,
+`--solver-iterations I` in place of the task's.
 """
 
 import dataclasses
@@ -25,7 +26,10 @@ from mqe_jax.physics.engines import STATE_FIELDS
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.skills.control import MODES
 
-SETTLE, PLAY, STEPS = 40, 300, 20  # environment steps: until the robots stand, of play, and compared
+# environment steps: until the robots stand, of play, and compared
+SETTLE = 40
+PLAY = 300
+STEPS = 20
 
 
 def comparable(task: str, engine: str, num_envs: int, solver_iterations: int | None) -> Any:
@@ -36,7 +40,9 @@ def comparable(task: str, engine: str, num_envs: int, solver_iterations: int | N
     return make(task, impl=engine, num_envs=num_envs, **options)
 
 
-def settled(task: str, num_envs: int, seed: int = 0, solver_iterations: int | None = None) -> tuple[Any, State]:
+def settled(
+    task: str, num_envs: int, seed: int = 0, solver_iterations: int | None = None
+) -> tuple[Any, State]:
     """Environments of a task on MuJoCo's C engine in which the robots stand after their drop."""
     env = comparable(task, "c", num_envs, solver_iterations)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(3 * seed), num_envs))
@@ -45,7 +51,9 @@ def settled(task: str, num_envs: int, seed: int = 0, solver_iterations: int | No
 
 
 def rolled(env: Any, states: State, actions: jax.Array) -> tuple[State, jax.Array]:
-    """Steps environments through actions (T, N, A, D), without auto-reset: the last states, and qpos (T, N, nq)."""
+    """Steps environments through actions (T, N, A, D), without auto-reset: the last states, and
+    qpos (T, N, nq).
+    """
 
     def advance(states: State, action: jax.Array) -> tuple[State, jax.Array]:
         states = jax.vmap(env.step)(states, action)
@@ -56,16 +64,21 @@ def rolled(env: Any, states: State, actions: jax.Array) -> tuple[State, jax.Arra
 
 def actions_of(env: Any, num_envs: int, seed: int = 0) -> jax.Array:
     """Joint targets about the default (T, N, A, 12), the same for every engine."""
-    return 0.5 * jax.random.normal(jax.random.PRNGKey(3 * seed + 1), (STEPS, num_envs, env.num_agents, 12))
+    return 0.5 * jax.random.normal(
+        jax.random.PRNGKey(3 * seed + 1), (STEPS, num_envs, env.num_agents, 12)
+    )
 
 
 def played(task: str, num_envs: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Physics states during scripted episodes on the C engine; in a match the scripted policy controls all robots.
+    """Physics states during scripted episodes on the C engine; in a match the scripted policy
+    controls all robots.
 
-    Of each environment's first `PLAY` steps, the one in which objects move fastest and robots touch most.
+    Of each environment's first `PLAY` steps, the one in which objects move fastest and robots touch
+    most.
     """
     env: Any = make(task, impl="c", num_envs=num_envs)
-    vector_env, plan = VectorEnv(env, num_envs), jax.vmap(scripted_policy(env) if task in SCRIPTED else ahead)
+    vector_env = VectorEnv(env, num_envs)
+    plan = jax.vmap(scripted_policy(env) if task in SCRIPTED else ahead)
     robots = np.concatenate([env.index.base_qvel, env.index.joint_qvel], axis=1).ravel()
     rest = np.setdiff1d(np.arange(env.compiled.model.nv), robots)
 
@@ -73,7 +86,9 @@ def played(task: str, num_envs: int, seed: int = 0) -> dict[str, np.ndarray]:
         states = vector_env.step(states, plan(states.obs))
         robot_state = jax.vmap(env.read)(states.data)
         touching = jnp.any(robot_state.trunk_force > 1.0, axis=1)
-        busy = jnp.minimum(jnp.linalg.norm(states.data.qvel[:, rest], axis=-1), 1.0) + 2.0 * touching
+        busy = (
+            jnp.minimum(jnp.linalg.norm(states.data.qvel[:, rest], axis=-1), 1.0) + 2.0 * touching
+        )
         return states, (busy, {name: getattr(states.data, name) for name in STATE_FIELDS})
 
     states = jax.jit(vector_env.reset)(jax.random.PRNGKey(3 * seed + 2))
@@ -86,13 +101,19 @@ def ahead(obs: jax.Array) -> jax.Array:
     return jnp.zeros((len(obs), 3)).at[:, 0].set(0.5)
 
 
-def record(task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int | None = None) -> dict[str, Any]:
-    """Reference trajectories of the C engine under those actions: initial states, and qpos (T, 2 N, nq).
+def record(
+    task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int | None = None
+) -> dict[str, Any]:
+    """Reference trajectories of the C engine under those actions: initial states, and qpos (T, 2 N,
+    nq).
 
     The first half of the environments have standing robots, the others are in play.
     """
     env, standing = settled(task, num_envs, seed, solver_iterations)
-    fields = {n: x.astype(getattr(standing.data, n).dtype) for n, x in played(task, num_envs, seed).items()}
+    fields = {
+        n: x.astype(getattr(standing.data, n).dtype)
+        for n, x in played(task, num_envs, seed).items()
+    }
     both = standing, dataclasses.replace(standing, data=standing.data.replace(**fields))
     states = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), *both)
     qpos = rolled(env, states, actions_of(env, 2 * num_envs, seed))[1]
@@ -101,29 +122,39 @@ def record(task: str, num_envs: int = 8, seed: int = 0, solver_iterations: int |
 
 
 def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
-    """Distance of an engine's trajectories from the recorded ones of the C engine, same states and actions.
+    """Distance of an engine's trajectories from the recorded ones of the C engine, same states and
+    actions.
 
     Returns:
-        `standing/robots_1` and so on, for standing robots and for play, for robots and for objects: the largest
-        difference of any position (m), quaternion or joint angle (rad). Over environments, it is the maximum after one
-        step, and median, 90% and 99% quantile and maximum after 20 steps.
+        `standing/robots_1` and so on, for standing robots and for play, for robots and for objects:
+        the largest difference of any position (m), quaternion or joint angle (rad). Over
+        environments, it is the maximum after one step, and median, 90% and 99% quantile and maximum
+        after 20 steps.
     """
-    states, num_envs = reference["states"], len(reference["states"].step)
+    states = reference["states"]
+    num_envs = len(reference["states"].step)
     env = comparable(task, engine, num_envs, reference["solver_iterations"])
     fresh = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
     fields = {name: jnp.asarray(getattr(states.data, name)) for name in STATE_FIELDS}
     if engine == "c":
-        shift = jax.random.uniform(jax.random.PRNGKey(3), fields["qpos"].shape, minval=-1e-6, maxval=1e-6)
+        shift = jax.random.uniform(
+            jax.random.PRNGKey(3), fields["qpos"].shape, minval=-1e-6, maxval=1e-6
+        )
         fields["qpos"] = fields["qpos"] + shift
     states = dataclasses.replace(states, data=fresh.data.replace(**fields))
-    apart = np.abs(np.asarray(rolled(env, states, actions_of(env, num_envs, reference["seed"]))[1]) - reference["qpos"])
+    apart = np.abs(
+        np.asarray(rolled(env, states, actions_of(env, num_envs, reference["seed"]))[1])
+        - reference["qpos"]
+    )
     robots = np.concatenate([env.index.base_qpos, env.index.joint_qpos], axis=1).ravel()
     rest = np.setdiff1d(np.arange(apart.shape[-1]), robots)
     figures = {}
     for number, kind in enumerate(("standing", "play")):
         for name, columns in (("robots", robots), ("objects", rest)):
             if len(columns):
-                worst = apart[:, np.arange(num_envs) // (num_envs // 2) == number][..., columns].max(-1)
+                worst = apart[:, np.arange(num_envs) // (num_envs // 2) == number][
+                    ..., columns
+                ].max(-1)
                 figures[f"{kind}/{name}_1"] = float(worst[0].max())
                 for suffix, quantile in (("", 0.5), ("_90", 0.9), ("_99", 0.99), ("_max", 1.0)):
                     figures[f"{kind}/{name}_20{suffix}"] = float(np.quantile(worst[-1], quantile))
@@ -131,7 +162,9 @@ def disagreement(task: str, engine: str, reference: Any) -> dict[str, float]:
 
 
 def covering() -> list[tuple[str, str, str]]:
-    """Returns one combination for every task, which has every pair of robot and control mode several times."""
+    """Returns one combination for every task, which has every pair of robot and control mode
+    several times.
+    """
     pairs = list(itertools.product(robots.ROBOTS, MODES))
     return [(task, *pairs[number % len(pairs)]) for number, task in enumerate(TASKS)]
 
@@ -146,7 +179,8 @@ def main(
     solver_iterations: int | None = None,
 ) -> None:
     for task in tasks:
-        began, file = time.perf_counter(), folder / f"{task}.pickle"
+        began = time.perf_counter()
+        file = folder / f"{task}.pickle"
         figures: dict[str, Any] = {}
         if what == "record":
             file.parent.mkdir(parents=True, exist_ok=True)

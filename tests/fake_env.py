@@ -1,6 +1,8 @@
-"""A task without physics, for tests of command line, rendering and benchmark; as a program, `mqe` with it as `fake`.
+"""A task without physics, for tests of command line, rendering and benchmark; as a program, `mqe`
+with it as `fake`.
 
-Its `mj_model` has two jointed boxes that rendering treats as robots, between a fixed wall and two moving ones.
+Its `mj_model` has two jointed boxes that rendering treats as robots, between a fixed wall and two
+moving ones.
 """
 
 import dataclasses
@@ -22,15 +24,17 @@ from mqe_jax.core.types import Outcome
 from mqe_jax.envs import TASKS, EnvironmentState
 from mqe_jax.runs import build
 
-SMALL = "--num-envs 4 --rollout-steps 8 --total-steps 64 --ppo.minibatches 1 --network.no-recurrent".split()
+SMALL = (
+    "--num-envs 4 --rollout-steps 8 --total-steps 64 --ppo.minibatches 1 --network.no-recurrent"
+).split()
 """Flags of a training that ends within seconds."""
 
-LEG = "".join(f'<body pos="0 0 -.01"><joint name="{{robot}}j{i}"/><geom size=".02"/>' for i in range(12))
+LEG = "".join(
+    f'<body pos="0 0 -.01"><joint name="{{robot}}j{i}"/><geom size=".02"/>' for i in range(12)
+)
 ROBOT = (
-    '<body name="{robot}" pos="1 {y} .3"><freejoint/><geom type="box" size=".2 .1 .06" rgba="{rgba}"/>'
-    + LEG
-    + "</body>" * 12
-    + "</body>"
+    '<body name="{robot}" pos="1 {y} .3"><freejoint/><geom type="box" size=".2 .1 .06" '
+    'rgba="{rgba}"/>' + LEG + "</body>" * 12 + "</body>"
 )
 XML = f"""<mujoco><worldbody>
 <geom type="plane" size="0 0 1"/>
@@ -38,7 +42,8 @@ XML = f"""<mujoco><worldbody>
 <geom type="box" pos="0 0 .25" size=".02 1.5 .25" group="1"/>
 <geom type="box" pos="4 0 .25" size=".02 1.5 .25" group="1"/>
 <body name="left" mocap="true" pos="2 1.4 .25"><geom type="box" size=".05 1 .25" group="1"/></body>
-<body name="right" mocap="true" pos="2 -1.4 .25"><geom type="box" size=".05 1 .25" group="1"/></body>
+<body name="right" mocap="true" pos="2 -1.4 .25">
+<geom type="box" size=".05 1 .25" group="1"/></body>
 {ROBOT.format(robot="a", y=-0.5, rgba="0 0 1 1")}{ROBOT.format(robot="b", y=0.5, rgba="0 1 0 1")}
 </worldbody></mujoco>"""
 
@@ -64,10 +69,15 @@ class FakeState(EnvironmentState):
 
 
 class FakeEnv:
-    """Two robots that glide along x by a tenth of a metre times their first action; ends after ten steps."""
+    """Two robots that glide along x by a tenth of a metre times their first action; ends after ten
+    steps.
+    """
 
     name = "fake"
-    num_agents, observation_size, privileged_observation_size, action_size = 2, 1, 2, 3
+    num_agents = 2
+    observation_size = 1
+    privileged_observation_size = 2
+    action_size = 3
     teams = ((0, 1),)
     dt = 0.02
     robot_x = np.array([0, 19])
@@ -80,11 +90,19 @@ class FakeEnv:
         self.physics = SimpleNamespace(impl="none", step=lambda data, ctrl: (data, False))
 
     def reset(self, key: jax.Array) -> FakeState:
-        model, false = self.mj_model, jnp.zeros((), bool)
+        model = self.mj_model
+        false = jnp.zeros((), bool)
         mocap = np.flatnonzero(model.body_mocapid >= 0)
-        start = model.qpos0, model.body_pos[mocap], model.body_quat[mocap], np.zeros(model.nu), np.zeros(model.nv)
+        start = (
+            model.qpos0,
+            model.body_pos[mocap],
+            model.body_quat[mocap],
+            np.zeros(model.nu),
+            np.zeros(model.nv),
+        )
         data: FakeData = FakeData(*(jnp.asarray(x, jnp.float32) for x in start))
-        zero, obs = jnp.zeros(()), data.qpos[self.robot_x][:, None]
+        zero = jnp.zeros(())
+        obs = data.qpos[self.robot_x][:, None]
         names = ("reward/progress", "average_step_reward", "diverged", "overflow")
         metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
         results = Outcome(zero[None]), metrics
@@ -102,23 +120,38 @@ class FakeEnv:
             "diverged": jnp.zeros(()),
             "overflow": (qpos[0] > self.overflow_x).astype(jnp.float32),
         }
-        end, data = state.step >= 9, dataclasses.replace(state.data, qpos=qpos)
-        seen = {"obs": obs, "privileged_obs": obs[:, 0], "final_obs": obs, "final_privileged_obs": obs[:, 0]}
-        seen |= {"reward": jnp.full(2, total), "truncated": end, "metrics": metrics, "step": state.step + 1}
+        end = state.step >= 9
+        data = dataclasses.replace(state.data, qpos=qpos)
+        seen = {
+            "obs": obs,
+            "privileged_obs": obs[:, 0],
+            "final_obs": obs,
+            "final_privileged_obs": obs[:, 0],
+        }
+        seen |= {
+            "reward": jnp.full(2, total),
+            "truncated": end,
+            "metrics": metrics,
+            "step": state.step + 1,
+        }
         outcome = Outcome(jnp.all(obs > 1.2).astype(jnp.float32)[None])
         return dataclasses.replace(state, data=data, **seen, outcome=outcome)
 
 
 class FakeVectorEnv:
     def __init__(self, env: Any, num_envs: int) -> None:
-        self.env, self.num_envs = env, num_envs
+        self.env = env
+        self.num_envs = num_envs
         self.name = env.name
-        self.num_agents, self.action_size = env.num_agents, env.action_size
+        self.num_agents = env.num_agents
+        self.action_size = env.action_size
         self.observation_size = env.observation_size
         self.privileged_observation_size = env.privileged_observation_size
 
     def reset(self, key: jax.Array) -> FakeState:
-        return jax.vmap(self.env.reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
+        return jax.vmap(self.env.reset)(
+            devices.rows(lambda n: jax.random.split(key, n), self.num_envs)
+        )
 
     def with_groups(self, names: set[str]) -> Any:
         assert names <= {"policy"}
@@ -135,14 +168,18 @@ class FakeVectorEnv:
             data = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh.data, state.data)
             obs = jnp.where(done, fresh.obs, state.obs)
             step = jnp.where(done, 0, state.step)
-            return dataclasses.replace(state, data=data, obs=obs, privileged_obs=obs[:, 0], step=step)
+            return dataclasses.replace(
+                state, data=data, obs=obs, privileged_obs=obs[:, 0], step=step
+            )
 
         return jax.vmap(one)(state, action)
 
 
 @functools.cache
 def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
-    """The task and a batch of it, made once, so that programs are shared (see the fixture `shared_programs`)."""
+    """The task and a batch of it, made once, so that programs are shared (see the fixture
+    `shared_programs`).
+    """
     env = FakeEnv()
     return env, FakeVectorEnv(env, num_envs)
 

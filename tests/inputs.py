@@ -1,7 +1,8 @@
-"""Bad input: what a refusal is, and strategies of hypothesis for values beyond `mqe_jax.core.limits`, texts and files.
+"""Bad input: what a refusal is, and strategies of hypothesis for values beyond
+`mqe_jax.core.limits`, texts and files.
 
-`refused(kind)` of a kind of numbers is outside its bounds or no such number; nothing of it may be accepted. Texts and
-damaged files may be accepted where they happen to be valid.
+`refused(kind)` of a kind of numbers is outside its bounds or no such number; nothing of it may be
+accepted. Texts and damaged files may be accepted where they happen to be valid.
 """
 
 import io
@@ -35,14 +36,61 @@ CASES = settings(
     suppress_health_check=(HealthCheck.too_slow, HealthCheck.filter_too_much),
 )
 """Hypothesis repeats the same inputs in every run; the soak draws new ones."""
-NO_NUMBERS = ("nan", "many", "", " ", "1,5", "0x10", "{}", "[]", "[1", "*x", "'", "2026-01-01", "1e", "--1", "\u00bd")
+NO_NUMBERS = (
+    "nan",
+    "many",
+    "",
+    " ",
+    "1,5",
+    "0x10",
+    "{}",
+    "[]",
+    "[1",
+    "*x",
+    "'",
+    "2026-01-01",
+    "1e",
+    "--1",
+    "\u00bd",
+)
 """Texts that are no number."""
 TEXTS = (
-    *NO_NUMBERS, "inf", "-inf", "1e400", "-1e-320", "1_000", "true", "null", "none", "~", "&a [*a]", "{a: *a}",
-    "[" * 200, "{a: " * 100, "!!python/object/apply:os.getcwd []", "!!binary aGk=", "? [a]", "a: b: c", "a=b", "=",
-    "\x00", "\x1b[2J", "\u202e", "\ud800", "/", ".", "..", "/dev/zero", "/dev/full", "/proc/self/mem", "-", "--",
-    "%s%n", "9" * 400, "a" * 5000,
-)  # fmt: skip
+    *NO_NUMBERS,
+    "inf",
+    "-inf",
+    "1e400",
+    "-1e-320",
+    "1_000",
+    "true",
+    "null",
+    "none",
+    "~",
+    "&a [*a]",
+    "{a: *a}",
+    "[" * 200,
+    "{a: " * 100,
+    "!!python/object/apply:os.getcwd []",
+    "!!binary aGk=",
+    "? [a]",
+    "a: b: c",
+    "a=b",
+    "=",
+    "\x00",
+    "\x1b[2J",
+    "\u202e",
+    "\ud800",
+    "/",
+    ".",
+    "..",
+    "/dev/zero",
+    "/dev/full",
+    "/proc/self/mem",
+    "-",
+    "--",
+    "%s%n",
+    "9" * 400,
+    "a" * 5000,
+)
 """Hostile texts for flags and YAML."""
 
 
@@ -58,9 +106,15 @@ def refuses(said: str, call: Callable[..., Any], *arguments: Any, **named: Any) 
 
 
 def settings_classes() -> dict[str, Any]:
-    """Returns the classes whose fields are settings, by name; those of a task are its parameters."""
+    """Returns the classes whose fields are settings, by name; those of a task are its
+    parameters.
+    """
     found: dict[str, Any] = {"training": TrainConfig, "sweep": Sweep, "walk": WalkTask}
-    found |= {f"network {name}": kind for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")}
+    found |= {
+        f"network {name}": kind
+        for name, kind in NETWORKS.items()
+        if kind.__module__.startswith("mqe_jax")
+    }
     return found | {task: kind.Params for task, kind in TASKS.items()}
 
 
@@ -82,7 +136,10 @@ def number_in(hint: Any) -> Any:
 
 def refused(kind: Any) -> Strategy:
     low, high = limits.bounds(kind)
-    beyond = [st.floats(max_value=low, exclude_max=True), st.floats(min_value=high, exclude_min=True)]
+    beyond = [
+        st.floats(max_value=low, exclude_max=True),
+        st.floats(min_value=high, exclude_min=True),
+    ]
     others: list[Strategy] = [st.just(float("nan")), st.booleans(), st.sampled_from(NO_NUMBERS)]
     others += [st.just([1]), st.just({}), st.just(b"1")]
     if typing.get_args(kind)[0] is int:
@@ -102,17 +159,26 @@ def wrong_settings(draw: st.DrawFn) -> tuple[str, str, Any]:
 
 
 TARGETS = {
-    "train": ["fake"], "eval": ["fake"], "render": ["fake", "-o", "a.png"], "view": ["fake"], "bench": ["fake"],
-    "export": ["fake", "--onnx", "a.onnx"], "replay": ["a.npz"],
+    "train": ["fake"],
+    "eval": ["fake"],
+    "render": ["fake", "-o", "a.png"],
+    "view": ["fake"],
+    "bench": ["fake"],
+    "export": ["fake", "--onnx", "a.onnx"],
+    "replay": ["a.npz"],
     "walk convert": ["a.jit", "b.jit", "-o", "w.safetensors"],
-    "sweep": ["a.yaml"], "report": ["a"], "tournament": ["go1tug", "idle", "random", "-o", "cup"],
-    "exploit": ["go1tug", "idle"], "oracle": ["go1tug", "go1tug"],
-}  # fmt: skip
+    "sweep": ["a.yaml"],
+    "report": ["a"],
+    "tournament": ["go1tug", "idle", "random", "-o", "cup"],
+    "exploit": ["go1tug", "idle"],
+    "oracle": ["go1tug", "go1tug"],
+}
 """Positional and needed arguments of each command."""
 
 
 LONG = ("view", "walk train", "walk eval", "tournament", "exploit", "oracle")
-"""Commands that run for long where a text happens to be allowed; they get numbers only, which never are."""
+"""Commands that run for long where a text happens to be allowed; they get numbers only, which never
+are."""
 
 
 def settings_of(command: str) -> Any:
@@ -130,23 +196,37 @@ def wrong_flags(draw: st.DrawFn) -> list[str]:
         field = draw(st.sampled_from(sorted(fields)))
         value = draw(refused(fields[field]).filter(lambda x: not isinstance(x, list | bytes)))
         return [*words, f"--{field.replace('_', '-')}={value}"]
-    texts = "--set= --set=gate_width= --set=task= --set=self= --seed= --policy= --config= --nope=".split()
+    settings = "--set= --set=gate_width= --set=task= --set=self="
+    texts = f"{settings} --seed= --policy= --config= --nope=".split()
     flag = draw(st.sampled_from([*texts, ""]))
     return [*words, flag + "nothing " * (not flag) + draw(text)]
 
 
 @st.composite
 def yaml_text(draw: st.DrawFn, settings: Any) -> str:
-    """YAML of the names of settings with hostile values, as text since a value may be a fragment."""
-    names = [*hints_of(settings), *(name for name, _ in numbers(settings)), *"nothing [a] 1 null self env.task".split()]
-    value = st.sampled_from(TEXTS) | st.text(max_size=30) | st.floats().map(str) | st.integers().map(str)
+    """YAML of the names of settings with hostile values, as text since a value may be a
+    fragment.
+    """
+    names = [
+        *hints_of(settings),
+        *(name for name, _ in numbers(settings)),
+        *"nothing [a] 1 null self env.task".split(),
+    ]
+    value = (
+        st.sampled_from(TEXTS)
+        | st.text(max_size=30)
+        | st.floats().map(str)
+        | st.integers().map(str)
+    )
     lines = draw(st.lists(st.tuples(st.sampled_from(names), value), min_size=1, max_size=4))
     return "\n".join(f"{name}: {text}" for name, text in lines)
 
 
 @st.composite
 def damaged(draw: st.DrawFn, content: bytes) -> bytes:
-    """A file with bytes that are flipped, missing, added or repeated; mostly in its first kilobyte, the header's."""
+    """A file with bytes that are flipped, missing, added or repeated; mostly in its first kilobyte,
+    the header's.
+    """
     for _ in range(draw(st.integers(1, 3))):
         place = draw(st.integers(0, min(len(content), 1000)) | st.integers(0, len(content)))
         end = place + draw(st.integers(1, 64))
@@ -155,29 +235,42 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
             flipped = content[place] ^ (1 << draw(st.integers(0, 7)))
             content = content[:place] + bytes([flipped]) + content[place + 1 :]
         else:
-            middle = {"add": content[place:end] + draw(st.binary(max_size=64)), "repeat": content[place:end] * 2}
-            content = content[:place] + middle.get(new, b"") + (b"" if new == "cut" else content[end:])
+            middle = {
+                "add": content[place:end] + draw(st.binary(max_size=64)),
+                "repeat": content[place:end] * 2,
+            }
+            content = (
+                content[:place] + middle.get(new, b"") + (b"" if new == "cut" else content[end:])
+            )
     return content
 
 
 @st.composite
 def tensors_file(draw: st.DrawFn, content: bytes) -> bytes:
-    """A safetensors file whose header is changed: types, shapes, places, names, metadata of another type."""
+    """A safetensors file whose header is changed: types, shapes, places, names, metadata of another
+    type.
+    """
     size = struct.unpack("<Q", content[:8])[0]
     header = json.loads(content[8 : 8 + size])
     name = draw(st.sampled_from(sorted(header)))
     junk = st.recursive(
-        st.none() | st.booleans() | st.integers() | st.text(max_size=9), lambda x: st.lists(x, max_size=3), max_leaves=6
+        st.none() | st.booleans() | st.integers() | st.text(max_size=9),
+        lambda x: st.lists(x, max_size=3),
+        max_leaves=6,
     )
     if name == "__metadata__":
         header[name][draw(st.sampled_from([*header[name], "more"]))] = draw(
-            st.sampled_from(["", "{}", "[]", "null", "3", "[" * 2000, '{"dims": 1}', '{"config": []}'])
+            st.sampled_from(
+                ["", "{}", "[]", "null", "3", "[" * 2000, '{"dims": 1}', '{"config": []}']
+            )
             | st.text(max_size=9)
         )
     elif draw(st.booleans()):
         types = st.sampled_from(["F8_E4M3", "BF16", "BOOL", "I64", "F16", "C64", "F4", "U16"])
         part = draw(st.sampled_from(["dtype", "shape", "data_offsets"]))
-        header[name][part] = draw(types | junk if part == "dtype" else junk | st.lists(st.integers(), max_size=4))
+        header[name][part] = draw(
+            types | junk if part == "dtype" else junk | st.lists(st.integers(), max_size=4)
+        )
     else:
         header[draw(st.text(max_size=9))] = header.pop(name)
     text = json.dumps(header).encode("utf-8", "replace")
@@ -189,7 +282,8 @@ PICKLES = (
     b"cos\nsystem\n(S'true'\ntR.",
     b"c__torch__\nModule\n)\x81}(X\x01\x00\x00\x00aubc__torch__\nModule\n)\x81.",
     b"\x80\x02]\x94h\x00a" + b"]" * 2000 + b".",
-    b"\x80\x02c__torch__\nM\n)\x81q\x00}X\x04\x00\x00\x00selfh\x00sb.",  # a module that contains itself
+    # a module that contains itself
+    b"\x80\x02c__torch__\nM\n)\x81q\x00}X\x04\x00\x00\x00selfh\x00sb.",
     b"\x80\x02" + b"(" * 5000 + b".",
     b"\x80\x04\x8d\xff\xff\xff\xff\xff\xff\xff\x7f",  # a text of 2^63 bytes
     b"ctorch._utils\n_rebuild_tensor_v2\n((NI9\nI9\ntI0\nI0\ntR.",
@@ -215,10 +309,19 @@ def tensor(size: tuple[int, ...], stride: tuple[int, ...], key: str = "0", count
     """A tensor of float32 in the member `data/KEY` with `count` numbers."""
     place = named("cpu", b"J" + struct.pack("<i", count) + b"t")
     storage = b"(" + named("storage", b"ctorch\nFloatStorage\n") + named(key, place) + b"Q"
-    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\x00" + integers(size) + integers(stride) + b"tR"
+    return (
+        b"ctorch._utils\n_rebuild_tensor_v2\n("
+        + storage
+        + b"K\x00"
+        + integers(size)
+        + integers(stride)
+        + b"tR"
+    )
 
 
-def zipped(pickle: bytes, storages: Mapping[str, bytes], code: Mapping[str, str] | None = None) -> bytes:
+def zipped(
+    pickle: bytes, storages: Mapping[str, bytes], code: Mapping[str, str] | None = None
+) -> bytes:
     """An archive of a whole pickle, storages by key, and sources by path below `code`."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -1,9 +1,11 @@
-"""Measures how a page of `mqe play-site` agrees with the package: its physics, and how often its teams succeed.
+"""Measures how a page of `mqe play-site` agrees with the package: its physics, and how often its
+teams succeed.
 
-`python -m tests.play_agreement FOLDER --json FILE` needs Node. Episodes of the environment (C engine, one task after
-another, with the page's first policy) give initial states, actions and the NPCs' noise. The page's code replays them in
-WebAssembly with its graphs. Reported are the largest differences of the states after 1 and 20 environment steps. Then
-the page plays further episodes; their mean outcomes are reported.
+`python -m tests.play_agreement FOLDER --json FILE` needs Node. Episodes of the environment (C
+engine, one task after another, with the page's first policy) give initial states, actions and the
+NPCs' noise. The page's code replays them in WebAssembly with its graphs. Reported are the largest
+differences of the states after 1 and 20 environment steps. Then the page plays further episodes;
+their mean outcomes are reported.
 """
 
 import argparse
@@ -28,13 +30,20 @@ Rollout = dict[str, Any]
 """`states` of the environment, one more than `actions` (T, A, D) and `noise` (T, K)."""
 
 
-def record(entry: Entry, steps: int, seed: int = 0, change: Any = lambda state, step: state) -> Rollout:
-    """Returns an episode of the environment under an entry's first policy; `change` may replace the state of a step."""
-    env, policy = entry.env, next(iter(entry.policies.values()))
+def record(
+    entry: Entry, steps: int, seed: int = 0, change: Any = lambda state, step: state
+) -> Rollout:
+    """Returns an episode of the environment under an entry's first policy; `change` may replace the
+    state of a step.
+    """
+    env = entry.env
+    policy = next(iter(entry.policies.values()))
     both = all_agents(env, policy, policy if len(env.teams) > 1 else None)
     size = TaskFunctions(env).control_inputs.get("noise", (0,))[0]
-    reset, key = jax.jit(env.reset), jax.random.PRNGKey(seed)
-    state, memory = reset(key), both.initial_memory(1)
+    reset = jax.jit(env.reset)
+    key = jax.random.PRNGKey(seed)
+    state = reset(key)
+    memory = both.initial_memory(1)
 
     @jax.jit
     def step(state: Any, memory: Any, key: jax.Array) -> tuple[Any, Any, jax.Array, jax.Array]:
@@ -43,14 +52,19 @@ def record(entry: Entry, steps: int, seed: int = 0, change: Any = lambda state, 
         with normal_numbers(noise):
             return env.step(state, action[0]), memory, action[0], noise
 
-    states, rows = [state], []
+    states = [state]
+    rows = []
     for number, step_key in enumerate(jax.random.split(key, steps)):
         state = change(state, number)
         states[-1] = state
         state, memory, action, noise = step(state, memory, step_key)
         states.append(state)
         rows.append(jax.device_get((action, noise)))
-    return {"states": jax.device_get(states), "actions": [row[0] for row in rows], "noise": [row[1] for row in rows]}
+    return {
+        "states": jax.device_get(states),
+        "actions": [row[0] for row in rows],
+        "noise": [row[1] for row in rows],
+    }
 
 
 def run_page(folder: Path, task: str, rollouts: list[Rollout], episodes: int) -> dict[str, Any]:
@@ -60,19 +74,30 @@ def run_page(folder: Path, task: str, rollouts: list[Rollout], episodes: int) ->
         first = rollout["states"][0]
         start = {**state_arrays(first), "mocap_pos": first.data.mocap_pos, "obs": first.obs}
         start = {name: np.ravel(value).tolist() for name, value in start.items()}
-        plain.append({"start": start} | {name: np.stack(rollout[name]).tolist() for name in ("actions", "noise")})
+        plain.append(
+            {"start": start}
+            | {name: np.stack(rollout[name]).tolist() for name in ("actions", "noise")}
+        )
     given = json.dumps({"task": task, "rollouts": plain, "episodes": list(range(episodes))})
     done = subprocess.run(
-        ["node", "--input-type=module", "-e", PAGE, folder], input=given, capture_output=True, text=True
+        ["node", "--input-type=module", "-e", PAGE, folder],
+        input=given,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
-def differences(env: Any, rollouts: list[Rollout], found: list[Any], steps: int) -> dict[str, float]:
+def differences(
+    env: Any, rollouts: list[Rollout], found: list[Any], steps: int
+) -> dict[str, float]:
     """Returns the largest differences by quantity after a number of steps."""
-    index, model = env.index, env.compiled.model
-    objects = sorted(set(range(model.nq)) - set(np.ravel(index.base_qpos)) - set(np.ravel(index.joint_qpos)))
+    index = env.index
+    model = env.compiled.model
+    objects = sorted(
+        set(range(model.nq)) - set(np.ravel(index.base_qpos)) - set(np.ravel(index.joint_qpos))
+    )
     parts: dict[str, tuple[str, Any]] = {
         "trunk position, m": ("qpos", index.base_qpos[:, :3]),
         "joint angle, rad": ("qpos", index.joint_qpos),
@@ -83,23 +108,33 @@ def differences(env: Any, rollouts: list[Rollout], found: list[Any], steps: int)
 
     def apart(name: str, where: Any) -> float:
         pairs = zip(rollouts, found, strict=True)
-        rows = [(getattr(a["states"][steps].data, name), np.array(b[name][steps - 1])) for a, b in pairs]
+        rows = [
+            (getattr(a["states"][steps].data, name), np.array(b[name][steps - 1])) for a, b in pairs
+        ]
         return max(float(np.abs(a[where] - b[where]).max(initial=0.0)) for a, b in rows)
 
-    return {label: float(f"{apart(*part):.2g}") for label, part in parts.items() if np.size(part[1])}
+    return {
+        label: float(f"{apart(*part):.2g}") for label, part in parts.items() if np.size(part[1])
+    }
 
 
 def measure(folder: Path, entry: Entry, count: int, episodes: int) -> dict[str, Any]:
     rollouts = [record(entry, max(STEPS), seed) for seed in range(count)]
     found = run_page(folder, entry.name, rollouts, episodes)
     apart = functools.partial(differences, entry.env, rollouts, found["rollouts"])
-    report: dict[str, Any] = {"browser": found["version"], "here": mujoco.__version__, "rollouts": count}
+    report: dict[str, Any] = {
+        "browser": found["version"],
+        "here": mujoco.__version__,
+        "rollouts": count,
+    }
     report |= {str(steps): apart(steps) for steps in STEPS}
     if episodes:
         outcomes = [episode["outcome"] for episode in found["episodes"]]
         names = [name for name in outcomes[0] if not name.startswith("team1")]
         report["episodes"] = episodes
-        report["outcome"] = {name: round(float(np.mean([row[name] for row in outcomes])), 4) for name in names}
+        report["outcome"] = {
+            name: round(float(np.mean([row[name] for row in outcomes])), 4) for name in names
+        }
         report["times_real_time"] = round(found["steps_per_second"] * entry.env.dt, 1)
     return report
 
@@ -117,7 +152,8 @@ const { Site } = await module('episode.js');
 
 const input = JSON.parse(fs.readFileSync(0, 'utf8'));
 const mujoco = await loadMujoco();
-const site = new Site(async (name) => new Uint8Array(fs.readFileSync(path.join(folder, name))), mujoco, ort);
+const read = async (name) => new Uint8Array(fs.readFileSync(path.join(folder, name)));
+const site = new Site(read, mujoco, ort);
 
 const rollouts = [];
 const replayed = await site.episode(input.task);
@@ -130,7 +166,8 @@ for (const { start, actions, noise } of input.rollouts) {
     await replayed.step();
     states.push({ qpos: [...replayed.physics.data.qpos], qvel: [...replayed.physics.data.qvel] });
   }
-  rollouts.push({ qpos: states.map((state) => state.qpos), qvel: states.map((state) => state.qvel) });
+  const qpos = states.map((state) => state.qpos);
+  rollouts.push({ qpos, qvel: states.map((state) => state.qvel) });
 }
 
 const episodes = [];
@@ -141,7 +178,8 @@ for (const seed of input.episodes) {
   episode.reset(seed);
   while (episode.result === null) await episode.step();
   steps += episode.steps;
-  episodes.push({ seed, result: episode.result, steps: episode.steps, outcome: { ...episode.outcome } });
+  const { result, steps: length } = episode;
+  episodes.push({ seed, result, steps: length, outcome: { ...episode.outcome } });
 }
 const rate = steps ? (1000 * steps) / (performance.now() - began) : 0;
 const report = { version: mujoco.mj_versionString(), rollouts, episodes, steps_per_second: rate };
@@ -149,9 +187,10 @@ process.stdout.write(JSON.stringify(report));
 """
 """Runs the page's code in Node, from JSON to JSON.
 
-Input: `task`, a folder of the site; `rollouts`, each with a `start` (arrays by name), `actions` and `noise` by step;
-`episodes`, seeds to play with the task's first policy. Output: for each rollout `qpos` and `qvel` after every
-environment step, for each episode its end and outcome, and environment steps per second.
+Input: `task`, a folder of the site; `rollouts`, each with a `start` (arrays by name), `actions` and
+`noise` by step; `episodes`, seeds to play with the task's first policy. Output: for each rollout
+`qpos` and `qvel` after every environment step, for each episode its end and outcome, and
+environment steps per second.
 """
 
 
@@ -165,7 +204,9 @@ def main() -> int:
     arguments = parser.parse_args()
     reports = {}
     for entry in entries(arguments.tasks):
-        reports[entry.name] = measure(arguments.folder, entry, arguments.rollouts, arguments.episodes)
+        reports[entry.name] = measure(
+            arguments.folder, entry, arguments.rollouts, arguments.episodes
+        )
         print(entry.name, json.dumps(reports[entry.name]), flush=True)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(reports, indent=1) + "\n", encoding="utf-8")

@@ -1,8 +1,10 @@
-"""Measures how robots that are processes agree with their policy in JAX: every action, and how often the team succeeds.
+"""Measures how robots that are processes agree with their policy in JAX: every action, and how
+often the team succeeds.
 
-`python -m tests.robot_agreement TARGET [--opponent NAME] [--sampled]` evaluates the policy of a run or a task twice,
-from the same initial states: in JAX, and with a process for each robot. In each step of the second evaluation JAX
-computes the actions too, from the same readings, its own recurrent state and the numbers that the processes draw.
+`python -m tests.robot_agreement TARGET [--opponent NAME] [--sampled]` evaluates the policy of a run
+or a task twice, from the same initial states: in JAX, and with a process for each robot. In each
+step of the second evaluation JAX computes the actions too, from the same readings, its own
+recurrent state and the numbers that the processes draw.
 """
 
 import json
@@ -31,8 +33,12 @@ class Compared:
     """A team of processes, each of whose actions is compared with that of the policy in JAX."""
 
     def __init__(self, team: RobotTeam, policy: Trained, seed: int) -> None:
-        self.task, self.agents, self.groups, self.needs = team.task, team.agents, team.groups, team.needs
-        self.config, self.deterministic = team.config, team.deterministic
+        self.task = team.task
+        self.agents = team.agents
+        self.groups = team.groups
+        self.needs = team.needs
+        self.config = team.config
+        self.deterministic = team.deterministic
         self.differences: list[float] = []
         self._team = team
         self._act, self._sizes = readings_function(policy, policy.needs.dims.observation)
@@ -40,7 +46,11 @@ class Compared:
         self._random = [np.random.default_rng(int(own)) for own in seeds]
 
     def initial_memory(self, num_envs: int) -> Any:
-        own = {name: jnp.zeros((num_envs, *x)) for name, x in self._sizes.items() if name.startswith("memory")}
+        own = {
+            name: jnp.zeros((num_envs, *x))
+            for name, x in self._sizes.items()
+            if name.startswith("memory")
+        }
         return self._team.initial_memory(num_envs), own
 
     def act(self, obs: Any, memory: Any, key: jax.Array) -> Any:
@@ -49,14 +59,19 @@ class Compared:
         inputs = {"obs": Observations.at(obs).group(self.needs.group), **memory}
         if "noise" in self._sizes:
             kind = jax.ShapeDtypeStruct((len(action), *self._sizes["noise"]), jnp.float32)
-            inputs["noise"] = jax.pure_callback(self._draw, kind, action, vmap_method="broadcast_all")
+            inputs["noise"] = jax.pure_callback(
+                self._draw, kind, action, vmap_method="broadcast_all"
+            )
         expected = jax.vmap(self._act)(inputs)
-        jax.debug.callback(lambda x: self.differences.append(float(x)), jnp.abs(expected["action"] - action).max())
+        jax.debug.callback(
+            lambda x: self.differences.append(float(x)), jnp.abs(expected["action"] - action).max()
+        )
         return action, (started, {name: expected[f"next_{name}"] for name in memory})
 
     def _draw(self, action: Any) -> np.ndarray:
         """Returns the numbers that the processes drew for the actions (..., N, A, D)."""
-        rows, size = math.prod(np.shape(action)[:-2]), self._sizes["noise"][0] // self.agents
+        rows = math.prod(np.shape(action)[:-2])
+        size = self._sizes["noise"][0] // self.agents
         drawn = [each.standard_normal((rows, size), np.float32) for each in self._random]
         return np.stack(drawn, axis=1).reshape(*np.shape(action)[:-2], -1)
 
@@ -70,10 +85,16 @@ def measure(
 ) -> dict[str, Any]:
     """Returns what the two evaluations give, and the largest difference of an action."""
     policy = load_policy(target).acting(not sampled)
-    task, seed = str(policy.config.task), 0
+    task = str(policy.config.task)
+    seed = 0
     env, _ = make_env(task, "c", policy.config.env, 1)
     model, error = verify_robot(policy, env)
-    options: dict[str, Any] = {"env": policy.config.env, "impl": "c", "episodes": episodes, "num_envs": num_envs}
+    options: dict[str, Any] = {
+        "env": policy.config.env,
+        "impl": "c",
+        "episodes": episodes,
+        "num_envs": num_envs,
+    }
     begun = time.perf_counter()
     inside = evaluate(task, policy, opponent, **options)
     middle = time.perf_counter()

@@ -1,4 +1,6 @@
-"""Environments shared by tests, and hand-built states: robots and objects at given positions, at rest."""
+"""Environments shared by tests, and hand-built states: robots and objects at given positions, at
+rest.
+"""
 
 import dataclasses
 import functools
@@ -19,7 +21,9 @@ from mqe_jax.physics.rotation import euler_to_quaternion
 
 @functools.cache
 def made(task: str) -> Any:
-    """The task on the C engine, on a GPU on MJX, under position control, created once per process."""
+    """The task on the C engine, on a GPU on MJX, under position control, created once per
+    process.
+    """
     return make(task, impl="c" if jax.default_backend() == "cpu" else "jax", control="position")
 
 
@@ -45,14 +49,19 @@ def placed(
     objects: Mapping[str, Sequence[float]] | None = None,
     state: State | None = None,
 ) -> State:
-    """An initial state with the robots at positions (R, 3), m, with roll, pitch, yaw (R, 3), rad, and default joints.
+    """An initial state with the robots at positions (R, 3), m, with roll, pitch, yaw (R, 3), rad,
+    and default joints.
 
-    Objects are put at the given coordinates; nothing moves. The task's own fields stay those of the reset.
+    Objects are put at the given coordinates; nothing moves. The task's own fields stay those of the
+    reset.
     """
     state = initial(env) if state is None else state
-    index, position = env.index, np.asarray(position, np.float32)
+    index = env.index
+    position = np.asarray(position, np.float32)
     qpos = np.array(state.data.qpos)
-    qpos[index.base_qpos] = np.c_[position, _quaternion(np.zeros_like(position) if euler is None else euler)]
+    qpos[index.base_qpos] = np.c_[
+        position, _quaternion(np.zeros_like(position) if euler is None else euler)
+    ]
     qpos[index.joint_qpos] = env.robot.default_joints
     for name, coordinates in (objects or {}).items():
         qpos[env.objects[name].qpos] = coordinates
@@ -90,16 +99,23 @@ def angles(roll: Any = (0.0, 0.0), pitch: Any = (0.0, 0.0), yaw: Any = (0.0, 0.0
 
 
 def robot_state(position: Any, **euler: Any) -> RobotState:
-    """The state of two robots at rest at positions (2, 3), m, with the default joints; see `angles`."""
+    """The state of two robots at rest at positions (2, 3), m, with the default joints; see
+    `angles`.
+    """
     joints = jnp.asarray(np.tile(GO1.default_joints, (2, 1)), jnp.float32)
-    none, turn = jnp.zeros((2, 3)), _quaternion(angles(**euler))
+    none = jnp.zeros((2, 3))
+    turn = _quaternion(angles(**euler))
     rest = joints, jnp.zeros((2, 12)), jnp.zeros(2), jnp.ones(2, bool)
     return RobotState(jnp.asarray(position), turn, none, none, *rest)
 
 
-def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, velocity: Any = ()) -> State:
+def with_object(
+    env: QuadrupedEnv, state: State, name: str, position: Any, velocity: Any = ()
+) -> State:
     """The state with an object's first coordinates, and its first velocities, as given."""
-    index, qpos, qvel = env.objects[name], np.array(state.data.qpos), np.array(state.data.qvel)
+    index = env.objects[name]
+    qpos = np.array(state.data.qpos)
+    qvel = np.array(state.data.qvel)
     qpos[index.qpos[: len(position)]] = position
     qvel[index.qvel[: len(velocity)]] = velocity
     return _with(state, qpos=qpos, qvel=qvel)
@@ -107,7 +123,9 @@ def with_object(env: QuadrupedEnv, state: State, name: str, position: Any, veloc
 
 @functools.cache
 def _programs(env: QuadrupedEnv) -> tuple[Any, Any, Any]:
-    """Compiled: a state's observations, its moment, and the reward terms and rewards from one state to another."""
+    """Compiled: a state's observations, its moment, and the reward terms and rewards from one state
+    to another.
+    """
 
     def observe(state: State) -> jax.Array:
         return env.observation_layout.pack(env.observe(state, env.read(state.data)))
@@ -131,7 +149,9 @@ def moment(env: QuadrupedEnv, state: State) -> Moment:
     return _programs(env)[1](state)
 
 
-def terms_of(env: QuadrupedEnv, before: State, after: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def terms_of(
+    env: QuadrupedEnv, before: State, after: State
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The unweighted terms and the agents' rewards (A,) of a step without collision."""
     return jax.device_get(_programs(env)[2](before, after))
 

@@ -1,4 +1,6 @@
-"""The Gymnasium adapter against Gymnasium's own checks and vector environment; matches against an opponent."""
+"""The Gymnasium adapter against Gymnasium's own checks and vector environment; matches against an
+opponent.
+"""
 
 import importlib
 import subprocess
@@ -24,21 +26,32 @@ from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.policies import SimplePolicy
 from tests.inputs import refuses
 
-COUNT, STEPS, ENDS = 3, 14, 5
+COUNT = 3
+STEPS = 14
+ENDS = 5
 SEED = 7
 # The time limit ends the episodes, at the same step under every version of the physics.
 SHORT: dict[str, Any] = {"episode_length": ENDS * 0.02}
-TASKS = ["go1gate", *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate")]
+TASKS = [
+    "go1gate",
+    *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate"),
+]
 
 
 def close(one: Any, other: Any) -> bool:
-    """Whether two nested infos agree, with a tolerance for the order of floating-point sums in batches."""
+    """Whether two nested infos agree, with a tolerance for the order of floating-point sums in
+    batches.
+    """
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(close(one[k], other[k]) for k in one)
     if isinstance(one, np.ndarray) and one.dtype == object:
         return all(close(a, b) for a, b in zip(one, other, strict=True))
     if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and np.allclose(one, other, rtol=1e-3, atol=1e-3)
+        return (
+            one.dtype == other.dtype
+            and one.shape == other.shape
+            and np.allclose(one, other, rtol=1e-3, atol=1e-3)
+        )
     return data_equivalence(one, other)
 
 
@@ -73,20 +86,33 @@ def test_single_environment_is_the_task(task: str) -> None:
     assert {"success", "average_step_reward"} <= set(info)
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP], ids=["same", "next"])
+@pytest.mark.parametrize(
+    "mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP], ids=["same", "next"]
+)
 @pytest.mark.parametrize("task", TASKS)
 def test_vector_environment_follows_sync_vector_env(task: str, mode: AutoresetMode) -> None:
     name = f"mqe/{task}-v0"
     ours: Any = gymnasium.make_vec(name, COUNT, impl="c", autoreset_mode=mode, **SHORT)
     theirs = gymnasium.make_vec(
-        name, COUNT, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, impl="c", **SHORT
+        name,
+        COUNT,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": mode},
+        impl="c",
+        **SHORT,
     )
     assert isinstance(ours.unwrapped, VectorEnv)
     assert ours.metadata["autoreset_mode"] is theirs.metadata["autoreset_mode"] is mode
-    for attribute in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
+    for attribute in (
+        "observation_space",
+        "action_space",
+        "single_observation_space",
+        "single_action_space",
+    ):
         assert getattr(ours, attribute) == getattr(theirs, attribute)
     resets = ended = 0
-    first, second = ours.reset(seed=SEED), theirs.reset(seed=SEED)
+    first = ours.reset(seed=SEED)
+    second = theirs.reset(seed=SEED)
     assert close(first[0], second[0]) and first[1] == second[1] == {}
     for step in range(STEPS):
         if step == 2:  # so that the environments' episodes end at different times
@@ -95,7 +121,8 @@ def test_vector_environment_follows_sync_vector_env(task: str, mode: AutoresetMo
             second = theirs.reset(options={"reset_mask": mask.copy()})
             assert close(first[0], second[0])
         action = actions(step, *ours.action_space.shape)
-        first, second = ours.step(action), theirs.step(action)
+        first = ours.step(action)
+        second = theirs.step(action)
         for one, other in zip(first[:4], second[:4], strict=True):
             assert one.dtype == other.dtype
             assert close(one, other), step
@@ -125,7 +152,12 @@ def test_render_returns_images() -> None:
     single = SingleEnv("go1gate", render_mode="rgb_array", **settings)
     single.reset(seed=SEED)
     image = single.render()
-    assert image is not None and image.shape == (64, 96, 3) and image.dtype == np.uint8 and image.std() > 5
+    assert (
+        image is not None
+        and image.shape == (64, 96, 3)
+        and image.dtype == np.uint8
+        and image.std() > 5
+    )
     vector: Any = VectorEnv("go1gate", COUNT, render_mode="rgb_array", **settings)
     vector.reset(seed=SEED)
     images = vector.render()
@@ -136,7 +168,10 @@ def test_render_returns_images() -> None:
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"autoreset_mode": "later"}, "autoreset_mode: 'later' is not allowed; it must be one of NextStep, SameStep"),
+        (
+            {"autoreset_mode": "later"},
+            "autoreset_mode: 'later' is not allowed; it must be one of NextStep, SameStep",
+        ),
         ({"render_mode": "human"}, "render_mode: 'human' is not allowed; it must be 'rgb_array'"),
         ({"num_envs": 0}, "num_envs: 0 is not allowed; .* greater than 0"),
         ({"num_envs": 1.5}, r"num_envs: 1\.5 is not allowed; .* a valid integer"),
@@ -164,7 +199,10 @@ def test_bad_calls_are_named() -> None:
 def test_every_task_is_registered() -> None:
     register()
     assert {f"mqe/{task}-v0" for task in tasks()} <= set(gymnasium.registry)
-    code = "import gymnasium; print(gymnasium.make('mqe_jax.adapters.gymnasium:mqe/go1gate-v0', impl='c'))"
+    code = (
+        "import gymnasium; print(gymnasium.make('mqe_jax.adapters.gymnasium:mqe/go1gate-v0', "
+        "impl='c'))"
+    )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "SingleEnv<mqe/go1gate-v0>" in out.stdout
 
@@ -181,17 +219,30 @@ def counting(task: str, act: float = 0.5) -> SimplePolicy:
 
 
 def test_team_0_plays_the_same_match_and_sees_its_own_half() -> None:
-    """States, observations, rewards and metrics are those of the match in which team 1 acts as the opponent does."""
+    """States, observations, rewards and metrics are those of the match in which team 1 acts as the
+    opponent does.
+    """
     env = match()
     team = TeamEnv(env, counting("go1wrestling"))
-    assert (team.num_agents, team.teams, team.name, team.max_steps) == (1, ((0,),), "go1wrestling", ENDS)
-    assert team.action_space.shape == (1, 12) and team.observation_space.shape == (1, env.observation_size)
+    assert (team.num_agents, team.teams, team.name, team.max_steps) == (
+        1,
+        ((0,),),
+        "go1wrestling",
+        ENDS,
+    )
+    assert team.action_space.shape == (1, 12) and team.observation_space.shape == (
+        1,
+        env.observation_size,
+    )
     key = jax.random.PRNGKey(0)
-    whole, half = jax.jit(env.reset)(key), jax.jit(team.reset)(key)
+    whole = jax.jit(env.reset)(key)
+    half = jax.jit(team.reset)(key)
     action = jnp.linspace(-1.0, 1.0, 12)[None]
-    step, play = jax.jit(team.step), jax.jit(env.step)
+    step = jax.jit(team.step)
+    play = jax.jit(env.step)
     for _ in range(ENDS):
-        whole, half = play(whole, jnp.concatenate([action, jnp.full((1, 12), 0.5)])), step(half, action)
+        whole = play(whole, jnp.concatenate([action, jnp.full((1, 12), 0.5)]))
+        half = step(half, action)
         np.testing.assert_allclose(half.data.qpos, whole.data.qpos, atol=1e-5)
         np.testing.assert_allclose(half.obs, whole.obs[:1], atol=1e-5)
         np.testing.assert_allclose(half.rival_obs, whole.obs[1:], atol=1e-5)
@@ -209,7 +260,9 @@ def test_a_shipped_opponent_adds_its_memory_to_the_state() -> None:
     team: Any = task_env("go1wrestling", opponent="go1wrestling", impl="c")
     assert team.match.params.skill == "agile"
     shapes: Any = jax.eval_shape(team.reset, jax.random.PRNGKey(0))
-    assert [x.shape[0] for x in jax.tree.leaves(shapes.rival_memory)] == [1] * len(jax.tree.leaves(shapes.rival_memory))
+    assert [x.shape[0] for x in jax.tree.leaves(shapes.rival_memory)] == [1] * len(
+        jax.tree.leaves(shapes.rival_memory)
+    )
     after: Any = jax.eval_shape(team.step, shapes, jnp.zeros((1, 3)))
     assert jax.tree.structure(after) == jax.tree.structure(shapes)
 
@@ -218,7 +271,9 @@ OPPOSED = {
     "gymnasium": lambda its, **of: (
         gymnasium.make_vec("mqe/go1wrestling-v0", 2, **of).single_action_space.shape == (1, 12)
     ),
-    "pettingzoo": lambda its, **of: its.parallel_env("go1wrestling", **of).possible_agents == ["robot_0"],
+    "pettingzoo": lambda its, **of: (
+        its.parallel_env("go1wrestling", **of).possible_agents == ["robot_0"]
+    ),
     "brax": lambda its, **of: its.Env("go1wrestling", **of).action_size == 12,
     "jaxmarl": lambda its, **of: its.Env("go1wrestling", **of).agents == ["robot_0"],
 }
@@ -236,8 +291,12 @@ def test_bad_opponents_are_named() -> None:
     with pytest.raises(InputError, match="opponent: go1gate is not a match; omit the opponent"):
         task_env("go1gate", opponent="idle", impl="c", control="position")
     refuses("opponent: unknown 'scriptd'", task_env, env, opponent="scriptd")
-    with pytest.raises(InputError, match=r"opponent: .* needs task 'go1tug'; the environment has 'go1wrestling'"):
+    with pytest.raises(
+        InputError, match=r"opponent: .* needs task 'go1tug'; the environment has 'go1wrestling'"
+    ):
         task_env(env, opponent=counting("go1tug"))
     team = TeamEnv(env, "idle")
     with pytest.raises(InputError, match=r"action: shape \(2, 12\); expected \(1, 12\)"):
-        jax.eval_shape(team.step, jax.eval_shape(team.reset, jax.random.PRNGKey(0)), jnp.zeros((2, 12)))
+        jax.eval_shape(
+            team.step, jax.eval_shape(team.reset, jax.random.PRNGKey(0)), jnp.zeros((2, 12))
+        )

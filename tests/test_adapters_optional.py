@@ -1,4 +1,6 @@
-"""The adapters of Brax, JaxMARL and PettingZoo: conventions, resets, names of tasks, and the libraries' own tests."""
+"""The adapters of Brax, JaxMARL and PettingZoo: conventions, resets, names of tasks, and the
+libraries' own tests.
+"""
 
 import functools
 import importlib
@@ -22,9 +24,14 @@ from tests.inputs import refuses
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
-COUNT, LIMIT, STEPS = 3, 3, 7
+COUNT = 3
+LIMIT = 3
+STEPS = 7
 GIVEN = r"actions: for \['robot_0'\]; expected one for each of robot_0, robot_1"
-TASKS = ["go1gate", *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate")]
+TASKS = [
+    "go1gate",
+    *(pytest.param(task, marks=pytest.mark.soak) for task in tasks() if task != "go1gate"),
+]
 
 
 def adapter(library: str) -> Any:
@@ -54,14 +61,20 @@ def test_brax_rollout(task: str) -> None:
     env = brax.Env(mqe_jax.make(task, impl="c", episode_length=2 * LIMIT * 0.02))
     assert env.episode_length == 2 * LIMIT and env.backend == "c"
     wrapped = brax.wrap(env, LIMIT)  # before the task's own limit
-    step, action_size = wrapped.step, env.action_size
+    step = wrapped.step
+    action_size = env.action_size
 
     @jax.jit
     def play(key: jax.Array) -> Any:
         def one(state: Any, _: None) -> Any:
             state = step(state, jnp.zeros((COUNT, action_size)))
             names = ("truncation", brax.FINAL_OBS, "steps")
-            return state, (state.obs, state.reward, state.done, *(state.info[name] for name in names))
+            return state, (
+                state.obs,
+                state.reward,
+                state.done,
+                *(state.info[name] for name in names),
+            )
 
         first = wrapped.reset(jax.random.split(key, COUNT))
         rows = jax.lax.scan(one, first, None, STEPS)[1]
@@ -69,22 +82,35 @@ def test_brax_rollout(task: str) -> None:
 
     start, final, (obs, reward, done, truncation, final_obs, steps) = play(jax.random.PRNGKey(0))
     np.testing.assert_array_equal(start, final)
-    assert obs.shape == (STEPS, COUNT, env.observation_size) and reward.shape == done.shape == (STEPS, COUNT)
+    assert obs.shape == (STEPS, COUNT, env.observation_size) and reward.shape == done.shape == (
+        STEPS,
+        COUNT,
+    )
     np.testing.assert_array_equal(steps[:, 0], [1, 2, 3, 1, 2, 3, 1])
-    check_episodes(start, obs, final_obs, done, truncation)  # each anew, unlike under Brax's wrapper
+    # each anew, unlike under Brax's wrapper
+    check_episodes(start, obs, final_obs, done, truncation)
 
 
 def test_brax_wrap_names_what_it_does_not_take() -> None:
     brax = adapter("brax")
-    vectorised = importlib.import_module("brax.envs.wrappers.training").VmapWrapper(brax.Env(task_env("go1gate")))
-    refuses("randomization_fn: not supported", brax.wrap, vectorised, randomization_fn=lambda system: system)
+    vectorised = importlib.import_module("brax.envs.wrappers.training").VmapWrapper(
+        brax.Env(task_env("go1gate"))
+    )
+    refuses(
+        "randomization_fn: not supported",
+        brax.wrap,
+        vectorised,
+        randomization_fn=lambda system: system,
+    )
     refuses("env: object is not", brax.wrap, type("Foreign", (), {"unwrapped": object()})())
 
 
 def test_brax_names_wrong_arguments() -> None:
-    brax, key = adapter("brax"), jax.random.PRNGKey(0)
+    brax = adapter("brax")
+    key = jax.random.PRNGKey(0)
     env = brax.Env(task_env("go1gate"))
-    wrapped, state = brax.wrap(env), jax.eval_shape(env.reset, key)
+    wrapped = brax.wrap(env)
+    state = jax.eval_shape(env.reset, key)
     states = jax.eval_shape(wrapped.reset, jax.random.split(key, COUNT))
     for name, call in {
         rf"action: shape \(3,\); expected \({env.action_size},\)": lambda: jax.eval_shape(
@@ -93,14 +119,18 @@ def test_brax_names_wrong_arguments() -> None:
         "rng: 3 is not allowed": lambda: wrapped.reset(3),
         "rng: .* a random key for each environment": lambda: wrapped.reset(key),
         "state: None is not allowed": lambda: wrapped.step(None, jnp.zeros((COUNT, 6))),
-        r"action: shape \(6,\); expected \(3, 6\)": lambda: jax.eval_shape(wrapped.step, states, jnp.zeros(6)),
+        r"action: shape \(6,\); expected \(3, 6\)": lambda: jax.eval_shape(
+            wrapped.step, states, jnp.zeros(6)
+        ),
     }.items():
         refuses(name, call)
 
 
 def test_jaxmarl_names_wrong_arguments() -> None:
-    jaxmarl, key = adapter("jaxmarl"), jax.random.PRNGKey(0)
-    env, discrete = (jaxmarl.Env(task_env("go1gate"), discrete=wanted) for wanted in (False, True))
+    jaxmarl = adapter("jaxmarl")
+    key = jax.random.PRNGKey(0)
+    env = jaxmarl.Env(task_env("go1gate"), discrete=False)
+    discrete = jaxmarl.Env(task_env("go1gate"), discrete=True)
     _, state = jax.jit(env.reset)(key)
     batch: Any = jax.tree.map(lambda x: np.stack([x, x]), state)
     some = {"robot_0": jnp.zeros(3), "robot_1": jnp.zeros(3)}
@@ -111,9 +141,15 @@ def test_jaxmarl_names_wrong_arguments() -> None:
         r"state: one with qpos \(2, 38\)": lambda: env.step(key, state, some, batch),
         "actions: 3": lambda: env.step(key, state, 3),
         GIVEN: lambda: env.step(key, state, {"robot_0": jnp.zeros(3)}),
-        "actions.robot_1: None .* 3 numbers": lambda: env.step(key, state, {**some, "robot_1": None}),
-        r"actions.robot_0: .* 3 numbers": lambda: env.step_env(key, state, {**some, "robot_0": jnp.zeros(4)}),
-        "actions.robot_1: 7 .* an integer below 7": lambda: discrete.step(key, state, {"robot_0": 0, "robot_1": 7}),
+        "actions.robot_1: None .* 3 numbers": lambda: env.step(
+            key, state, {**some, "robot_1": None}
+        ),
+        r"actions.robot_0: .* 3 numbers": lambda: env.step_env(
+            key, state, {**some, "robot_0": jnp.zeros(4)}
+        ),
+        "actions.robot_1: 7 .* an integer below 7": lambda: discrete.step(
+            key, state, {"robot_0": 0, "robot_1": 7}
+        ),
         "actions.robot_0: -1 ": lambda: discrete.step(key, state, {"robot_0": -1, "robot_1": 0}),
         "actions.robot_1: 0.5 ": lambda: discrete.step(key, state, {"robot_0": 0, "robot_1": 0.5}),
         "state: of type NoneType": lambda: env.get_obs(None),
@@ -137,7 +173,9 @@ def test_jaxmarl_rollout(task: str) -> None:
     @jax.jit
     def play(key: jax.Array) -> Any:
         def one(carry: Any, key: jax.Array) -> Any:
-            obs, state, reward, done, info = jax.vmap(wrapped.step)(jax.random.split(key, COUNT), carry, zero)
+            obs, state, reward, done, info = jax.vmap(wrapped.step)(
+                jax.random.split(key, COUNT), carry, zero
+            )
             return state, (obs, state.env_state.final_obs, reward, done, info)
 
         obs, state = jax.vmap(wrapped.reset)(jax.random.split(key, COUNT))
@@ -151,26 +189,37 @@ def test_jaxmarl_rollout(task: str) -> None:
     np.testing.assert_array_equal(info["returned_episode_lengths"][LIMIT - 1], LIMIT)
     first = agents[0]
     assert obs[first].shape == (STEPS, COUNT, *spaces[first].shape)
-    check_episodes(start[first], obs[first], final_obs[:, :, 0], done["__all__"], info["truncation"][..., 0])
+    check_episodes(
+        start[first], obs[first], final_obs[:, :, 0], done["__all__"], info["truncation"][..., 0]
+    )
 
 
 @pytest.mark.parametrize("library", ["brax", "jaxmarl", "pettingzoo"])
-def test_without_the_library_the_extra_is_named(library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_library_the_extra_is_named(
+    library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in [name for name in sys.modules if name.split(".")[0] == library]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(sys.modules, f"mqe_jax.adapters.{library}", raising=False)
-    refuses(rf"pip install 'mqe-jax\[{library}\]'", importlib.import_module, f"mqe_jax.adapters.{library}")
+    refuses(
+        rf"pip install 'mqe-jax\[{library}\]'",
+        importlib.import_module,
+        f"mqe_jax.adapters.{library}",
+    )
 
 
 def test_brax_knows_the_tasks_by_name() -> None:
     brax = adapter("brax")
-    env = importlib.import_module("brax.envs").get_environment("go1gate", impl="c", control="position")
+    env = importlib.import_module("brax.envs").get_environment(
+        "go1gate", impl="c", control="position"
+    )
     assert isinstance(env, brax.Env) and env.action_size == 24
 
 
 def test_jaxmarl_makes_the_tasks_and_still_its_own() -> None:
-    ours, jaxmarl = adapter("jaxmarl"), importlib.import_module("jaxmarl")
+    ours = adapter("jaxmarl")
+    jaxmarl = importlib.import_module("jaxmarl")
     ours.register()
     assert isinstance(jaxmarl.make("go1gate", impl="c", control="position"), ours.Env)
     assert jaxmarl.registered_envs.count("go1gate") == 1
@@ -180,7 +229,9 @@ def test_jaxmarl_makes_the_tasks_and_still_its_own() -> None:
 
 
 def test_jaxmarl_world_state_and_discrete_actions() -> None:
-    """The world state is the privileged observation; an integer sets one command to its limit, 0 none."""
+    """The world state is the privileged observation; an integer sets one command to its limit, 0
+    none.
+    """
     task = task_env("go1gate")
     env = adapter("jaxmarl").Env(task, discrete=True)
     _, state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
@@ -190,12 +241,18 @@ def test_jaxmarl_world_state_and_discrete_actions() -> None:
     assert space.n == 7
     table = [env._continuous(jnp.int32(i)) for i in range(7)]
     np.testing.assert_array_equal(table, [[0, 0, 0], *np.kron(np.eye(3), [[1], [-1]])])
-    integers = {agent: jnp.zeros(1, jnp.int32) for agent in env.agents}  # JaxMARL's MAPPO passes (1,)
-    assert jax.eval_shape(env.step_env, jax.random.PRNGKey(0), state, integers)[1].obs.shape == state.obs.shape
+    # JaxMARL's MAPPO passes (1,)
+    integers = {agent: jnp.zeros(1, jnp.int32) for agent in env.agents}
+    assert (
+        jax.eval_shape(env.step_env, jax.random.PRNGKey(0), state, integers)[1].obs.shape
+        == state.obs.shape
+    )
     assert jax.eval_shape(env.get_avail_actions, state)["robot_1"].shape == (7,)
 
 
-def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+def test_a_script_of_another_library_knows_the_tasks(
+    tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
     adapter("jaxmarl")
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "beside_it.py").write_text("CONTROL = 'position'\n")
@@ -215,7 +272,7 @@ def test_a_script_of_another_library_knows_the_tasks(tmp_path: Path, capsys: Any
             runpy.run_module("mqe_jax.adapters", run_name="__main__")
 
 
-# -- PettingZoo --------------------------------------------------------------------------------------------------------
+# -- PettingZoo
 
 SHORT: dict[str, Any] = {"episode_length": 5 * 0.02, "impl": "c"}
 
@@ -236,7 +293,9 @@ def test_parallel_api(task: str, zoo: Any) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_parallel_seed(task: str, zoo: Any) -> None:
-    own_test("parallel_seed_test")(functools.partial(zoo.parallel_env, task, **SHORT), num_cycles=10)
+    own_test("parallel_seed_test")(
+        functools.partial(zoo.parallel_env, task, **SHORT), num_cycles=10
+    )
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -272,18 +331,24 @@ def test_pettingzoo_knows_the_tasks_by_name(zoo: Any) -> None:
         zoo.register()
         env = pettingzoo.make("parallel", "mqe/go1sheep-easy-v0", impl="c", control="position")
     assert env.metadata["name"] == "go1sheep-easy"
-    assert {f"mqe/{task}-v0" for task in tasks()} <= set(pettingzoo.parallel_registry) & set(pettingzoo.aec_registry)
+    assert {f"mqe/{task}-v0" for task in tasks()} <= set(pettingzoo.parallel_registry) & set(
+        pettingzoo.aec_registry
+    )
 
 
 def test_a_copy_is_a_new_environment_with_the_same_settings(zoo: Any) -> None:
-    """Vectorisers copy environments by pickling them: copied generators would give all of them the same episodes."""
+    """Vectorisers copy environments by pickling them: copied generators would give all of them the
+    same episodes.
+    """
     env = zoo.parallel_env("go1wrestling", opponent="scripted", **SHORT)
     env.reset(seed=1)
     copies = [pickle.loads(pickle.dumps(env)) for _ in range(2)]
     assert copies[0].task is not env.task and copies[0].task.params == env.task.params
     one, other = (copy.reset()[0]["robot_0"] for copy in copies)
     assert (one != other).any()
-    np.testing.assert_array_equal(copies[0].reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"])
+    np.testing.assert_array_equal(
+        copies[0].reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"]
+    )
 
 
 def test_bad_input_is_named(zoo: Any) -> None:
@@ -294,11 +359,17 @@ def test_bad_input_is_named(zoo: Any) -> None:
     refuses("render_mode: 'human'", zoo.parallel_env, render_mode="human")
     with pytest.raises(InputError, match=r"max_cycles: -1 is not allowed; .* greater than 0"):
         zoo.parallel_env("go1gate", max_cycles=-1, impl="c", control="position")
-    refuses("episode_length: give either this or max_cycles", zoo.parallel_env, "go1gate", max_cycles=4, **SHORT)
+    refuses(
+        "episode_length: give either this or max_cycles",
+        zoo.parallel_env,
+        "go1gate",
+        max_cycles=4,
+        **SHORT,
+    )
     refuses("need the id of a task", zoo.parallel_env, env.task, max_cycles=4)
 
 
-# -- Examples of trainings with other libraries ------------------------------------------------------------------------
+# -- Examples of trainings with other libraries
 
 
 @pytest.mark.soak
@@ -316,7 +387,9 @@ def test_stable_baselines3_trains() -> None:
     for library in ("supersuit", "stable_baselines3"):
         pytest.importorskip(library)
     example = importlib.import_module("sb3_pettingzoo")
-    rows = example.train(example.vectorised("go1gate", impl="c", episode_length=0.5), 200, rollout=32)
+    rows = example.train(
+        example.vectorised("go1gate", impl="c", episode_length=0.5), 200, rollout=32
+    )
     assert rows[-1]["env_steps"] == 256 and rows[-1]["episode_length"] <= 25
 
 

@@ -38,7 +38,9 @@ def run_folder(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) 
     return folder
 
 
-def test_alone_it_says_what_to_do_first_and_its_version_on_request(capfd: pytest.CaptureFixture[str]) -> None:
+def test_alone_it_says_what_to_do_first_and_its_version_on_request(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     assert cli.main([]) == 0
     out = capfd.readouterr().out
     assert "mqe train go1gate" in out and "mqe render" in out
@@ -54,7 +56,9 @@ def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFi
     assert "usage: mqe" in capfd.readouterr().out
 
 
-def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_eval_prints_one_object_and_nothing_else(
+    run_folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["eval", str(run_folder), "--json", "--episodes", "6", "--num-envs", "4"]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert len(lines) == 1
@@ -64,12 +68,18 @@ def test_eval_prints_one_object_and_nothing_else(run_folder: Path, capfd: pytest
     assert {"success_rate", "average_step_reward", "terms"} <= set(result)
 
 
-def test_a_simple_policy_is_measured_and_dropped_contacts_are_counted(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_simple_policy_is_measured_and_dropped_contacts_are_counted(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     command = ["eval", "fake", "--json", "--episodes", "2", "--policy"]
     assert cli.main([*command, "forward"]) == 0  # two steps of each episode beyond x = 1.21 m
     out, err = capfd.readouterr()
     result = json.loads(out)
-    assert result["success_rate"] == 1.0 and result["policy"] == "forward" and not {"actions", "opponent"} & set(result)
+    assert (
+        result["success_rate"] == 1.0
+        and result["policy"] == "forward"
+        and not {"actions", "opponent"} & set(result)
+    )
     assert result["average_step_reward"] == pytest.approx(0.05) and result["overflow"] == 4
     assert [line for line in err.splitlines() if "dropped contacts in 4 environment steps" in line]
     assert cli.main([*command, "idle"]) == 0
@@ -77,8 +87,11 @@ def test_a_simple_policy_is_measured_and_dropped_contacts_are_counted(capfd: pyt
     assert json.loads(out)["overflow"] == 0 and "dropped" not in err
 
 
-def test_a_divergence_is_recorded_and_replayed(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
-    monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.19)  # in the tenth step of 0.02 s
+def test_a_divergence_is_recorded_and_replayed(
+    tmp_path: Path, monkeypatch: Any, capfd: Any
+) -> None:
+    # in the tenth step of 0.02 s
+    monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.19)
     monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
     task = ["go1gate", "--impl", "c", "--control", "position", "--policy", "random", "--json"]
     folder = ["--dump-diverged", str(tmp_path / "dump")]
@@ -94,9 +107,13 @@ def test_a_divergence_is_recorded_and_replayed(tmp_path: Path, monkeypatch: Any,
 
 
 def test_a_divergence_in_training_is_recorded(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
-    monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)  # in the second step
+    # in the second step
+    monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)
     (tmp_path / "small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
-    command = "train go1revolvingdoor --impl c --control position --run-dir run --config small.yaml --num-envs 4"
+    command = (
+        "train go1revolvingdoor --impl c --control position --run-dir run --config "
+        "small.yaml --num-envs 4"
+    )
     command += " --rollout-steps 2 --total-steps 4 --ppo.minibatches 1 --dump-diverged dump"
     assert cli.main(command.split()) == 0
     assert "recorded 2 divergences" in capfd.readouterr().err
@@ -106,7 +123,9 @@ def test_a_divergence_in_training_is_recorded(tmp_path: Path, monkeypatch: Any, 
         assert recording.actions.shape == (2, 2, 12)
 
 
-def test_bench_prints_its_figures(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_bench_prints_its_figures(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(FakeEnv, "overflow_x", -100.0)
     assert cli.main(["bench", "fake", "--json", "--num-envs", "2", "--steps", "3"]) == 0
     result = json.loads(capfd.readouterr().out)
@@ -116,22 +135,35 @@ def test_bench_prints_its_figures(monkeypatch: pytest.MonkeyPatch, capfd: pytest
     assert result["slowest"] <= result["env_steps_per_s"] <= result["fastest"]
 
 
-def test_the_best_of_several_episodes_is_rendered(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
+def test_the_best_of_several_episodes_is_rendered(
+    tmp_path: Path, monkeypatch: Any, capfd: Any
+) -> None:
     recorded = [
-        recording.Episode(np.zeros((n, 1)), np.zeros((n, 0, 3)), np.zeros((n, 0, 4)), 0.1, success, reward)
+        recording.Episode(
+            np.zeros((n, 1)), np.zeros((n, 0, 3)), np.zeros((n, 0, 4)), 0.1, success, reward
+        )
         for n, success, reward in ((6, 0.5, 2.0), (4, 1.0, 0.5), (5, 1.0, 1.0))
     ]
     rendered = []
     monkeypatch.setattr(recording, "record_episodes", lambda *arguments, **named: recorded)
-    monkeypatch.setattr(render, "render_episode", lambda env, episode, path, **named: rendered.append(episode) or "egl")
-    assert cli.main(["render", "fake", "-o", str(tmp_path / "clip.png"), "--best-of", "3", "--json"]) == 0
+    monkeypatch.setattr(
+        render,
+        "render_episode",
+        lambda env, episode, path, **named: rendered.append(episode) or "egl",
+    )
+    assert (
+        cli.main(["render", "fake", "-o", str(tmp_path / "clip.png"), "--best-of", "3", "--json"])
+        == 0
+    )
     said = json.loads(capfd.readouterr().out)
     assert [len(episode) for episode in rendered] == [5] and said["rendered"] == 2
     assert said["episodes"][1] == {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3}
 
 
 @pytest.mark.parametrize("command", ["eval", "render", "view"])
-def test_evaluation_clip_and_viewer_run_the_same_policy(command: str, run_folder: Path, monkeypatch: Any) -> None:
+def test_evaluation_clip_and_viewer_run_the_same_policy(
+    command: str, run_folder: Path, monkeypatch: Any
+) -> None:
     played: list[tuple[str, bool]] = []
 
     def load(source: str, env: Any = None, *, deterministic: bool = False) -> None:
@@ -149,7 +181,9 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(command: str, run_folder
     assert [policy for policy, _ in played[::2]] == [str(run_folder), "go1gate", "forward"]
 
 
-def test_set_keeps_the_other_parameters_of_a_run(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_set_keeps_the_other_parameters_of_a_run(
+    run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made: list[Any] = []
     config = override(build.run_config(str(run_folder)), {"env": {"rewards": {"collision": -5.0}}})
     monkeypatch.setattr(build, "run_config", lambda target: config)
@@ -159,26 +193,51 @@ def test_set_keeps_the_other_parameters_of_a_run(run_folder: Path, monkeypatch: 
         raise InputError("stop")
 
     monkeypatch.setattr(build, "make_env", make_env)
-    assert cli.main(["eval", str(run_folder), "--set", "rewards={success: 9}", "--set", "rewards={approach: 1}"]) == 2
+    assert (
+        cli.main(
+            [
+                "eval",
+                str(run_folder),
+                "--set",
+                "rewards={success: 9}",
+                "--set",
+                "rewards={approach: 1}",
+            ]
+        )
+        == 2
+    )
     assert made == [{"rewards": {"collision": -5.0, "success": 9, "approach": 1}}]
 
 
-def test_a_policy_of_another_task_is_refused_by_name(run_folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_policy_of_another_task_is_refused_by_name(
+    run_folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     for flag in ("--policy", "--opponent"):
         assert cli.main(["eval", "go1tug", flag, str(run_folder)]) == 2
         err = capfd.readouterr().err
-        assert err.startswith(f"mqe: {flag[2:]}: ") and "needs task 'fake'; the environment has 'go1tug'" in err
+        assert (
+            err.startswith(f"mqe: {flag[2:]}: ")
+            and "needs task 'fake'; the environment has 'go1tug'" in err
+        )
 
 
 def test_a_parameter_that_is_given_counts_in_training_too() -> None:
     tuned = build.base_config("go1sheep-easy", None)
-    assert tuned.training_env["rewards"]["failure"] == -10.0 and tuned.training_env["rewards"]["crossing"] == 10.0
+    assert (
+        tuned.training_env["rewards"]["failure"] == -10.0
+        and tuned.training_env["rewards"]["crossing"] == 10.0
+    )
     given = {"rewards.failure": 0.0, "frozen_time": 1.0}
-    parsed = parse_train(["go1sheep-easy", *(word for name, x in given.items() for word in ("--set", f"{name}={x}"))])
+    parsed = parse_train(
+        ["go1sheep-easy", *(word for name, x in given.items() for word in ("--set", f"{name}={x}"))]
+    )
     learnt = build.settings_of("go1sheep-easy", None, given)
     for settings in (build.for_task(x, "go1sheep-easy", given) for x in (parsed.settings, learnt)):
         trained = settings.training_env
-        assert trained["rewards"] == {**tuned.training_env["rewards"], "failure": 0.0} and trained["frozen_time"] == 1.0
+        assert (
+            trained["rewards"] == {**tuned.training_env["rewards"], "failure": 0.0}
+            and trained["frozen_time"] == 1.0
+        )
     both = build.settings_of("go1sheep-easy", {"train_env": {"rewards.failure": -5.0}}, given)
     assert build.for_task(both, "go1sheep-easy", given).training_env["rewards"]["failure"] == -5.0
 
@@ -190,26 +249,45 @@ def test_a_run_has_the_parameters_that_the_policy_to_start_from_needs() -> None:
 
 
 def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
-    parsed = parse_train(["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"])
+    parsed = parse_train(
+        ["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"]
+    )
     expected = {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
     assert parsed.settings == override(build.base_config("go1gate", "demo"), expected)
-    parsed = parse_train(["go1gate", "--network.name", "mat", "--network.heads", "2", "--checkpoint.no-environments"])
+    parsed = parse_train(
+        ["go1gate", "--network.name", "mat", "--network.heads", "2", "--checkpoint.no-environments"]
+    )
     assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
     assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"
-    flags = ["--ppo.critic-warmup", "0.02", "--network.symmetry-coef", "1", "--task.shove-length", "0.1", "2"]
+    flags = [
+        "--ppo.critic-warmup",
+        "0.02",
+        "--network.symmetry-coef",
+        "1",
+        "--task.shove-length",
+        "0.1",
+        "2",
+    ]
     for skill, (settings, task) in SETTINGS.items():
         parsed = parse_skill_train([skill, *flags])
-        assert parsed.settings == override(settings, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0})
+        assert parsed.settings == override(
+            settings, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0}
+        )
         assert parsed.task == override(task, {"shove_length": (0.1, 2.0)})
 
 
-@pytest.mark.parametrize("words", ["--run-dir go1tug", "--no-both-sides --run_dir go1tug", "--start go1tug"])
+@pytest.mark.parametrize(
+    "words", ["--run-dir go1tug", "--no-both-sides --run_dir go1tug", "--start go1tug"]
+)
 def test_the_task_comes_first(words: str, capfd: pytest.CaptureFixture[str]) -> None:
-    parsed, alone = parse_train(["go1gate", *words.split()]), parse_train(["go1gate"]).settings
+    parsed = parse_train(["go1gate", *words.split()])
+    alone = parse_train(["go1gate"]).settings
     assert parsed.target == "go1gate"
     assert override(parsed.settings, {"start": None, "both_sides": alone.both_sides}) == alone
     assert cli.main(["train", *words.split(), "go1gate"]) == 2
-    assert capfd.readouterr().err.startswith("mqe: task: is missing; it comes first: mqe train TASK --")
+    assert capfd.readouterr().err.startswith(
+        "mqe: task: is missing; it comes first: mqe train TASK --"
+    )
 
 
 START = """
@@ -221,10 +299,20 @@ class Missing:
 sys.meta_path.insert(0, Missing())
 from mqe_jax.cli import main
 assert main(["tasks"]) == 0 and main(["tasks", "--long"]) == 0 and main(["tasks", "--json"]) == 0
-for command in ("eval gogate", "view gogate", "render gogate -o a.gif", "bench gogate", "train gogate", "evl go1gate"):
-    assert main(command.split()) == 2
-for command in ("train go1gate --sed 1", "train go1gate --config demo --ppo.epoch 3", "train go1gate --config nobody",
-                "train go1tug --network.name mat --network.head 2", "eval go1gate --sed 1", "view go1gate --sed 1"):
+for command in (
+    "eval gogate",
+    "view gogate",
+    "render gogate -o a.gif",
+    "bench gogate",
+    "train gogate",
+    "evl go1gate",
+    "train go1gate --sed 1",
+    "train go1gate --config demo --ppo.epoch 3",
+    "train go1gate --config nobody",
+    "train go1tug --network.name mat --network.head 2",
+    "eval go1gate --sed 1",
+    "view go1gate --sed 1",
+):
     assert main(command.split()) == 2
 print({"jax", "mujoco"} & {*sys.modules})
 import mqe_jax
@@ -235,8 +323,13 @@ print(load_mjx().__name__)
 
 
 def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
-    """Importing them takes seconds. MJX's note that Warp is missing is not printed; Python's warnings are errors."""
-    done = subprocess.run([sys.executable, "-W", "error", "-c", START], capture_output=True, text=True, check=True)
+    """Importing them takes seconds.
+
+    MJX's note that Warp is missing is not printed; Python's warnings are errors.
+    """
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", START], capture_output=True, text=True, check=True
+    )
     first, *lines, last, late, name = done.stdout.splitlines()
     assert "Failed" not in done.stdout and (late, name) == ("set()", "mujoco.mjx")
     assert first.split() == ["task", "title", "robots", "sizes", "time,", "s"]
@@ -250,17 +343,27 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     assert long["go1plane"][-1] == "none"
     assert long["go1football-2vs2"][1:4] == ["2", "vs", "2"]
     errors = [line for line in done.stderr.splitlines() if line.startswith("mqe: ")]
-    assert len(errors) == 7 and all("did you mean" in line for line in errors[:6]) and "'nobody'" in errors[6]
+    assert (
+        len(errors) == 7
+        and all("did you mean" in line for line in errors[:6])
+        and "'nobody'" in errors[6]
+    )
     assert all(f"--{flag}" in done.stderr for flag in ("seed", "ppo.epochs", "network.heads"))
 
 
-def test_the_demo_resumes_only_what_has_begun(capfd: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+def test_the_demo_resumes_only_what_has_begun(
+    capfd: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
     monkeypatch.setattr(demo, "DEMO_TASK", "fake")
     small = "task: fake, num_envs: 4, rollout_steps: 8, total_steps: 64, checkpoint: {every: 1}"
     Path("small.yaml").write_text(f"{{{small}, network: {{recurrent: false}}}}")
     for _ in range(2):
-        assert cli.main(["demo", "--run-dir", "run", "--config", "small.yaml", "--episodes", "4"]) == 0
+        assert (
+            cli.main(["demo", "--run-dir", "run", "--config", "small.yaml", "--episodes", "4"]) == 0
+        )
         said = capfd.readouterr()
         assert "no checkpoint" not in said.err
-        assert re.search(r"after training:  both robots through [\d.]+% \([\d.]+ to [\d.]+%\)", said.out)
+        assert re.search(
+            r"after training:  both robots through [\d.]+% \([\d.]+ to [\d.]+%\)", said.out
+        )
     assert json.loads(Path("run/evaluation.json").read_text())["after"]["episodes"] == 4

@@ -21,15 +21,27 @@ pytestmark = pytest.mark.usefixtures("fake_tasks")
 
 BAD = {
     "command": (["trian", "fake"], ["'trian'", "did you mean 'train'"]),
-    "no command of a skill": (["walk"], ["unknown command 'walk'", "; allowed: walk train, walk eval, walk convert"]),
-    "command of a skill": (["walk", "evl"], ["'walk evl' (did you mean 'walk eval'?); allowed: walk train"]),
+    "no command of a skill": (
+        ["walk"],
+        ["unknown command 'walk'", "; allowed: walk train, walk eval, walk convert"],
+    ),
+    "command of a skill": (
+        ["walk", "evl"],
+        ["'walk evl' (did you mean 'walk eval'?); allowed: walk train"],
+    ),
     "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
     "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),
     "parameter": (["bench", "go1gate", "--set", "gate_wdth=1"], ["gate_wdth", "gate_width"]),
     "pair": (["bench", "fake", "--set", "gate_width"], ["'gate_width'", "KEY=VALUE"]),
-    "policy": (["eval", "fake", "--policy", "randm"], ["policy: unknown 'randm'", "random", "a run folder"]),
-    "file without its suffix": (["eval", "./fifo"], ["'./fifo' has no policy.safetensors", "*.safetensors"]),
+    "policy": (
+        ["eval", "fake", "--policy", "randm"],
+        ["policy: unknown 'randm'", "random", "a run folder"],
+    ),
+    "file without its suffix": (
+        ["eval", "./fifo"],
+        ["'./fifo' has no policy.safetensors", "*.safetensors"],
+    ),
     "control of a teacher": (
         ["train", "go1sheep-easy", "--control", "position"],
         ["imitation.teacher: 'scripted'", "'position'"],
@@ -40,36 +52,68 @@ BAD = {
         ["policy: 'scripted'", "'position'", "random"],
     ),
     "commands of scripted": (
-        ["eval", "go1gate", "--policy", "scripted", "--episodes", "2", "--set", "commands=[vy, vx, yaw_rate]"],
+        [
+            "eval",
+            "go1gate",
+            "--policy",
+            "scripted",
+            "--episodes",
+            "2",
+            "--set",
+            "commands=[vy, vx, yaw_rate]",
+        ],
         ["commands", "'vy', 'vx', 'yaw_rate'", "'vx', 'vy', 'yaw_rate'"],
     ),
     "run": (["eval", "runs/none"], ["runs/none"]),
     "no run": (["eval", "."], ["policy.safetensors"]),
     "config": (["train", "fake", "--config", "dmo"], ["'dmo'", "demo"]),
     "suffix": (["render", "fake", "-o", "clip.avi"], ["clip.avi", ".mp4, .webp, .gif, .png"]),
-    "frame rate of an image": (["render", "fake", "-o", "a.png", "--fps", "9"], ["fps: 9.0", "left out for a .png"]),
+    "frame rate of an image": (
+        ["render", "fake", "-o", "a.png", "--fps", "9"],
+        ["fps: 9.0", "left out for a .png"],
+    ),
     "run folder": (["train", "fake", "--run-dir", "/proc/none", *SMALL], ["run_dir", "/proc/none"]),
     "dump folder": (
-        ["eval", "go1plane", "--control", "position", "--episodes", "2", "--dump-diverged", "/proc/none"],
+        [
+            "eval",
+            "go1plane",
+            "--control",
+            "position",
+            "--episodes",
+            "2",
+            "--dump-diverged",
+            "/proc/none",
+        ],
         ["dump_diverged: /proc/none cannot be written"],
     ),
     "recording": (["replay", "none.npz"], ["none.npz"]),
     "policy to start from": (["train", "fake", *SMALL, "--start", "nope"], ["start: 'nope'"]),
-    "host": (["view", "go1plane", "--control", "position", "--host", "a..b"], ["host: 'a..b' is not allowed"]),
+    "host": (
+        ["view", "go1plane", "--control", "position", "--host", "a..b"],
+        ["host: 'a..b' is not allowed"],
+    ),
     "empty run folder": (
         ["train", "fake", *SMALL, "--run-dir", ""],
         ["run-dir: '' is not allowed; it must be not empty"],
     ),
     "long word": (["eval", "x" * 100_000], ["at most 4096 characters"]),
     "no text": (["eval", "a\udcff"], ["control character"]),
-    "task as a parameter": (["eval", "go1gate", "--set", "task=go1tug"], ["set.task: is not a task parameter"]),
-    "self as a parameter": (["eval", "go1gate", "--set", "self=3"], ["self: unknown name (value 3)"]),
+    "task as a parameter": (
+        ["eval", "go1gate", "--set", "task=go1tug"],
+        ["set.task: is not a task parameter"],
+    ),
+    "self as a parameter": (
+        ["eval", "go1gate", "--set", "self=3"],
+        ["self: unknown name (value 3)"],
+    ),
     "policy in a pipe": (["eval", "fake", "--policy", "./fifo"], ["not a regular file"]),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(
+    case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     os.mkfifo("fifo")
     os.mkfifo("fifo.yaml")
     arguments, said = BAD[case]
@@ -78,7 +122,8 @@ def test_bad_input_is_one_line_and_exit_code_2(case: str, tmp_path: Path, capfd:
     assert out == ""
     assert err.startswith("mqe: ") and err.count("\n") == 1 and len(err) < 4000, err
     assert all(word in err for word in said), err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo", "fifo.yaml"]  # nothing half-written
+    # nothing half-written
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo", "fifo.yaml"]
 
 
 OUTPUTS = {
@@ -92,18 +137,30 @@ OUTPUTS = {
 
 @pytest.mark.parametrize("name", OUTPUTS)
 @pytest.mark.parametrize("kind", ["in no folder", "folder", "device", "long", "below a file"])
-def test_an_output_is_checked_first(name: str, kind: str, tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
+def test_an_output_is_checked_first(
+    name: str, kind: str, tmp_path: Path, monkeypatch: Any, capfd: Any
+) -> None:
     monkeypatch.setattr(build, "make_env", lambda *_: pytest.fail("it was not checked first"))
-    monkeypatch.setattr("mqe_jax.policies.load_policy", lambda *_: pytest.fail("it was not checked first"))
+    monkeypatch.setattr(
+        "mqe_jax.policies.load_policy", lambda *_: pytest.fail("it was not checked first")
+    )
     os.mkfifo("fifo")
     words, suffix = OUTPUTS[name]
     Path(f"folder{suffix}").mkdir()
     os.mkfifo(f"device{suffix}")
     before = sorted(tmp_path.iterdir())
-    place = {"in no folder": "/proc/none/a", "long": "new/" + "a" * 300, "below a file": "fifo/new/a"}.get(kind, kind)
+    place = {
+        "in no folder": "/proc/none/a",
+        "long": "new/" + "a" * 300,
+        "below a file": "fifo/new/a",
+    }.get(kind, kind)
     assert cli.main([*words, place + suffix]) == 2
     error = capfd.readouterr().err
-    assert error.count("\n") == 1 and place in error and ("cannot be written" in error or "must be a file" in error)
+    assert (
+        error.count("\n") == 1
+        and place in error
+        and ("cannot be written" in error or "must be a file" in error)
+    )
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -119,14 +176,35 @@ def test_an_output_is_checked_first(name: str, kind: str, tmp_path: Path, monkey
         ["play-site", "nobody", "-o", "new/site"],
         ["play-site", "go1gate", "--libraries", ".", "-o", "new/site"],
         ["demo", "--run-dir", "new/demo", "--config", "nobody"],
-        ["train", "go1plane", *SMALL, "--control", "position", "--start", "go1gate", "--run-dir", "new/run"],
-        ["eval", "go1plane", "--episodes", "1", "--policy", "nobody", "--dump-diverged", "new/diverged"],
+        [
+            "train",
+            "go1plane",
+            *SMALL,
+            "--control",
+            "position",
+            "--start",
+            "go1gate",
+            "--run-dir",
+            "new/run",
+        ],
+        [
+            "eval",
+            "go1plane",
+            "--episodes",
+            "1",
+            "--policy",
+            "nobody",
+            "--dump-diverged",
+            "new/diverged",
+        ],
         ["sweep", "none.yaml", "--folder", "new/sweep"],
         ["report", "new/sweep"],
     ],
     ids=lambda words: " ".join(words[:2]),
 )
-def test_errors_leave_no_folders(arguments: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_errors_leave_no_folders(
+    arguments: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(arguments) == 2
     assert capfd.readouterr().err.splitlines()[-1].startswith("mqe: ")
     assert list(tmp_path.iterdir()) == []
@@ -137,7 +215,10 @@ def test_errors_leave_no_folders(arguments: list[str], tmp_path: Path, capfd: py
     [
         (["bench", "--nope", "3"], ["--nope"]),
         (["bench", "go1gate", "--num-envs", "0"], ["num_envs: 0", "greater than 0"]),
-        (["render", "fake", "-o", "a.png", "--width", "5000"], ["width: 5000", "less than or equal to 4096"]),
+        (
+            ["render", "fake", "-o", "a.png", "--width", "5000"],
+            ["width: 5000", "less than or equal to 4096"],
+        ),
         (["view", "go1gate", "--port", "99999"], ["port: 99999", "less than 65536"]),
         (["train", "fake", "--ppo.gamma", "2"], ["ppo: gamma: 2.0", "less than or equal to 1"]),
         (["train", "fake", "--ppo.clip", "much"], ["ppo.clip", "'much'"]),
@@ -147,7 +228,9 @@ def test_errors_leave_no_folders(arguments: list[str], tmp_path: Path, capfd: py
     ],
     ids=str,
 )
-def test_wrong_flags_are_named_by_tyro(arguments: list[str], said: list[str], tmp_path: Path, capfd: Any) -> None:
+def test_wrong_flags_are_named_by_tyro(
+    arguments: list[str], said: list[str], tmp_path: Path, capfd: Any
+) -> None:
     assert cli.main(arguments) == 2
     out, err = capfd.readouterr()
     shown = " ".join(err.replace("│", " ").split())
@@ -158,12 +241,22 @@ def test_wrong_flags_are_named_by_tyro(arguments: list[str], said: list[str], tm
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (NonFiniteError("run: update 3 made loss/value NaN"), 1, "run: update 3 made loss/value NaN"),
-        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/a"), 2, "run/a: No space left on device"),
+        (
+            NonFiniteError("run: update 3 made loss/value NaN"),
+            1,
+            "run: update 3 made loss/value NaN",
+        ),
+        (
+            OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/a"),
+            2,
+            "run/a: No space left on device",
+        ),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_what_ends_a_training_has_its_exit_code(error: Any, code: int, said: str, monkeypatch: Any, capfd: Any) -> None:
+def test_what_ends_a_training_has_its_exit_code(
+    error: Any, code: int, said: str, monkeypatch: Any, capfd: Any
+) -> None:
     monkeypatch.setattr(learning, "open_training", mock.Mock(side_effect=error))
     assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == code
     assert capfd.readouterr().err == f"mqe: {said}\n"
@@ -178,15 +271,22 @@ def test_what_ends_a_training_has_its_exit_code(error: Any, code: int, said: str
     ],
     ids=["our own", "KeyError", "ZeroDivisionError"],
 )
-def test_defects_keep_their_traceback(defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_defects_keep_their_traceback(
+    defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(build, "make_env", lambda *arguments: defect())
     with pytest.raises(error):
         cli.main(["bench", "fake"])
 
 
-@pytest.mark.parametrize(("name", "value"), [("JAX_ENABLE_X64", "maybe"), ("JAX_NUM_CPU_DEVICES", "many")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("JAX_ENABLE_X64", "maybe"), ("JAX_NUM_CPU_DEVICES", "many")]
+)
 def test_a_variable_that_jax_rejects_is_named(name: str, value: str) -> None:
     words = [sys.executable, "-m", "mqe_jax.cli", "zoo", "go1gate"]
     done = subprocess.run(words, env={**os.environ, name: value}, capture_output=True, text=True)
     assert done.returncode == 2 and done.stdout == ""
-    assert done.stderr.startswith(f"mqe: {name}: '{value}' is not allowed") and done.stderr.count("\n") == 1
+    assert (
+        done.stderr.startswith(f"mqe: {name}: '{value}' is not allowed")
+        and done.stderr.count("\n") == 1
+    )

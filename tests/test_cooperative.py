@@ -43,13 +43,18 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, gate_fres
     near = gate.rewards(Moment(state, after), Moment(state, close), jnp.array(False))
     assert float(near["crowding"]) == pytest.approx(2 / 0.2**2, rel=1e-4)
     closer = np.hypot(1.7, 0.03) - np.hypot(1.9, 0.15) + np.hypot(2.0, 1.1) - np.hypot(1.9, 1.15)
-    assert float(near["collision"]) == 0 and float(near["approach"]) == pytest.approx(closer, abs=1e-5)
+    assert float(near["collision"]) == 0 and float(near["approach"]) == pytest.approx(
+        closer, abs=1e-5
+    )
     assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
 
 
-def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv, gate_fresh: State) -> None:
+def test_gate_success_needs_both_through_and_no_failure(
+    gate: QuadrupedEnv, gate_fresh: State
+) -> None:
     state = dataclasses.replace(gate_fresh, anchors=jnp.array([[3.5, 0.0]]))
-    both, one = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]]), robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
+    both = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]])
+    one = robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
     fine = jnp.array(False)
     assert float(gate.outcome(state, both, fine)["success"]) == 1
     assert float(gate.outcome(state, both, ~fine)["success"]) == 0
@@ -59,19 +64,24 @@ def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv, gate
 
 def ground_height(env: Any, x: float, y: float) -> float:
     """Height of the ground or object below (x, y), m."""
-    model, data = env.compiled.model, mujoco.MjData(env.compiled.model)
+    model = env.compiled.model
+    data = mujoco.MjData(env.compiled.model)
     data.qpos[env.index.base_qpos[:, 2]] = 50.0
     mujoco.mj_kinematics(model, data)
     geom = np.zeros(1, np.int32)
-    return 5.0 - mujoco.mj_ray(model, data, np.array([x, y, 5.0]), np.array([0, 0, -1.0]), None, 1, -1, geom)
+    return 5.0 - mujoco.mj_ray(
+        model, data, np.array([x, y, 5.0]), np.array([0, 0, -1.0]), None, 1, -1, geom
+    )
 
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_endings(task: str) -> None:
-    env, step = made(task), stepper(task)
+    env = made(task)
+    step = stepper(task)
     pose = np.array(env.spawn_poses())
     height = [ground_height(env, x, y) + env.robot.stand_height + 0.01 for x, y, _ in pose]
-    position, euler = np.c_[pose[:, :2], height], np.c_[np.zeros((len(pose), 2)), pose[:, 2]]
+    position = np.c_[pose[:, :2], height]
+    euler = np.c_[np.zeros((len(pose), 2)), pose[:, 2]]
 
     after = step(placed(env, position, euler), still(env))
     assert not after.terminated and not after.truncated and not ending(after)
@@ -80,8 +90,10 @@ def test_endings(task: str) -> None:
     after = step(late, still(env))
     assert after.truncated and not after.terminated and ending(after) == ["time_limit"]
 
-    rolled, high = euler.copy(), position.copy()
-    rolled[-1, 0], high[-1, 2] = env.params.max_roll + 0.1, high[-1, 2] + 0.5
+    rolled = euler.copy()
+    high = position.copy()
+    rolled[-1, 0] = env.params.max_roll + 0.1
+    high[-1, 2] = high[-1, 2] + 0.5
     for start in (placed(env, high, rolled), placed(env, high, rolled, state=late)):
         after = step(start, still(env))
         assert after.terminated and ending(after) == ["fall"]
@@ -90,7 +102,8 @@ def test_endings(task: str) -> None:
 
     # The first robot's trunk lies across the second's: they touch.
     if len(pose) > 1:
-        touching, across = position.copy(), euler.copy()
+        touching = position.copy()
+        across = euler.copy()
         touching[0] = touching[1] + [0.0, 0.0, 0.09]
         across[0, 2] = pose[1, 2] + np.pi / 2
         bumped = step(placed(env, touching, across), still(env))
@@ -108,20 +121,27 @@ SPAWN = [[1.0, -0.75, 0.31], [1.0, 0.75, 0.31]]
 
 
 @pytest.mark.parametrize(("task", "ceiling"), [("go1gate", True), ("go1seesaw", False)])
-def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(task: str, ceiling: bool) -> None:
-    env, step = made(task), stepper(task)
+def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(
+    task: str, ceiling: bool
+) -> None:
+    env = made(task)
+    step = stepper(task)
     for height, euler, ends in (
         (0.9, angles(roll=(0.9, 0.0)), True),
         (0.9, angles(pitch=(1.2, 0.0)), False),
         (1.6, angles(), ceiling),
     ):
-        assert step(placed(env, [[1.0, -0.75, height], SPAWN[1]], euler), still(env)).terminated == ends
-    at_wall = placed(env, [[0.33, -0.75, 0.31], SPAWN[1]], angles(yaw=(np.pi, 0.0)))  # the head against the back wall
+        assert (
+            step(placed(env, [[1.0, -0.75, height], SPAWN[1]], euler), still(env)).terminated
+            == ends
+        )
+    # the head against the back wall
+    at_wall = placed(env, [[0.33, -0.75, 0.31], SPAWN[1]], angles(yaw=(np.pi, 0.0)))
     bumped = step(moving(env, at_wall, [-1.5, 0.0, 0.0]), still(env))
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
 
 
-# -- Climb on Seesaw ---------------------------------------------------------------------------------------------------
+# -- Climb on Seesaw
 
 
 env = pytest.fixture(scope="module")(lambda: made("go1seesaw"))
@@ -139,35 +159,51 @@ def angle(env: Any, state: State) -> float:
 
 
 def test_the_scene_is_as_listed(env: Any) -> None:
-    model, data = env.compiled.model, mujoco.MjData(env.compiled.model)
+    model = env.compiled.model
+    data = mujoco.MjData(env.compiled.model)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 16))
     start = np.asarray(states.data.qpos)[:, env.index.base_qpos[:, :3]]
-    assert np.abs(start - [[1.0, -0.75, 0.42], [1.0, 0.75, 0.42]]).max((0, 1)) == pytest.approx([0.1, 0.1, 0], abs=0.02)
+    assert np.abs(start - [[1.0, -0.75, 0.42], [1.0, 0.75, 0.42]]).max((0, 1)) == pytest.approx(
+        [0.1, 0.1, 0], abs=0.02
+    )
     assert env.params.gait == "pace" and env.params.episode_length == 10
-    assert env.compiled.layout.anchors == () and env._scene.track.length == 10 and env._scene.track.width == 3
+    assert (
+        env.compiled.layout.anchors == ()
+        and env._scene.track.length == 10
+        and env._scene.track.width == 3
+    )
 
-    plank, platform = env.objects["seesaw"], env.objects["platform"]
+    plank = env.objects["seesaw"]
+    platform = env.objects["platform"]
     data.qpos[:] = states.data.qpos[0]
     mujoco.mj_kinematics(model, data)
-    half, turn = model.geom_size[plank.geom], data.geom_xmat[plank.geom].reshape(3, 3)
-    ends = data.geom_xpos[plank.geom] + np.array([[-half[0], 0, half[2]], [half[0], 0, half[2]]]) @ turn.T
+    half = model.geom_size[plank.geom]
+    turn = data.geom_xmat[plank.geom].reshape(3, 3)
+    ends = (
+        data.geom_xpos[plank.geom]
+        + np.array([[-half[0], 0, half[2]], [half[0], 0, half[2]]]) @ turn.T
+    )
     assert 2 * half == pytest.approx([4.123, 1.0, 0.03])
     assert ends[0] == pytest.approx([3.5, 0.0, 0.02], abs=0.01)  # the near end: a step of 2 cm
-    assert ends[1] == pytest.approx([7.5, 0.0, 1.045], abs=0.01)  # the far end, just above the platform
-    low, high = (data.geom_xpos[platform.geom] + side * model.geom_size[platform.geom] for side in (-1, 1))
+    # the far end, just above the platform
+    assert ends[1] == pytest.approx([7.5, 0.0, 1.045], abs=0.01)
+    low = data.geom_xpos[platform.geom] + (-1) * model.geom_size[platform.geom]
+    high = data.geom_xpos[platform.geom] + 1 * model.geom_size[platform.geom]
     assert low == pytest.approx([7.5, -0.5, 0.97]) and high == pytest.approx([8.5, 0.5, 1.0])
 
 
 def test_observation(env: Any, fresh: State) -> None:
     both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], pitch=(-0.2, 0.0), yaw=(0.0, 0.4))
     obs = env.observation_layout.pack(env.observe(fresh, both))
-    first, second = [1, 2, 0.3, 0, -0.2, 0], [4, 5, 0.6, 0, 0, 0.4]
+    first = [1, 2, 0.3, 0, -0.2, 0]
+    second = [4, 5, 0.6, 0, 0, 0.4]
     np.testing.assert_allclose(obs, [[1, 0, *first, *second], [0, 1, *second, *first]], atol=1e-6)
     assert env.observation_size == 14
 
 
 def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
-    no, yes = jnp.array(False), jnp.array(True)
+    no = jnp.array(False)
+    yes = jnp.array(True)
     before = Moment(fresh, robot_state([[7.70, 0, 0.3], [3.90, 0, 0.3]]))
 
     def reward(after: RobotState, collision: Any = no) -> tuple[Any, Any]:
@@ -176,7 +212,8 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
         assert float(logged["average_step_reward"]) == float(total[0]) == float(total[1])
         return total[0], terms
 
-    # One stands on the platform: heights 1.3 + 0.45 - 0.56; ways 0.02 - 0.01; squares 0.01 + 0.04 - 0.5.
+    # One stands on the platform: heights 1.3 + 0.45 - 0.56; ways 0.02 - 0.01; squares 0.01 + 0.04 -
+    # 0.5.
     up = robot_state([[7.72, 0.1, 1.3], [3.89, -0.2, 0.45]])
     assert float(reward(up)[0]) == pytest.approx(10 + 1.19 + 5 * 0.01 + 0.5 * 0.45, abs=1e-4)
     assert float(reward(up, yes)[0]) == pytest.approx(11.465 - 2, abs=1e-4)
@@ -200,24 +237,35 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
 
 def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any, fresh: State) -> None:
     fine = jnp.array(False)
-    up, below = robot_state([[3.9, 0, 0.45], [8.0, 0, 1.3]]), robot_state([[3.9, 0, 0.45], [8.0, 0, 0.3]])
+    up = robot_state([[3.9, 0, 0.45], [8.0, 0, 1.3]])
+    below = robot_state([[3.9, 0, 0.45], [8.0, 0, 0.3]])
     assert float(env.outcome(fresh, up, fine)["success"]) == 1
     assert float(env.outcome(fresh, up, ~fine)["success"]) == 0
     assert float(env.outcome(fresh, below, fine)["success"]) == 0
     assert float(env.outcome(fresh, up, fine)["height"]) == pytest.approx(1.3)
 
 
-def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(env: Any, step: Any, fresh: State) -> None:
-    rolled = step(placed(env, [[1.0, -0.75, 1.6], SPAWN[1]], angles(roll=(0.9, 0.0)), state=fresh), still(env))
+def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(
+    env: Any, step: Any, fresh: State
+) -> None:
+    rolled = step(
+        placed(env, [[1.0, -0.75, 1.6], SPAWN[1]], angles(roll=(0.9, 0.0)), state=fresh), still(env)
+    )
     assert rolled.terminated and float(rolled.metrics["reward/fall"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
     low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)
     qpos = low.data.qpos.at[env.index.joint_qpos[0, 1::3]].set(np.pi)
     low = step(dataclasses.replace(low, data=low.data.replace(qpos=qpos)), still(env))
-    assert low.terminated and float(low.metrics["collision"]) == 0 and float(low.metrics["reward/fall"]) == 0
+    assert (
+        low.terminated
+        and float(low.metrics["collision"]) == 0
+        and float(low.metrics["reward/fall"]) == 0
+    )
 
 
-def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any, step: Any, fresh: State) -> None:
+def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(
+    env: Any, step: Any, fresh: State
+) -> None:
     def stand(first: Any, second: Any, pitch: Any) -> State:
         after = placed(env, [first, second], angles(pitch=pitch), state=fresh)
         for _ in range(30):

@@ -27,12 +27,22 @@ OTHER = Path(__file__).parents[1] / "results" / "cooperative" / "go1gate-seed10.
 
 
 def test_each_agent_does_what_its_own_policy_does_for_it() -> None:
-    """Of policies that are exchanged as arrays, of another architecture, and scripted ones; with recurrent states."""
+    """Of policies that are exchanged as arrays, of another architecture, and scripted ones; with
+    recurrent states.
+    """
     env = make("go1gate", impl="c", num_envs=1)
     trained: Any = load_policy("go1gate", env, deterministic=True)
-    changed = dataclasses.replace(trained, params=jax.tree.map(lambda x: 0.9 * jnp.asarray(x), trained.params))
-    policies = trained, load_policy("scripted", env), changed, load_policy(OTHER, env, deterministic=True)
-    obs, memories = jax.random.normal(KEY, (3, 2, 16)), [policy.initial_memory(3) for policy in policies]
+    changed = dataclasses.replace(
+        trained, params=jax.tree.map(lambda x: 0.9 * jnp.asarray(x), trained.params)
+    )
+    policies = (
+        trained,
+        load_policy("scripted", env),
+        changed,
+        load_policy(OTHER, env, deterministic=True),
+    )
+    obs = jax.random.normal(KEY, (3, 2, 16))
+    memories = [policy.initial_memory(3) for policy in policies]
     team = MixedTeam(policies, (0, 0))
     memory = team.initial_memory(3)
     both = jnp.array([*itertools.product(range(4), repeat=2)])
@@ -55,7 +65,9 @@ def test_each_agent_does_what_its_own_policy_does_for_it() -> None:
 
 
 def simple(*forward: float) -> SimplePolicy:
-    """A policy of the fake task, in which each robot moves by a tenth of a metre times its number a step."""
+    """A policy of the fake task, in which each robot moves by a tenth of a metre times its number a
+    step.
+    """
     action = jnp.array(forward)[:, None] * jnp.array([1.0, 0.0, 0.0])
     return SimplePolicy("fake", 2, lambda obs, key: jnp.tile(action, (len(obs), 1, 1)))
 
@@ -89,17 +101,31 @@ def test_tables_are_80_columns_wide_and_have_intervals(monkeypatch: pytest.Monke
     for text in (repr(shown), repr(standings)):
         assert max(map(len, text.splitlines())) <= 80
     assert f"{Estimate(*Rate.of(success[3, 20], 16)).text()}" in repr(shown)
-    found, pairs = shown.to_dict(), list(itertools.permutations(range(19), 2))
+    found = shown.to_dict()
+    pairs = list(itertools.permutations(range(19), 2))
     assert found["worst"]["value"] == min(success[pair] for pair in pairs)
     assert found["cross"]["value"] == pytest.approx(np.mean([success[pair] for pair in pairs]))
     assert "100 (100 to 100)" in repr(standings) and "cycles: 0 " in repr(standings)
 
 
 def test_a_cooperative_task_is_played_by_mixed_teams(tmp_path: Path, capfd: Any) -> None:
-    words = ["--impl", "c", "--set", "episode_length=0.1", "--control", "position", "--episodes", "2"]
+    words = [
+        "--impl",
+        "c",
+        "--set",
+        "episode_length=0.1",
+        "--control",
+        "position",
+        "--episodes",
+        "2",
+    ]
     assert cli.main(["tournament", "go1gate", "random", *words, "-o", str(tmp_path), "--json"]) == 0
     found = json.loads(capfd.readouterr().out)
-    assert found["policies"] == ["random"] and found["references"] == ["idle"] and found["worst"] is None
+    assert (
+        found["policies"] == ["random"]
+        and found["references"] == ["idle"]
+        and found["worst"] is None
+    )
     assert np.shape(found["success"]["value"]) == (2, 2)
     rows = (tmp_path / "tournament.csv").read_text().splitlines()
     assert rows[2].startswith("random,idle,2,0.0000,0.0000,0.6") and len(rows) == 5

@@ -1,4 +1,6 @@
-"""Several processes: functions that span those of a training, as an axis of `vmap`; objects pickled for another one."""
+"""Several processes: functions that span those of a training, as an axis of `vmap`; objects pickled
+for another one.
+"""
 
 import pickle
 import subprocess
@@ -41,7 +43,8 @@ def together(function: Callable[[Any], Any], count: int = 2) -> Callable[[Any], 
 
 def test_statistics_are_those_of_all_processes() -> None:
     random = np.random.default_rng(0)
-    x, mask = random.normal(2.0, 3.0, (2, 5, 7)).astype(np.float32), random.random((2, 5, 7)) < 0.7
+    x = random.normal(2.0, 3.0, (2, 5, 7)).astype(np.float32)
+    mask = random.random((2, 5, 7)) < 0.7
     x[~mask] = 1e6  # counts nowhere
     kept = np.ma.masked_array(x, ~mask)
     cases: Any = (
@@ -54,7 +57,9 @@ def test_statistics_are_those_of_all_processes() -> None:
     for function, expected in cases:
         found = np.asarray(jax.vmap(function, axis_name=devices.AXIS, axis_size=2)(x, mask))
         np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-5)
-        np.testing.assert_allclose(function(x.reshape(10, 7), mask.reshape(10, 7)), expected, rtol=1e-5)
+        np.testing.assert_allclose(
+            function(x.reshape(10, 7), mask.reshape(10, 7)), expected, rtol=1e-5
+        )
 
 
 def test_a_flag_of_one_process_is_true_for_all() -> None:
@@ -88,11 +93,17 @@ def test_random_numbers_belong_to_the_environment() -> None:
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_minibatches_are_the_same_sets(count: int) -> None:
     """Chunks (part, environment) of 8 environments in 4 groups; every chunk is in one minibatch."""
-    ppo, parts, envs = PPO(minibatches=3, groups=4), 6, 8
+    ppo = PPO(minibatches=3, groups=4)
+    parts = 6
+    envs = 8
 
     def chunk_sets(count: int) -> list[set[tuple[int, int]]]:
         own = envs // count
-        index = np.asarray(together(lambda key: minibatches(ppo, key, parts, own), count)(jnp.tile(KEY, (count, 1))))
+        index = np.asarray(
+            together(lambda key: minibatches(ppo, key, parts, own), count)(
+                jnp.tile(KEY, (count, 1))
+            )
+        )
         return [
             {(c // own, p * own + c % own) for p in range(count) for c in index[p, m].tolist()}
             for m in range(ppo.minibatches)
@@ -121,29 +132,45 @@ def test_one_group_is_one_permutation() -> None:
 def test_two_shares_are_one_batch(network: dict[str, Any]) -> None:
     ppo = {"epochs": 2, "minibatches": 2, "groups": 2}
     sizes = {"num_envs": 8, "rollout_steps": 8, "total_steps": 640, "ppo": ppo}
-    config = settings(**sizes, optimizer__target_kl=0.01, network={"name": "actor_critic", **network})
+    config = settings(
+        **sizes, optimizer__target_kl=0.01, network={"name": "actor_critic", **network}
+    )
     whole = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 8), config)
     share = make_learner(fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4), config, processes=2)
 
     def run(init: Callable[[Any], Any], update: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        init, update = jax.jit(init), jax.jit(update)
+        init = jax.jit(init)
+        update = jax.jit(update)
         return lambda key: update(update(init(key))[0])
 
     expected, metrics = run(whole.init, whole.update)(KEY)
     found, found_metrics = run(together(share.init), together(share.update))(jnp.tile(KEY, (2, 1)))
     learned = ("params", "optimizer", "obs_normalizer", "value_normalizer", "learning_rate", "key")
     for name in learned:
-        for one, two in zip(*(jax.tree.leaves(getattr(s, name)) for s in (expected, found)), strict=True):
-            np.testing.assert_allclose(two, np.broadcast_to(one, two.shape), rtol=1e-4, atol=1e-5, err_msg=name)
-    same = lambda two, one: np.testing.assert_allclose(two, np.full(2, one), rtol=1e-4, atol=1e-5)  # noqa: E731
+        for one, two in zip(
+            *(jax.tree.leaves(getattr(s, name)) for s in (expected, found)), strict=True
+        ):
+            np.testing.assert_allclose(
+                two, np.broadcast_to(one, two.shape), rtol=1e-4, atol=1e-5, err_msg=name
+            )
+
+    def same(two, one):
+        return np.testing.assert_allclose(two, np.full(2, one), rtol=1e-4, atol=1e-5)
+
     jax.tree.map(same, found_metrics, metrics)
-    qpos, own = expected.rollout.env_state.data.qpos, found.rollout.env_state.data.qpos
+    qpos = expected.rollout.env_state.data.qpos
+    own = found.rollout.env_state.data.qpos
     np.testing.assert_allclose(own.reshape(qpos.shape), qpos, atol=1e-5)
 
 
-@pytest.mark.parametrize(("count", "groups", "said"), [(3, 3, "ppo.groups: 3"), (2, 1, "ppo.groups: 1")])
+@pytest.mark.parametrize(
+    ("count", "groups", "said"), [(3, 3, "ppo.groups: 3"), (2, 1, "ppo.groups: 1")]
+)
 def test_groups_that_do_not_fit(count: int, groups: int, said: str) -> None:
-    config = build(TrainConfig, {"num_envs": 4, "rollout_steps": 4, "ppo": {"minibatches": 2, "groups": groups}})
+    config = build(
+        TrainConfig,
+        {"num_envs": 4, "rollout_steps": 4, "ppo": {"minibatches": 2, "groups": groups}},
+    )
     env = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 4 // count if count == 2 else 4)
     refuses(said, make_learner, env, config, processes=2 if count == 2 else 1)
 
@@ -172,7 +199,9 @@ def league() -> Any:
 BATCHES: dict[str, Callable[[], Any]] = {
     "vector": lambda: VectorEnv(made("go1plane"), 2),
     "deadline": lambda: Deadline(VectorEnv(made("go1plane"), 2)),
-    "demonstrated": lambda: Demonstrated(played("go1gate"), 2, load_policy("scripted", played("go1gate"))),
+    "demonstrated": lambda: Demonstrated(
+        played("go1gate"), 2, load_policy("scripted", played("go1gate"))
+    ),
     "versus": lambda: versus(matches(), ["go1wrestling", "scripted"]),
     "mirror": lambda: Mirror(matches()),
     "both sides": lambda: BothSides(matches()),
@@ -188,7 +217,9 @@ def test_batches(name: str) -> None:
     programs = []
     for each in (batch, copied(batch)):
         state = jax.eval_shape(each.reset, KEY)
-        programs.append(f"{jax.make_jaxpr(each.reset)(KEY)} {jax.make_jaxpr(each.step)(state, action)}")
+        programs.append(
+            f"{jax.make_jaxpr(each.reset)(KEY)} {jax.make_jaxpr(each.step)(state, action)}"
+        )
     assert programs[0] == programs[1]
 
 
@@ -205,7 +236,8 @@ def test_policies(name: str) -> None:
 @pytest.mark.soak
 def test_another_process_steps_environments_and_policies_alike(tmp_path: Path) -> None:
     """Gymnasium's copies keep their state."""
-    env, file = make("go1plane", num_envs=2, **PLANE), tmp_path / "all"
+    env = make("go1plane", num_envs=2, **PLANE)
+    file = tmp_path / "all"
     single = gymnasium.make("mqe/go1wrestling-v0", opponent="random", **PLANE)
     several = gymnasium.make_vec("mqe/go1plane-v0", num_envs=2, **PLANE)
     for each in (single, several):
@@ -218,7 +250,9 @@ def step(env, policy, *adapters):
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     action, _ = policy.act(state.obs[None], (), jax.random.PRNGKey(0))
     after = [np.asarray(jax.jit(env.step)(state, action[0]).data.qpos)]
-    return after + [each.step(np.full(each.action_space.shape, 0.1, np.float32))[0] for each in adapters]
+    for each in adapters:
+        after.append(each.step(np.full(each.action_space.shape, 0.1, np.float32))[0])
+    return after
 if __name__ == "__main__":
     file = pathlib.Path(sys.argv[1])
     file.write_bytes(pickle.dumps(step(*pickle.loads(file.read_bytes()))))

@@ -1,4 +1,6 @@
-"""The documentation's pages: their code, notebooks and examples run, their commands are parsed by the program."""
+"""The documentation's pages: their code, notebooks and examples run, their commands are parsed by
+the program.
+"""
 
 import functools
 import importlib
@@ -38,11 +40,32 @@ from tests.training import Stop
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted(
+    [
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        ROOT / "SECURITY.md",
+        *(ROOT / "docs").rglob("*.md"),
+    ]
+)
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 
 # First words of shell lines beside `mqe`; of `make` the target is checked, of `python` the file.
-SHELL = {"make", "python", "pip", "source", "bash", "export", "cd", "git", "ssh", "sudo", "apt-get", "tar", "jupyter"}
+SHELL = {
+    "make",
+    "python",
+    "pip",
+    "source",
+    "bash",
+    "export",
+    "cd",
+    "git",
+    "ssh",
+    "sudo",
+    "apt-get",
+    "tar",
+    "jupyter",
+}
 
 
 def read(page: str) -> str:
@@ -63,8 +86,12 @@ def test_drawings_are_made_from_the_code(tmp_path: Path, monkeypatch: pytest.Mon
     drawings = importlib.import_module("drawings")
     pages = "".join(map(read, NAMES))
     published = {file.stem for file in (ROOT / "docs" / "drawings").iterdir()}
-    assert published == {*drawings.DRAWINGS} and all(f"drawings/{name}.svg" in pages for name in published)
-    monkeypatch.setattr(drawings, "DRAWINGS", {name: drawings.DRAWINGS[name] for name in ("observation", "league")})
+    assert published == {*drawings.DRAWINGS} and all(
+        f"drawings/{name}.svg" in pages for name in published
+    )
+    monkeypatch.setattr(
+        drawings, "DRAWINGS", {name: drawings.DRAWINGS[name] for name in ("observation", "league")}
+    )
     for folder in ("a", "b"):
         drawings.main(tmp_path / folder)
     for file in (tmp_path / "a").iterdir():
@@ -72,20 +99,27 @@ def test_drawings_are_made_from_the_code(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("name", ["curves", "levers", "performance", "sizes", "students"])
-def test_charts_show_the_published_data(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawings, published = importlib.import_module("drawings"), read(f"docs/drawings/{name}.svg")
+def test_charts_show_the_published_data(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawings = importlib.import_module("drawings")
+    published = read(f"docs/drawings/{name}.svg")
     if f"Matplotlib v{matplotlib.__version__}," not in published:
         pytest.skip("another version of matplotlib drew them")
     monkeypatch.setattr(drawings, "DRAWINGS", {name: drawings.DRAWINGS[name]})
     drawings.main(tmp_path)
-    assert (tmp_path / f"{name}.svg").read_text(encoding="utf-8") == published, "run python tools/drawings.py"
+    assert (tmp_path / f"{name}.svg").read_text(encoding="utf-8") == published, (
+        "run python tools/drawings.py"
+    )
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Trainings of two updates and episodes of 20 steps, of examples as a user writes them, in an empty folder.
+    """Trainings of two updates and episodes of 20 steps, of examples as a user writes them, in an
+    empty folder.
 
-    After the check of their settings they all have the same ones, so that pages share compiled programs.
+    After the check of their settings they all have the same ones, so that pages share compiled
+    programs.
     """
     few: dict[str, Any] = {"num_envs": 8, "rollout_steps": 16, "total_steps": 256, "ppo.epochs": 1}
     few |= {"network": {"recurrent": False, "hidden_sizes": (8,)}}
@@ -107,7 +141,9 @@ def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tasks = {*TASKS}
     monkeypatch.setitem(NAMED_SCRIPTED, "go1tug", {})  # a page registers a policy
     if 'Robot("robot.onnx")' in read(page):  # which its commands write
-        graph = pytest.importorskip("mqe_jax.export.robot_graph").robot_onnx(load_policy("go1gate"), make("go1gate"))
+        graph = pytest.importorskip("mqe_jax.export.robot_graph").robot_onnx(
+            load_policy("go1gate"), make("go1gate")
+        )
         Path("robot.onnx").write_bytes(graph.SerializeToString())
     try:
         for block in blocks(read(page), "python"):
@@ -122,7 +158,13 @@ SOURCES = {
     for file in sorted((ROOT / "mqe_jax").rglob("*.py"))
 }
 EXPLOIT = {"config": "few.yaml", "total_steps": 256, "episodes": 4, "impl": "c"}
-WALKERS = {"num_envs": 4, "total_steps": 48, "rollout_steps": 12, "network": {"chunk_length": 6}, "ppo.minibatches": 1}
+WALKERS = {
+    "num_envs": 4,
+    "total_steps": 48,
+    "rollout_steps": 12,
+    "network": {"chunk_length": 6},
+    "ppo.minibatches": 1,
+}
 # Functions whose examples take minutes, with arguments that make them small.
 LONG: dict[str, dict[str, Any]] = {
     "exploitability": {**EXPLOIT, "seeds": [0]},
@@ -130,7 +172,14 @@ LONG: dict[str, dict[str, Any]] = {
     "train_skill": {"config": override(AGILE, WALKERS)},
     "evaluate_skill": {"episodes": 4},
 }
-SLOW = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_team", "export/policy", "export/site")
+SLOW = (
+    "runs/exploiting",
+    "walk/training",
+    "walk/evaluation",
+    "export/robot_team",
+    "export/policy",
+    "export/site",
+)
 
 
 @pytest.mark.usefixtures("small")
@@ -144,29 +193,41 @@ SLOW = ("runs/exploiting", "walk/training", "walk/evaluation", "export/robot_tea
 )
 def test_examples_of_docstrings_run(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(NAMED_SCRIPTED, "go1tug", {})  # one of them registers a policy
-    Path("few.yaml").write_text("{num_envs: 8, rollout_steps: 16, ppo: {epochs: 1}, network: {hidden_sizes: [8]}}")
+    Path("few.yaml").write_text(
+        "{num_envs: 8, rollout_steps: 16, ppo: {epochs: 1}, network: {hidden_sizes: [8]}}"
+    )
     for name, few in LONG.items():
         monkeypatch.setattr(mqe_jax, name, functools.partial(getattr(mqe_jax, name), **few))
     if module == "export/site":  # without npm
         monkeypatch.setattr("mqe_jax.export.site.add_libraries", lambda *_: None)
     if module == "export/robot_team":
         assert cli.main(["export", "go1gate", "--per-robot", "--onnx", "gate.onnx"]) == 0
-    for example in re.findall(r"^ +```python\n(.*?)^ +```", SOURCES[module], re.DOTALL | re.MULTILINE):
+    for example in re.findall(
+        r"^ +```python\n(.*?)^ +```", SOURCES[module], re.DOTALL | re.MULTILINE
+    ):
         exec(textwrap.dedent(example), {"mqe_jax": mqe_jax, "jax": jax})
 
 
 def test_everything_that_the_package_exports_has_an_example() -> None:
-    assert [name for name in mqe_jax.__all__ if "```python" not in getattr(mqe_jax, name).__doc__] == []
+    assert [
+        name for name in mqe_jax.__all__ if "```python" not in getattr(mqe_jax, name).__doc__
+    ] == []
 
 
 def test_every_reference_page_has_an_example() -> None:
-    modules = [name.replace(".", "/") for name in re.findall(r"reference/(\S+)\.md", read("mkdocs.yml"))]
+    modules = [
+        name.replace(".", "/") for name in re.findall(r"reference/(\S+)\.md", read("mkdocs.yml"))
+    ]
     found = [SOURCES[name] if name in SOURCES else SOURCES[f"{name}/__init__"] for name in modules]
-    assert [name for name, source in zip(modules, found, strict=True) if "```python" not in source] == []
+    assert [
+        name for name, source in zip(modules, found, strict=True) if "```python" not in source
+    ] == []
 
 
 def commands(text: str) -> list[list[str]]:
-    """The words of every line of the shell blocks of a text, and of every `mqe ...` in it, without comments."""
+    """The words of every line of the shell blocks of a text, and of every `mqe ...` in it, without
+    comments.
+    """
     lines = "\n".join(blocks(text, "bash")).replace("\\\n", " ").splitlines()
     lines += re.findall(r"`(mqe [^`]+)`", text)
     found = [shlex.split(line, comments=True) for line in dict.fromkeys(lines)]
@@ -201,7 +262,9 @@ def check_commands(text: str) -> None:
             continue
         program = words[0].rsplit("/", 1)[-1]
         if program == "mqe":
-            end = next((i for i, word in enumerate(words) if word in ("|", "&&", ">", "&")), len(words))
+            end = next(
+                (i for i, word in enumerate(words) if word in ("|", "&&", ">", "&")), len(words)
+            )
             assert accepted(words[:end]), words
         elif program == "make":
             assert words[1] in targets, words
@@ -218,14 +281,24 @@ def test_commands_on_pages_exist(page: str) -> None:
 
 @pytest.mark.parametrize("page", [name for name in NAMES if name != "SECURITY.md"])
 def test_a_page_begins_with_a_command_or_code_that_works(page: str) -> None:
-    """The first command has no placeholder, and reads no file or run that is not in the repository."""
+    """The first command has no placeholder, and reads no file or run that is not in the
+    repository.
+    """
     language, code = re.findall(r"^```(\w+)\n(.*?)^```", read(page), re.DOTALL | re.MULTILINE)[0]
     assert language in ("bash", "python")
     if language == "bash":
         words = commands(f"```bash\n{code}```")[0]
         assert [word for word in words if re.fullmatch(r"[A-Z][A-Z_:]+(\.\w+)?", word)] == []
-        read_paths = [b for a, b in itertools.pairwise(words) if "/" in b and a not in ("-o", "--run-dir", "--folder")]
-        assert [path for path in read_paths if not any(ROOT.glob(path)) and not path.startswith("population/")] == []
+        read_paths = [
+            b
+            for a, b in itertools.pairwise(words)
+            if "/" in b and a not in ("-o", "--run-dir", "--folder")
+        ]
+        assert [
+            path
+            for path in read_paths
+            if not any(ROOT.glob(path)) and not path.startswith("population/")
+        ] == []
 
 
 def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
@@ -233,8 +306,13 @@ def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
     pages = importlib.import_module("docs_pages").pages()
     for name, task in TASKS.items():
         assert pages[f"tasks/{name}.md"].startswith(f"# {task.title} (`{name}`)\n\n{task.aim}\n")
-        assert {"render", "train", "view"} == {words[1] for words in commands(pages[f"tasks/{name}.md"])}
-    for text in [*pages.values(), *(path.read_text(encoding="utf-8") for path in (ROOT / "mqe_jax").rglob("*.py"))]:
+        assert {"render", "train", "view"} == {
+            words[1] for words in commands(pages[f"tasks/{name}.md"])
+        }
+    for text in [
+        *pages.values(),
+        *(path.read_text(encoding="utf-8") for path in (ROOT / "mqe_jax").rglob("*.py")),
+    ]:
         check_commands(text)
 
 
@@ -243,15 +321,21 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocstrings")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "JAX_PLATFORMS": "cpu"}
-    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    built = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+    )
     assert built.returncode == 0 and "WARNING" not in built.stderr, built.stderr[-3000:]
     for name, task in TASKS.items():
         page = (tmp_path / "tasks" / f"{name}.html").read_text(encoding="utf-8")
         assert all(f"<code>{term}</code>" in page for term in vars(task.Params().rewards))
 
 
-def test_the_demo_makes_a_policy_of_its_real_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other tests of the demo have a task without physics, whose states hold all final observations."""
+def test_the_demo_makes_a_policy_of_its_real_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other tests of the demo have a task without physics, whose states hold all final
+    observations.
+    """
 
     def evaluated(task: str, policy: Any, **_: Any) -> None:
         assert (task, policy.task, policy.agents) == ("go1gate", "go1gate", 2)
@@ -288,14 +372,17 @@ def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: A
     keys = jax.random.split(jax.random.PRNGKey(0))
     scripted, idle = evaluator(jnp.array([1.0, 0.0]), 8, keys)
     assert scripted.success_rate >= 0.5 and idle.success_rate == 0
-    near, far = (example.flee(jnp.array([3.0, y]), jnp.array([3.0, 0.0]), speed=0.4) for y in (1.0, 2.0))
+    near = example.flee(jnp.array([3.0, 1.0]), jnp.array([3.0, 0.0]), speed=0.4)
+    far = example.flee(jnp.array([3.0, 2.0]), jnp.array([3.0, 0.0]), speed=0.4)
     np.testing.assert_allclose(near, [0, 0.4], atol=1e-6)
     np.testing.assert_allclose(far, [0, 0])
     pillar = env.env.compiled.model.geom("wall/pillar1")
     np.testing.assert_allclose(pillar.pos[:2], [2.5, 0.0])
 
 
-@pytest.mark.parametrize("network", [{}, {"network": {"name": "mean_field", "width": 32}}], ids=["shipped", "own"])
+@pytest.mark.parametrize(
+    "network", [{}, {"network": {"name": "mean_field", "width": 32}}], ids=["shipped", "own"]
+)
 def test_an_environment_of_ones_own_is_trained(network: dict[str, Any]) -> None:
     runpy.run_path(str(EXAMPLES / "custom_network.py"))
     try:
@@ -307,9 +394,23 @@ def test_an_environment_of_ones_own_is_trained(network: dict[str, Any]) -> None:
 
 def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "own_loop.py"))
-    few = {"num_envs": 4, "rollout_steps": 8, "total_steps": 64, "ppo.minibatches": 1, "network.hidden_sizes": [8]}
-    rewards = np.array(example["main"](seeds=2, updates=2, **few, curriculum={"demonstrator": None, "assistance": 0.0}))
-    assert rewards.shape == (2, 2) and np.isfinite(rewards).all() and (rewards[:, 0] != rewards[:, 1]).all()
+    few = {
+        "num_envs": 4,
+        "rollout_steps": 8,
+        "total_steps": 64,
+        "ppo.minibatches": 1,
+        "network.hidden_sizes": [8],
+    }
+    rewards = np.array(
+        example["main"](
+            seeds=2, updates=2, **few, curriculum={"demonstrator": None, "assistance": 0.0}
+        )
+    )
+    assert (
+        rewards.shape == (2, 2)
+        and np.isfinite(rewards).all()
+        and (rewards[:, 0] != rewards[:, 1]).all()
+    )
 
 
 @pytest.mark.soak
@@ -332,11 +433,14 @@ CLIPS = {"quickstart": 1, "tour": 2, "design_a_task": 1, "compare_algorithms": 0
 
 
 def run(path: Path) -> list[dict[str, Any]]:
-    """Runs a notebook in this process, which keeps compiled programs; returns its outputs by MIME type."""
+    """Runs a notebook in this process, which keeps compiled programs; returns its outputs by MIME
+    type.
+    """
     base = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell
     traitlets, capture = map(importlib.import_module, ("traitlets.config", "IPython.utils.capture"))
     interactive = type("Shell", (base,), {"enable_gui": lambda self, gui=None: None})
-    shell, values = interactive.instance(config=traitlets.Config({"HistoryManager": {"enabled": False}})), []
+    shell = interactive.instance(config=traitlets.Config({"HistoryManager": {"enabled": False}}))
+    values = []
     try:
         with capture.capture_output() as captured:
             for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
@@ -353,7 +457,11 @@ def run(path: Path) -> list[dict[str, Any]]:
 
 def check(outputs: list[dict[str, Any]], name: str) -> None:
     pages = [str(data["text/html"]) for data in outputs if "text/html" in data]
-    clips = [page for page in pages if "data:video/mp4;base64," in page or "data:image/gif;base64," in page]
+    clips = [
+        page
+        for page in pages
+        if "data:video/mp4;base64," in page or "data:image/gif;base64," in page
+    ]
     assert len(clips) == CLIPS[name] and all(len(clip) > 2000 for clip in clips)
     if name != "design_a_task":
         assert any("image/png" in data for data in outputs)
@@ -362,10 +470,15 @@ def check(outputs: list[dict[str, Any]], name: str) -> None:
 # The others do what the quickstart, the README and the example task do, at length.
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=() if path.stem == "quickstart" else pytest.mark.soak) for path in NOTEBOOKS],
+    [
+        pytest.param(path, marks=() if path.stem == "quickstart" else pytest.mark.soak)
+        for path in NOTEBOOKS
+    ],
     ids=lambda path: path.stem,
 )
-def test_notebooks_run_at_small_size(path: Path, tmp_path: Path, monkeypatch: Any, request: Any) -> None:
+def test_notebooks_run_at_small_size(
+    path: Path, tmp_path: Path, monkeypatch: Any, request: Any
+) -> None:
     monkeypatch.setenv("MQE_NOTEBOOK_SMALL", "1")
     if path.stem == "quickstart":  # as the README does
         request.getfixturevalue("small")

@@ -31,7 +31,8 @@ from tests import engines as comparison
 from tests.inputs import refuses
 from tests.states import made
 
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # for a few steps
+# for a few steps
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
 @pytest.mark.soak
@@ -48,12 +49,17 @@ def test_mjx_agrees_with_the_c_engine_over_20_steps(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_two_engines_return_the_same_shapes(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The task's code accepts the state of both; their physics, which takes seconds to trace, stands still."""
+    """The task's code accepts the state of both; their physics, which takes seconds to trace,
+    stands still.
+    """
     monkeypatch.setattr(Engine, "step", lambda self, data, ctrl, **_: (data, jnp.zeros((), bool)))
     shapes = []
     for env in (made(task), make(task, impl="jax", control="position", num_envs=2)):
-        batch, action = VectorEnv(env, 2), jnp.zeros((2, env.num_agents, 12))
-        state = jax.eval_shape(lambda key, b=batch, a=action: b.step(b.reset(key), a), jax.random.PRNGKey(0))
+        batch = VectorEnv(env, 2)
+        action = jnp.zeros((2, env.num_agents, 12))
+        state = jax.eval_shape(
+            lambda key, b=batch, a=action: b.step(b.reset(key), a), jax.random.PRNGKey(0)
+        )
         shapes.append(jax.tree.map(lambda x: x.shape, dataclasses.replace(state, data=None)))
     assert shapes[0] == shapes[1]
 
@@ -66,19 +72,36 @@ def test_two_engines_return_the_same_shapes(task: str, monkeypatch: pytest.Monke
     ],
 )
 def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any]) -> None:
-    env = make("go1plane", impl=impl, control="position", num_envs=3, num_agents=1, contacts="minimal", **limit)
+    env = make(
+        "go1plane",
+        impl=impl,
+        control="position",
+        num_envs=3,
+        num_agents=1,
+        contacts="minimal",
+        **limit,
+    )
 
     start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
-    qpos, qvel = np.array(start.data.qpos), np.zeros_like(start.data.qvel)
+    qpos = np.array(start.data.qpos)
+    qvel = np.zeros_like(start.data.qvel)
     qpos[:, env.index.base_qpos[0]] = [(1, 0, height, 1, 0, 0, 0) for height in (0.3, 1.3, 0.3)]
     qpos[:, env.index.joint_qpos[0]] = env.robot.default_joints
     qvel[:, env.index.base_qvel[0, 2]] = 0.0, 0.0, 3.0
-    start = dataclasses.replace(start, data=start.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)))
-    step = jax.jit(jax.vmap(env.step)).lower(start, jnp.zeros((3, 1, 12))).compile(compiler_options=QUICK)
+    start = dataclasses.replace(
+        start, data=start.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
+    )
+    step = (
+        jax.jit(jax.vmap(env.step))
+        .lower(start, jnp.zeros((3, 1, 12)))
+        .compile(compiler_options=QUICK)
+    )
     after = step(start, jnp.zeros((3, 1, 12)))
     assert after.metrics["overflow"].tolist() == [1.0, 0.0, 1.0]
     lifted = after.data.qpos.at[:, env.index.base_qpos[0, 2]].add(1.0)
-    after = step(dataclasses.replace(after, data=after.data.replace(qpos=lifted)), jnp.zeros((3, 1, 12)))
+    after = step(
+        dataclasses.replace(after, data=after.data.replace(qpos=lifted)), jnp.zeros((3, 1, 12))
+    )
     assert after.metrics["overflow"].tolist() == [0.0, 0.0, 0.0]  # of this step, not of one before
 
 
@@ -89,20 +112,30 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
         (5, None, private._NEWTON_OF, True),
         (5, False, private._NEWTON_OF, False),
         (3, True, private._NEWTON_OF, True),
-        (2, True, private._NEWTON_OF, "None or False: .* but those of 36 degrees of freedom are dense"),
+        (
+            2,
+            True,
+            private._NEWTON_OF,
+            "None or False: .* but those of 36 degrees of freedom are dense",
+        ),
         (5, None, "3.99.0", False),
         (5, True, "3.99.0", f"None or False: .* mujoco-mjx {private._NEWTON_OF}, not 3.99.0"),
     ],
 )
 def test_warp_skips_zeros_where_it_pays(
-    robots: int, asked: bool | None, version: str, found: bool | str, monkeypatch: pytest.MonkeyPatch
+    robots: int,
+    asked: bool | None,
+    version: str,
+    found: bool | str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def put_model(model: mujoco.MjModel, device: Any, impl: str) -> Any:
         option = SimpleNamespace(integrator=SimpleNamespace(name="EULER"))
         sparse = model.opt.jacobian == mujoco.mjtJacobian.mjJAC_AUTO
         return SimpleNamespace(nv=model.nv, opt=option, _impl=SimpleNamespace(is_sparse=sparse))
 
-    assert importlib.metadata.version("mujoco-mjx") == private._NEWTON_OF  # of another one compare the Newton step
+    # of another one compare the Newton step
+    assert importlib.metadata.version("mujoco-mjx") == private._NEWTON_OF
     monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
     monkeypatch.setattr(private, "load_mjx", lambda: SimpleNamespace(put_model=put_model))
     monkeypatch.setattr(private, "warp_is_installed", lambda: True)
@@ -127,17 +160,26 @@ def test_warp_skips_zeros_with_the_same_result(monkeypatch: pytest.MonkeyPatch) 
         calls.append(arguments)
         step(*arguments, **options)
 
-    after, calls, step = [], [], newton.step
+    after = []
+    calls = []
+    step = newton.step
     monkeypatch.setattr(newton, "step", counted)
     for sparse in (True, False):
         calls.clear()  # a model of the other kind in this process changes nothing
         options = {"num_envs": 2, "num_agents": 4, "sparse_solver": sparse}
         env: Any = make("go1football-1vs1", impl="warp", control="position", **options)
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
-        first, last = env.index.base_qpos[0, :3], env.index.base_qpos[3, :3]
-        qpos = state.data.qpos.at[1, last].set(state.data.qpos[1, first] + jnp.array([0.0, 0.05, 0.1]))
+        first = env.index.base_qpos[0, :3]
+        last = env.index.base_qpos[3, :3]
+        qpos = state.data.qpos.at[1, last].set(
+            state.data.qpos[1, first] + jnp.array([0.0, 0.05, 0.1])
+        )
         state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
-        walk = jax.jit(jax.vmap(env.step)).lower(state, jnp.zeros((2, 4, 12))).compile(compiler_options=QUICK)
+        walk = (
+            jax.jit(jax.vmap(env.step))
+            .lower(state, jnp.zeros((2, 4, 12)))
+            .compile(compiler_options=QUICK)
+        )
         for _ in range(4):
             state = walk(state, jnp.zeros((2, 4, 12)))
         after.append(np.asarray(state.data.qpos))
@@ -156,22 +198,29 @@ def called(function: Any, number: int, owner: Owner) -> Any:
 
 
 class _Stream:
-    """A stand-in for Warp's handle to a stream of JAX: any that is collected releases the stream."""
+    """A stand-in for Warp's handle to a stream of JAX: any that is collected releases the
+    stream.
+    """
 
     known: ClassVar[set[int]] = set()
 
     def __init__(self, address: int, owner: bool) -> None:
-        self.address, self.owner = address, owner
+        self.address = address
+        self.owner = owner
         self.known.add(address)
 
     def __del__(self) -> None:
         self.known.discard(self.address)
 
 
-def test_warp_keeps_a_stream_of_jax_when_an_old_handle_to_it_is_collected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warp_keeps_a_stream_of_jax_when_an_old_handle_to_it_is_collected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "warp", SimpleNamespace(Stream=_Stream))
     private.keep_streams.__wrapped__()
-    old, new, owned = _Stream(1, False), _Stream(1, False), _Stream(2, True)
+    old = _Stream(1, False)
+    new = _Stream(1, False)
+    owned = _Stream(2, True)
     del old, owned
     gc.collect()
     assert _Stream.known == {new.address}
@@ -217,7 +266,8 @@ def content(model: mujoco.MjModel) -> bytes:
 
 
 BIT = mujoco.mjtDisableBit
-FRICTION, PASSIVE = BIT.mjDSBL_FRICTIONLOSS, BIT.mjDSBL_SPRING | BIT.mjDSBL_DAMPER
+FRICTION = BIT.mjDSBL_FRICTIONLOSS
+PASSIVE = BIT.mjDSBL_SPRING | BIT.mjDSBL_DAMPER
 
 
 @pytest.mark.parametrize(
@@ -238,8 +288,10 @@ FRICTION, PASSIVE = BIT.mjDSBL_FRICTIONLOSS, BIT.mjDSBL_SPRING | BIT.mjDSBL_DAMP
 def test_warp_computes_no_terms_that_are_zero(
     part: str, attribute: str, fields: tuple[str, ...], unused: int, warp: _Mjx
 ) -> None:
-    xml = """<mujoco><option/><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
-      <tendon><fixed><joint joint="j" coef="1"/></fixed></tendon><actuator><motor joint="j"/></actuator></mujoco>"""
+    xml = """<mujoco><option/>
+      <worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>
+      <tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>
+      <actuator><motor joint="j"/></actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml.replace(f"<{part}", f"<{part} {attribute}", 1))
     before = content(model)
     engine = WarpEngine(model)
@@ -251,7 +303,9 @@ def test_warp_computes_no_terms_that_are_zero(
 
 @pytest.fixture(params=["handler", "callback"])
 def host(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both ways of calling a host function: by XLA's C interface and, where its version differs, by JAX's callback."""
+    """Both ways of calling a host function: by XLA's C interface and, where its version differs, by
+    JAX's callback.
+    """
     assert host_calls.FITS
     monkeypatch.setattr(host_calls, "FITS", request.param == "handler")
 
@@ -265,7 +319,8 @@ def test_a_host_function_gets_all_arguments_as_one_batch_that_it_cannot_change()
         return x + y
 
     owner = Owner()
-    x, y = jnp.arange(6.0).reshape(2, 3), jnp.array([[1, 2, 3], [4, 5, 6]], jnp.int32)
+    x = jnp.arange(6.0).reshape(2, 3)
+    y = jnp.array([[1, 2, 3], [4, 5, 6]], jnp.int32)
     np.testing.assert_array_equal(called(add, 1, owner)(x, y), x + y)
     assert seen == [((2, 3), "int32", False)]
 
@@ -289,7 +344,8 @@ def test_what_a_host_function_raises_ends_the_program() -> None:
 
 
 def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mqe_jax.physics.engines.host_call._owners", {})  # no other environment of this physics
+    # no other environment of this physics
+    monkeypatch.setattr("mqe_jax.physics.engines.host_call._owners", {})
     seen: list[Any] = []
 
     def walk() -> Any:
@@ -298,8 +354,11 @@ def test_a_program_outlives_its_environment(monkeypatch: pytest.MonkeyPatch) -> 
 
         def run(key: jax.Array) -> jax.Array:
             state = jax.vmap(env.reset)(jax.random.split(key, 3))
-            step, action = jax.vmap(env.step), jnp.zeros((3, 2, 12))
-            return jax.lax.scan(lambda state, _: (step(state, action), ()), state, None, 100)[0].data.qpos
+            step = jax.vmap(env.step)
+            action = jnp.zeros((3, 2, 12))
+            return jax.lax.scan(lambda state, _: (step(state, action), ()), state, None, 100)[
+                0
+            ].data.qpos
 
         return run
 
@@ -328,22 +387,36 @@ print(hits.count("cache_hits"), hits.count("cache_misses"), float(state.data.qpo
 
 @pytest.mark.soak
 def test_a_second_process_compiles_no_step_of_the_c_engine(tmp_path: Path) -> None:
-    keep = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    keep = {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
     run = [sys.executable, "-c", SECOND_START]
     first, second = (
-        subprocess.run(run, env={**os.environ, **keep}, capture_output=True, text=True, check=True).stdout.split()
+        subprocess.run(
+            run, env={**os.environ, **keep}, capture_output=True, text=True, check=True
+        ).stdout.split()
         for _ in range(2)
     )
-    assert int(first[1]) >= 2 and int(second[1]) == 0 and int(second[0]) == int(first[0]) + int(first[1])
+    assert (
+        int(first[1]) >= 2
+        and int(second[1]) == 0
+        and int(second[0]) == int(first[0]) + int(first[1])
+    )
     assert first[2] == second[2]
 
 
 @pytest.mark.parametrize(
-    "task", ["go1plane", *(pytest.param(task, marks=pytest.mark.soak) for task in TASKS if task != "go1plane")]
+    "task",
+    [
+        "go1plane",
+        *(pytest.param(task, marks=pytest.mark.soak) for task in TASKS if task != "go1plane"),
+    ],
 )
 def test_reset_and_step_are_lowered_for_a_tpu(task: str) -> None:
     env = make(task, impl="jax", num_envs=2)
-    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    reset = jax.jit(jax.vmap(env.reset))
+    step = jax.jit(jax.vmap(env.step))
     key = jax.ShapeDtypeStruct((2, 2), jnp.uint32)
     action = jax.ShapeDtypeStruct((2, env.num_agents, env.action_size), jnp.float32)
     for exported in (
@@ -354,7 +427,9 @@ def test_reset_and_step_are_lowered_for_a_tpu(task: str) -> None:
 
 
 def test_a_program_that_still_runs_at_the_end_of_the_interpreter_is_awaited() -> None:
-    """Otherwise XLA's thread would call Python while it is finalised, which ends the process with SIGSEGV."""
+    """Otherwise XLA's thread would call Python while it is finalised, which ends the process with
+    SIGSEGV.
+    """
     code = """
 import time
 import jax, numpy as np
@@ -366,8 +441,12 @@ def slow(x):
     time.sleep(0.02)
     return x + 1
 shape = jax.ShapeDtypeStruct((300, 300), np.float32)
-f = jax.jit(lambda x: jax.lax.fori_loop(0, 40, lambda i, x: host_call(1, owner, slow, shape, [x @ x]), x))
+def call(i, x):
+    return host_call(1, owner, slow, shape, [x @ x])
+f = jax.jit(lambda x: jax.lax.fori_loop(0, 40, call, x))
 running = f(np.zeros((300, 300), np.float32))
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+    )
     assert ended.returncode == 0, ended.stderr

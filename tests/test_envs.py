@@ -1,4 +1,6 @@
-"""The tasks' contract, and what all environments share: parameters, actions, observations and recordings."""
+"""The tasks' contract, and what all environments share: parameters, actions, observations and
+recordings.
+"""
 
 import dataclasses
 import subprocess
@@ -12,7 +14,16 @@ import pytest
 
 import mqe_jax
 from mqe_jax.core.errors import InputError
-from mqe_jax.envs import TASKS, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task, replay
+from mqe_jax.envs import (
+    TASKS,
+    QuadrupedEnv,
+    State,
+    TaskParams,
+    VectorEnv,
+    make,
+    register_task,
+    replay,
+)
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.envs.observation import Block, ObservationLayout, by_entity, entities, image
 from mqe_jax.envs.plane import Go1Plane
@@ -33,7 +44,11 @@ def test_the_registry_lists_what_the_environment_has(task: str) -> None:
     env = make(task, impl="c", num_envs=1)
     sizes = env.observation_size, env.privileged_observation_size, env.params.episode_length
     assert (env.title, tuple(map(len, env.teams)), *sizes) == SHIPPED[task][2:-1]
-    allowed = [number for number in range(1, 66) if accepts(env.Params, number)] if env.variable_num_agents else []
+    allowed = (
+        [number for number in range(1, 66) if accepts(env.Params, number)]
+        if env.variable_num_agents
+        else []
+    )
     assert SHIPPED[task].sizes == ((allowed[0], allowed[-1]) if allowed else None)
 
 
@@ -44,7 +59,9 @@ def accepts(params: Any, num_agents: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize(("count", "steps"), [(4, 100), pytest.param(32, 1000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    ("count", "steps"), [(4, 100), pytest.param(32, 1000, marks=pytest.mark.soak)]
+)
 @pytest.mark.parametrize(("task", "robot", "control"), engines.covering(), ids=str)
 def test_contract(task: str, robot: str, control: str, count: int, steps: int) -> None:
     """Random steps: shapes, finite numbers, same key same result, one trace, clean auto-reset.
@@ -60,8 +77,16 @@ def test_contract(task: str, robot: str, control: str, count: int, steps: int) -
     def step(state: State, key: Array) -> tuple[State, Array]:
         traces.append(1)
         state = batch.step(state, jax.random.uniform(key, shape, minval=-1.0))
-        shown = (state.obs, state.final_obs, state.privileged_obs, state.reward, *state.metrics.values())
-        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in (*shown, state.data.qpos, state.data.qvel)]
+        shown = (
+            state.obs,
+            state.final_obs,
+            state.privileged_obs,
+            state.reward,
+            *state.metrics.values(),
+        )
+        finite = [
+            jnp.all(jnp.isfinite(leaf)) for leaf in (*shown, state.data.qpos, state.data.qvel)
+        ]
         return state, jnp.all(jnp.stack(finite))
 
     reset = jax.jit(batch.reset)
@@ -75,7 +100,9 @@ def test_contract(task: str, robot: str, control: str, count: int, steps: int) -
 
     state = play()
     jax.tree.map(np.testing.assert_array_equal, state, play())
-    one, other = (np.asarray(step(state, key)[0].data.qvel[:, env.index.joint_qvel]) for key in keys[10:12])
+    one, other = (
+        np.asarray(step(state, key)[0].data.qvel[:, env.index.joint_qvel]) for key in keys[10:12]
+    )
     assert np.abs(one - other).max() > 1e-3, "actions have no effect"
     assert env.observation_size == sum(block.width for block in env.observation_layout.blocks)
     assert [agent for team in env.teams for agent in team] == list(range(env.num_agents))
@@ -92,13 +119,18 @@ def test_contract(task: str, robot: str, control: str, count: int, steps: int) -
     assert ended[::2].all() and not ended.all()
     np.testing.assert_array_equal(np.asarray(state.step) == 0, ended)
     assert np.all(np.abs(np.asarray(state.obs - state.final_obs)).max((1, 2))[ended] > 0)
-    for now, last in ((state.obs, state.final_obs), (state.privileged_obs, state.final_privileged_obs)):
-        same = np.all(np.isclose(now, last, atol=1e-5).reshape(count, -1), axis=1)  # computed twice, so up to rounding
+    for now, last in (
+        (state.obs, state.final_obs),
+        (state.privileged_obs, state.final_privileged_obs),
+    ):
+        # computed twice, so up to rounding
+        same = np.all(np.isclose(now, last, atol=1e-5).reshape(count, -1), axis=1)
         np.testing.assert_array_equal(same, ~ended)
     spawned = np.asarray(state.data.qpos)[ended][:, env.index.base_qpos[:, 2]]
     np.testing.assert_allclose(spawned, env.params.spawn_height, atol=1e-6)
 
-    fine, diverged = [], []
+    fine = []
+    diverged = []
     for key in keys[11:]:
         state, finite = step(state, key)
         fine.append(finite)
@@ -107,28 +139,47 @@ def test_contract(task: str, robot: str, control: str, count: int, steps: int) -
     assert len(traces) == 1
 
 
-def test_a_diverged_environment_ends_and_is_counted(gate: QuadrupedEnv, fresh: State, gate_step: Any) -> None:
+def test_a_diverged_environment_ends_and_is_counted(
+    gate: QuadrupedEnv, fresh: State, gate_step: Any
+) -> None:
     state = fresh
-    broken = dataclasses.replace(state, data=state.data.replace(qvel=state.data.qvel.at[0].set(jnp.nan)))
+    broken = dataclasses.replace(
+        state, data=state.data.replace(qvel=state.data.qvel.at[0].set(jnp.nan))
+    )
     after = gate_step(broken, jnp.zeros((2, 12)))
     assert after.terminated and float(after.metrics["diverged"]) == 1
     assert np.all(np.asarray(after.reward) == 0) and np.isfinite(after.obs).all()
     last = dataclasses.replace(broken, step=jnp.int32(gate.max_steps - 1))
-    ended = [gate_step(start, jnp.zeros((2, 12))) for start in (last, dataclasses.replace(last, data=state.data))]
-    assert [ending(state) for state in (after, *ended)] == [["divergence"], ["divergence"], ["time_limit"]]
-    assert [(bool(s.terminated), bool(s.truncated)) for s in ended] == [(True, False), (False, True)]  # never both
+    ended = [
+        gate_step(start, jnp.zeros((2, 12)))
+        for start in (last, dataclasses.replace(last, data=state.data))
+    ]
+    assert [ending(state) for state in (after, *ended)] == [
+        ["divergence"],
+        ["divergence"],
+        ["time_limit"],
+    ]
+    # never both
+    assert [(bool(s.terminated), bool(s.truncated)) for s in ended] == [
+        (True, False),
+        (False, True),
+    ]
     bad = gate_step(state, jnp.full((2, 12), jnp.nan))
     assert bad.terminated and float(bad.metrics["diverged"]) == 1
     assert np.isfinite(np.asarray(bad.data.qpos)).all()
 
 
 def test_a_robot_that_takes_no_part_counts_nowhere(gate: QuadrupedEnv, gate_step: Any) -> None:
-    """It lies on its back, past the gate: it neither ends the episode nor is rewarded, and does not act."""
+    """It lies on its back, past the gate: it neither ends the episode nor is rewarded, and does not
+    act.
+    """
     state = placed(gate, [[1.0, -0.5, 0.3], [6.0, 0.5, 0.3]], euler=[[0, 0, 0], [np.pi, 0, 0]])
     out = dataclasses.replace(state, active=jnp.array([True, False]))
-    still, moved = jnp.zeros((2, 12)), jnp.zeros((2, 12)).at[1].set(1.0)
+    still = jnp.zeros((2, 12))
+    moved = jnp.zeros((2, 12)).at[1].set(1.0)
     assert ending(gate_step(state, still)) == ["fall"]
-    after, other = gate_step(out, still), gate_step(out, moved)
+    after = gate_step(out, still)
+    other = gate_step(out, moved)
     assert ending(after) == [] and not after.terminated and after.active.tolist() == [True, False]
     np.testing.assert_array_equal(after.data.qpos, other.data.qpos)
     assert float(after.reward[1]) == 0 and not after.obs[1].any() and after.obs[0].any()
@@ -141,26 +192,39 @@ def test_only_the_agents_trunks_count_as_collisions(monkeypatch: pytest.MonkeyPa
 
     @jax.jit
     def collides(state: State, force: Array) -> Array:
-        monkeypatch.setattr(env, "read", lambda *of: dataclasses.replace(read(*of), trunk_force=force))
+        monkeypatch.setattr(
+            env, "read", lambda *of: dataclasses.replace(read(*of), trunk_force=force)
+        )
         return env.step(state, jnp.zeros((2, 12))).metrics["collision"]
 
-    forces = {(100.0, 0.0, 0.0): 1, (0.0, 100.0, 0.0): 1, (0.0, 0.0, 100.0): 0}  # the third robot is the defender
+    # the third robot is the defender
+    forces = {(100.0, 0.0, 0.0): 1, (0.0, 100.0, 0.0): 1, (0.0, 0.0, 100.0): 0}
     assert {force: int(collides(initial(env), jnp.array(force))) for force in forces} == forces
 
 
-def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(gate: QuadrupedEnv, fresh: State) -> None:
+def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(
+    gate: QuadrupedEnv, fresh: State
+) -> None:
     ended = dataclasses.replace(fresh, truncated=jnp.array(True))
     after = jax.jit(lambda state: autoreset(gate, state))(ended)
-    assert int(after.step) == 0 and np.abs(np.asarray(after.data.qpos - fresh.data.qpos)).max() > 1e-3
+    assert (
+        int(after.step) == 0 and np.abs(np.asarray(after.data.qpos - fresh.data.qpos)).max() > 1e-3
+    )
     for key in (after.key, ended.key):
         assert np.abs(np.asarray(jax.jit(gate.reset)(key).data.qpos - after.data.qpos)).max() > 1e-3
 
 
 BOTH = ("walk", "agile")
 RANGES: list[tuple[dict[str, Any], str]] = [
-    ({"vz": (-1, 1)}, r"command_ranges: unknown command 'vz' .did you mean 'v.'.*allowed: vx, vy, yaw_rate"),
+    (
+        {"vz": (-1, 1)},
+        r"command_ranges: unknown command 'vz' .did you mean 'v.'.*allowed: vx, vy, yaw_rate",
+    ),
     ({"roll": (-0.1, 0.1)}, r"command_ranges: unknown command 'roll'.*allowed: vx, vy, yaw_rate"),
-    ({"vx": (0.5, 1.0)}, r"command_ranges.vx: \(0.5, 1.0\) .*lowest < highest, with the default 0 between"),
+    (
+        {"vx": (0.5, 1.0)},
+        r"command_ranges.vx: \(0.5, 1.0\) .*lowest < highest, with the default 0 between",
+    ),
     ({"vx": (-1.0, -0.5)}, r"command_ranges.vx: .*default 0 between"),
     ({"vx": (0.0, 0.0)}, r"command_ranges.vx: .*lowest < highest"),
     ({"vx": (1.0, -1.0)}, r"command_ranges.vx: .*\(lowest, highest\), in this order"),
@@ -173,35 +237,67 @@ RANGES: list[tuple[dict[str, Any], str]] = [
 ]
 """Command ranges of the revolving door that are refused, and what is said."""
 REFUSED: list[tuple[str, dict[str, Any], str]] = [
-    ("go1gat", {}, r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\); allowed: go1plane, go1gate"),
+    (
+        "go1gat",
+        {},
+        r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\); allowed: go1plane, go1gate",
+    ),
     ("go1gate", {"impl": "mjx"}, r"impl: unknown engine 'mjx'.*allowed: auto, warp, c, jax"),
-    ("go1gate", {"control": "comand"}, r"control: unknown mode 'comand' \(did you mean 'command'\?\)"),
+    (
+        "go1gate",
+        {"control": "comand"},
+        r"control: unknown mode 'comand' \(did you mean 'command'\?\)",
+    ),
     ("go1gate", {"gate_widht": 1.0}, r"gate_widht: unknown name .*did you mean 'gate_width'"),
     ("go1gate", {"gate_width": 4.0}, r"gate_width: 4.0 .* less than the width of the track, 3.0"),
     ("go1gate", {"gate_random": (0.5, -0.1)}, r"gate_random: \(0.5, -0.1\)|gate_random.*-0.1"),
-    ("go1gate", {"randomization": {"payload": (-9, 1)}}, r"randomization.payload: .*mass of the trunk"),
+    (
+        "go1gate",
+        {"randomization": {"payload": (-9, 1)}},
+        r"randomization.payload: .*mass of the trunk",
+    ),
     (
         "go1gate",
         {"control": "torque", "randomization": {"motor_offset": 0.1}},
         r"randomization.motor_offset: 0.1 .*0 with control torque",
     ),
-    ("go1plane", {"randomization": {"joint_mechanics": (0.5, 2.0)}}, "randomization.joint_mechanics"),
+    (
+        "go1plane",
+        {"randomization": {"joint_mechanics": (0.5, 2.0)}},
+        "randomization.joint_mechanics",
+    ),
     ("go1seesaw", {"plank_start": -0.3}, r"plank_start: -0.3 .*within \+-plank.limit"),
     ("go1revolvingdoor", {"gap": 1.5}, r"door.size: .*narrower than the gap, 1.5"),
     ("go1bridge", {"platform_x": (3.0, 4.0)}, r"platform_x: .*more than a platform's length"),
-    ("go1tug", {"num_agents": 3}, r"num_agents: 3 is not allowed; it must be 2, the size of go1tug"),
+    (
+        "go1tug",
+        {"num_agents": 3},
+        r"num_agents: 3 is not allowed; it must be 2, the size of go1tug",
+    ),
     ("go1plane", {"gait": "gallop"}, r"gait: unknown name 'gallop'"),
     ("go1plane", {"skill_weights": "/nowhere"}, r"walk policy: no file /nowhere"),
     ("go1plane", {"skill": ("walk", "agil")}, r"skill: unknown name 'agil' .did you mean 'agile'"),
-    ("go1plane", {"skill": ("walk", "walk")}, r"skill: \('walk', 'walk'\) is not allowed; .* several distinct names"),
+    (
+        "go1plane",
+        {"skill": ("walk", "walk")},
+        r"skill: \('walk', 'walk'\) is not allowed; .* several distinct names",
+    ),
     ("go1plane", {"skill": ()}, r"skill: \(\) is not allowed"),
-    ("go1plane", {"skill": BOTH, "skill_weights": "x"}, r"skill_weights: 'x' is not allowed; of several skills"),
+    (
+        "go1plane",
+        {"skill": BOTH, "skill_weights": "x"},
+        r"skill_weights: 'x' is not allowed; of several skills",
+    ),
     (
         "go1plane",
         {"skill": BOTH, "commands": ("vx", "skill")},
         r"commands: \('vx', 'skill', 'skill'\) must be .*distinct",
     ),
-    ("go1plane", {"skill": BOTH, "command_ranges": {"skill": (-0.5, 1)}}, r"command_ranges: unknown command 'skill'"),
+    (
+        "go1plane",
+        {"skill": BOTH, "command_ranges": {"skill": (-0.5, 1)}},
+        r"command_ranges: unknown command 'skill'",
+    ),
     ("go1plane", {"skill": BOTH, "gait": "canter"}, r"gait: unknown name 'canter'.*pace"),
     *(("go1revolvingdoor", {"command_ranges": ranges}, said) for ranges, said in RANGES),
 ]
@@ -232,21 +328,37 @@ def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
         refuses(f"num_envs: {count} is not allowed; .*{allowed}", VectorEnv, gate, count)
     state = jax.tree.map(lambda x: np.stack([x] * 3), state)
     for shape in ((2, 2, 12), (3, 12)):  # another number of environments, no axis of agents
-        with pytest.raises(InputError, match=r"action: shape .*; expected \(3, 2, 12\) \(environments, agents"):
+        with pytest.raises(
+            InputError, match=r"action: shape .*; expected \(3, 2, 12\) \(environments, agents"
+        ):
             VectorEnv(gate, 3).step(state, jnp.zeros(shape))
 
 
 def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any) -> None:
     action = jnp.tile(jnp.array([0.5, 3.0, -1e6]), (2, 4))
-    after, clipped = gate_step(fresh, action), gate_step(fresh, jnp.clip(action, -1.0, 1.0))
-    jax.tree.map(np.testing.assert_array_equal, (after.data.ctrl, after.obs), (clipped.data.ctrl, clipped.obs))
-    assert np.abs(np.asarray(gate_step(fresh, 0.9 * jnp.clip(action, -1.0, 1.0)).data.ctrl - after.data.ctrl)).max() > 0
+    after = gate_step(fresh, action)
+    clipped = gate_step(fresh, jnp.clip(action, -1.0, 1.0))
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        (after.data.ctrl, after.obs),
+        (clipped.data.ctrl, clipped.obs),
+    )
+    assert (
+        np.abs(
+            np.asarray(
+                gate_step(fresh, 0.9 * jnp.clip(action, -1.0, 1.0)).data.ctrl - after.data.ctrl
+            )
+        ).max()
+        > 0
+    )
 
 
 def test_a_taken_or_missing_id_is_refused() -> None:
     other = type("Other", (TASKS["go1plane"],), {"name": "go1gate"})
     refuses("the id 'go1gate' is already registered by Go1Gate", register_task, other)
-    refuses("its `name` is empty", register_task, type("Nameless", (TASKS["go1plane"],), {"name": ""}))
+    refuses(
+        "its `name` is empty", register_task, type("Nameless", (TASKS["go1plane"],), {"name": ""})
+    )
     for other in (3, int):
         refuses("must be a class derived from QuadrupedEnv", register_task, other)
     assert [task.name for task in TASKS.values()] == list(TASKS)
@@ -258,26 +370,51 @@ def test_making_and_stepping_imports_no_foreign_library_and_no_other_task() -> N
         "env = mqe_jax.make('go1plane', impl='c', control='position')\n"
         "state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))\n"
         "jax.eval_shape(env.step, state, jax.numpy.zeros((env.num_agents, 12)))\n"
-        "print([m for m in ('flax', 'optax', 'brax', 'torch', 'gymnasium', 'mqe_jax.envs.gate') if m in sys.modules])"
+        "print([m for m in ('flax', 'optax', 'brax', 'torch', 'gymnasium', 'mqe_jax.envs.gate') "
+        "if m in sys.modules])"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert out.strip().splitlines()[-1] == "[]"
     assert set(mqe_jax.tasks()) == set(TASKS)
     assert type(make("go1bridgewrestling", impl="c", control="position")) is TASKS["go1wrestling"]
 
 
-def test_captured_constants_are_arguments_in_compiled_code(gate: QuadrupedEnv, fresh: State) -> None:
-    action, assistance = jnp.zeros((2, 12)), jnp.float32(0.5)
-    after = jax.jit(lambda state: jax.lax.scan(lambda state, _: (gate.step(state, action), None), state, None, 2)[0])
+def test_captured_constants_are_arguments_in_compiled_code(
+    gate: QuadrupedEnv, fresh: State
+) -> None:
+    action = jnp.zeros((2, 12))
+    assistance = jnp.float32(0.5)
+    after = jax.jit(
+        lambda state: jax.lax.scan(
+            lambda state, _: (gate.step(state, action), None), state, None, 2
+        )[0]
+    )
     assert int(after(fresh).step) == 2
-    assert jax.eval_shape(lambda key: gate.reset(key, assistance), jax.random.PRNGKey(0)).assistance.shape == ()
+    assert (
+        jax.eval_shape(
+            lambda key: gate.reset(key, assistance), jax.random.PRNGKey(0)
+        ).assistance.shape
+        == ()
+    )
 
 
 def test_a_layout_slices_packs_and_splits() -> None:
-    layout = ObservationLayout((Block("id", 1, categorical=True), Block("place", 2), Block("speed", 3)))
-    values = {"id": jnp.ones((4, 1)), "place": jnp.full((4, 2), 2.0), "speed": jnp.full((4, 3), 3.0)}
+    layout = ObservationLayout(
+        (Block("id", 1, categorical=True), Block("place", 2), Block("speed", 3))
+    )
+    values = {
+        "id": jnp.ones((4, 1)),
+        "place": jnp.full((4, 2), 2.0),
+        "speed": jnp.full((4, 3), 3.0),
+    }
     packed = layout.pack(values)
-    assert packed.shape == (4, 6) and layout.slice("place") == slice(1, 3) and layout.slice("speed") == slice(3, 6)
+    assert (
+        packed.shape == (4, 6)
+        and layout.slice("place") == slice(1, 3)
+        and layout.slice("speed") == slice(3, 6)
+    )
     np.testing.assert_array_equal(packed[:, layout.slice("place")], values["place"])
     jax.tree.map(np.testing.assert_array_equal, layout.split(packed), values)
     np.testing.assert_array_equal(layout.continuous, [0, 1, 1, 1, 1, 1])
@@ -286,19 +423,33 @@ def test_a_layout_slices_packs_and_splits() -> None:
 
 
 def test_a_block_of_entities_says_who_is_there() -> None:
-    """Entries of those who are not there are 0 and their mask gets no noise; a block without a mask has all."""
+    """Entries of those who are not there are 0 and their mask gets no noise; a block without a mask
+    has all.
+    """
     layout = ObservationLayout(
-        (Block("own", 1), entities("mates", "robot", 3, 2, masked=True), entities("sheep", "s", 2, 1))
+        (
+            Block("own", 1),
+            entities("mates", "robot", 3, 2, masked=True),
+            entities("sheep", "s", 2, 1),
+        )
     )
-    values, there = 1.0 + jnp.arange(12.0).reshape(2, 3, 2), jnp.array([[True, False, True], [False, True, True]])
-    blocks = {"own": jnp.zeros((2, 1)), "mates": by_entity(values, there), "sheep": jnp.ones((2, 2))}
+    values = 1.0 + jnp.arange(12.0).reshape(2, 3, 2)
+    there = jnp.array([[True, False, True], [False, True, True]])
+    blocks = {
+        "own": jnp.zeros((2, 1)),
+        "mates": by_entity(values, there),
+        "sheep": jnp.ones((2, 2)),
+    }
     packed = layout.pack(blocks)
     assert packed.shape == (2, layout.size) == (2, 1 + 3 * 3 + 2)
     found, who = layout.entities(packed, "mates")
     np.testing.assert_array_equal(found, np.where(there[..., None], values, 0))
     np.testing.assert_array_equal(who, there)
     np.testing.assert_array_equal(layout.continuous, [1, *[1, 1, 0] * 3, 1, 1])
-    assert layout.entities(packed, "sheep")[0].shape == (2, 2, 1) and layout.entities(packed, "sheep")[1].all()
+    assert (
+        layout.entities(packed, "sheep")[0].shape == (2, 2, 1)
+        and layout.entities(packed, "sheep")[1].all()
+    )
     with pytest.raises(KeyError, match="'own' has no entities"):
         layout.entities(packed, "own")
     blocks = made("go1sheep-hard").observation_layout.blocks
@@ -324,17 +475,41 @@ def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:
 
 
 MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
-    "width": ({"observe": lambda *_: {**BLOCKS, "base": jnp.zeros((2, 5))}}, r"observe: base: \(2, 5\).* \(2, 6\)"),
-    "agents": ({"observe": lambda *_: {**BLOCKS, "base": jnp.zeros(6)}}, r"observe: base: \(6,\).* \(2, 6\)"),
-    "no blocks": ({"observe": lambda *_: jnp.zeros((2, 14))}, r"observe: \(2, 14\) float32; expected by name"),
-    "reward's shape": ({"rewards": lambda *_: {"forward": jnp.zeros((2, 1))}}, r"forward: \(2, 1\).* \(\) or \(2,\)"),
-    "reward's name": ({"rewards": lambda *_: {"froward": 0.0}}, r"rewards: \['froward'\]; expected .* \['forward'\]"),
+    "width": (
+        {"observe": lambda *_: {**BLOCKS, "base": jnp.zeros((2, 5))}},
+        r"observe: base: \(2, 5\).* \(2, 6\)",
+    ),
+    "agents": (
+        {"observe": lambda *_: {**BLOCKS, "base": jnp.zeros(6)}},
+        r"observe: base: \(6,\).* \(2, 6\)",
+    ),
+    "no blocks": (
+        {"observe": lambda *_: jnp.zeros((2, 14))},
+        r"observe: \(2, 14\) float32; expected by name",
+    ),
+    "reward's shape": (
+        {"rewards": lambda *_: {"forward": jnp.zeros((2, 1))}},
+        r"forward: \(2, 1\).* \(\) or \(2,\)",
+    ),
+    "reward's name": (
+        {"rewards": lambda *_: {"froward": 0.0}},
+        r"rewards: \['froward'\]; expected .* \['forward'\]",
+    ),
     "no weights": ({"Params": TaskParams}, "Params = TaskParams: no field rewards"),
-    "outcome": ({"outcome": lambda *_: {"success": jnp.zeros(2)}}, r"outcome: success: \(2,\) float32; expected \(\)"),
+    "outcome": (
+        {"outcome": lambda *_: {"success": jnp.zeros(2)}},
+        r"outcome: success: \(2,\) float32; expected \(\)",
+    ),
     "no outcome": ({"outcome": lambda *_: None}, "outcome: None; expected numbers by name"),
-    "no success": ({"outcome": lambda *_: {"one": 1.0}}, r"outcome: \['one'\]; expected success, and further results"),
+    "no success": (
+        {"outcome": lambda *_: {"one": 1.0}},
+        r"outcome: \['one'\]; expected success, and further results",
+    ),
     "ending": ({"ending": lambda *_: jnp.zeros(())}, r"ending: \(\) float32; expected \(\) bool"),
-    "own fields": ({"step_task": lambda *_: jnp.zeros(3)}, r"step_task: \(3,\) float32; expected as before, None"),
+    "own fields": (
+        {"step_task": lambda *_: jnp.zeros(3)},
+        r"step_task: \(3,\) float32; expected as before, None",
+    ),
 }
 BLOCKS = {"one_hot": jnp.eye(2), "base": jnp.zeros((2, 6)), "teammates": jnp.zeros((2, 6))}
 
@@ -344,7 +519,9 @@ def test_a_mistake_in_a_task_names_the_method(mistake: str) -> None:
     methods, said = MISTAKES[mistake]
     with pytest.raises(ValueError, match=said):
         env: Any = type("Bad", (Go1Plane,), methods)(impl="c", control="position", num_envs=1)
-        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros((2, 12))), jax.random.PRNGKey(0))
+        jax.eval_shape(
+            lambda key: env.step(env.reset(key), jnp.zeros((2, 12))), jax.random.PRNGKey(0)
+        )
 
 
 def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: Any) -> None:
@@ -356,4 +533,9 @@ def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: An
     replay.save_recording(tmp_path / "gate.npz", gate, states, jnp.zeros((2, 2, 12)))
     recording = replay.load_recording(tmp_path / "gate.npz")
     np.testing.assert_array_equal(replay._restore(gate, recording).data.qpos, states.data.qpos[0])
-    refuses(r"go1seesaw .* does not fit a recording of go1gate", replay.replay, recording, made("go1seesaw"))
+    refuses(
+        r"go1seesaw .* does not fit a recording of go1gate",
+        replay.replay,
+        recording,
+        made("go1seesaw"),
+    )

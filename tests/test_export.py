@@ -39,15 +39,28 @@ GATE = zoo.file_of("go1gate")
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
 
 
-def new_policy(env: Any, control: str = "command", group: str = "policy", **network: Any) -> TrainedPolicy:
-    """A policy with random weights, statistics and action layer, large enough to saturate some actions."""
+def new_policy(
+    env: Any, control: str = "command", group: str = "policy", **network: Any
+) -> TrainedPolicy:
+    """A policy with random weights, statistics and action layer, large enough to saturate some
+    actions.
+    """
     if "name" not in network:
         network["critic_input"] = "observations"
-    settings = {"task": env.name, "env": {"control": control}, "action_scale": 0.5, "network": network, "group": group}
+    settings = {
+        "task": env.name,
+        "env": {"control": control},
+        "action_scale": 0.5,
+        "network": network,
+        "group": group,
+    }
     config = build(TrainConfig, settings)
     needs = needs_of(env, config)
     net = config.network.build(needs.dims)
-    params = jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + np.float32(0.1)), net.policy_params(random_params(net)))
+    params = jax.tree.map(
+        lambda x: jnp.asarray(np.asarray(x) + np.float32(0.1)),
+        net.policy_params(random_params(net)),
+    )
     fresh = running_init(needs.dims.observation, config.network.features(needs.dims))
     mean, spread = np.random.default_rng(3).normal(size=(2, *fresh.mean.shape)).astype(np.float32)
     statistics = RunningStatistics(jnp.asarray(mean), jnp.asarray(spread**2), fresh.samples + 9.0)
@@ -55,13 +68,18 @@ def new_policy(env: Any, control: str = "command", group: str = "policy", **netw
 
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
-    run, file = zoo.file_of("go1pushbox"), tmp_path / "box.onnx"
+    run = zoo.file_of("go1pushbox")
+    file = tmp_path / "box.onnx"
     assert cli.main(["export", str(run), "--onnx", str(file), "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
     assert 0.0 < said["largest_error"] < 6e-5
     model = onnx.load(file)
     sizes = shapes(model)
-    assert sizes["inputs"]["obs"] == ["N", 2, 22] and sizes["outputs"]["joint_target"] == ["N", 2, 12]
+    assert sizes["inputs"]["obs"] == ["N", 2, 22] and sizes["outputs"]["joint_target"] == [
+        "N",
+        2,
+        12,
+    ]
     memory = sorted(name for name in sizes["inputs"] if name.startswith("walk_"))
     assert memory == WALK_MEMORY
     assert all(sizes["outputs"][f"next_{name}"] == sizes["inputs"][name] for name in memory)
@@ -77,7 +95,9 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
     session = onnxruntime.InferenceSession(to_onnx(policy, env).SerializeToString())
     sizes = {i.name: i.shape[1:] for i in session.get_inputs()}
     memory = {name: np.zeros((1, *sizes[name]), np.float32) for name in WALK_MEMORY}
-    read, act, step = jax.jit(env.read), jax.jit(lambda obs: policy.act(obs, ())[0]), jax.jit(env.step)
+    read = jax.jit(env.read)
+    act = jax.jit(lambda obs: policy.act(obs, ())[0])
+    step = jax.jit(env.step)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     now = read(state.data)
     for _ in range(20):
@@ -103,13 +123,28 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
 @pytest.mark.parametrize(
     ("task", "control", "network"),
     [
-        ("go1revolvingdoor", "command", {"recurrent": True, "share_policy": False, "action_mean": "tanh"}),
-        ("go1revolvingdoor", "position", {"recurrent": False, "activation": "elu", "hidden_sizes": [32, 16]}),
-        ("go1gate", "torque", {"recurrent": True, "activation": "tanh", "gru_size": 24, "openrl_layers": True}),
-        ("go1gate", "torque", {"name": "mat", "heads": 2, "blocks": 2}),  # agents act one after another
+        (
+            "go1revolvingdoor",
+            "command",
+            {"recurrent": True, "share_policy": False, "action_mean": "tanh"},
+        ),
+        (
+            "go1revolvingdoor",
+            "position",
+            {"recurrent": False, "activation": "elu", "hidden_sizes": [32, 16]},
+        ),
+        (
+            "go1gate",
+            "torque",
+            {"recurrent": True, "activation": "tanh", "gru_size": 24, "openrl_layers": True},
+        ),
+        # agents act one after another
+        ("go1gate", "torque", {"name": "mat", "heads": 2, "blocks": 2}),
     ],
 )
-def test_networks_memories_and_controls_agree(task: str, control: str, network: dict[str, Any]) -> None:
+def test_networks_memories_and_controls_agree(
+    task: str, control: str, network: dict[str, Any]
+) -> None:
     params = {"position_scale": 2.0} if control == "position" else {}
     env = make(task, impl="c", control=control, num_envs=1, **params)
     assert export_error(new_policy(env, control, **network), env) < 2e-5
@@ -117,10 +152,18 @@ def test_networks_memories_and_controls_agree(task: str, control: str, network: 
 
 @pytest.mark.parametrize(
     ("skill", "commands", "memory"),
-    [("lean", ("roll", "pitch"), {"lean_lean": (2, 2)}),
-     (("walk", "agile"), ("vx", "vy", "yaw_rate"), {"choice_acting": (2,), "choice_agile_frames": (2, 9, 39)})],
-)  # fmt: skip
-def test_a_graph_holds_the_skill_of_the_task(skill: Any, commands: Any, memory: Any, monkeypatch: Any) -> None:
+    [
+        ("lean", ("roll", "pitch"), {"lean_lean": (2, 2)}),
+        (
+            ("walk", "agile"),
+            ("vx", "vy", "yaw_rate"),
+            {"choice_acting": (2,), "choice_agile_frames": (2, 9, 39)},
+        ),
+    ],
+)
+def test_a_graph_holds_the_skill_of_the_task(
+    skill: Any, commands: Any, memory: Any, monkeypatch: Any
+) -> None:
     monkeypatch.setitem(SKILLS, "lean", StandAndLean)
     env = make("go1gate", impl="c", num_envs=1, skill=skill, commands=commands)
     policy = new_policy(env, recurrent=False)
@@ -130,10 +173,17 @@ def test_a_graph_holds_the_skill_of_the_task(skill: Any, commands: Any, memory: 
 
 @pytest.mark.soak
 def test_a_policy_that_sees_sensors_is_exported_and_senses_on_the_page(tmp_path: Path) -> None:
-    """The graph has readings as inputs; that of the page has the state, for either team of a match."""
-    late, near = {"all": {"delay": 1}}, {"position_noise": 0.0, "yaw_noise": 0.0, "misses": 0.0}
+    """The graph has readings as inputs; that of the page has the state, for either team of a
+    match.
+    """
+    late = {"all": {"delay": 1}}
+    near = {"position_noise": 0.0, "yaw_noise": 0.0, "misses": 0.0}
     odometry = {"name": "proprioception", "drift": 0.0, "yaw_drift": 0.0}
-    senses = [odometry, {"name": "detections", **near, "pipeline": late}, {"name": "lidar", "rays": 8}]
+    senses = [
+        odometry,
+        {"name": "detections", **near, "pipeline": late},
+        {"name": "lidar", "rays": 8},
+    ]
     env = make("go1bridge", impl="c", num_envs=1, senses=senses)
     network = {"name": "blocks", "hidden_sizes": [8], "gru_size": 4, "entity_sizes": [4]}
     policy = new_policy(env, "command", "onboard", **network).acting(True)
@@ -142,19 +192,27 @@ def test_a_policy_that_sees_sensors_is_exported_and_senses_on_the_page(tmp_path:
     model = to_onnx(policy, env)
     assert max(errors(model, inputs, outputs).values()) < 1e-4
     properties = {entry.key: entry.value for entry in model.metadata_props}
-    assert properties["group"] == "onboard" and "lidar" in [name for name, *_ in json.loads(properties["observation"])]
+    assert properties["group"] == "onboard" and "lidar" in [
+        name for name, *_ in json.loads(properties["observation"])
+    ]
 
-    observe = lambda state: env.with_observations(state, ["onboard"])  # noqa: E731
+    def observe(state):
+        return env.with_observations(state, ["onboard"])
+
     step = jax.jit(lambda state, action: observe(env.advance(state, action)))
     state = jax.jit(lambda key: observe(env.begin(key)))(jax.random.PRNGKey(0))
     act, sizes = policy_function(policy, TaskFunctions(env))
     assert sizes["team"] == ()
     memory = [{name: jnp.zeros(shape) for name, shape in sizes.items()} for _ in env.teams]
-    expected, graph, page = [policy.initial_memory()] * 2, translate.translate(act, sizes, "test"), jax.jit(act)
+    expected = [policy.initial_memory()] * 2
+    graph = translate.translate(act, sizes, "test")
+    page = jax.jit(act)
     for _ in range(3):
         actions = []
         for team in range(2):
-            action, expected[team] = policy.act(state.groups["onboard"][team : team + 1], expected[team])
+            action, expected[team] = policy.act(
+                state.groups["onboard"][team : team + 1], expected[team]
+            )
             given = memory[team] | state_arrays(state) | {"team": jnp.float32(team)}
             found = page(given)
             np.testing.assert_allclose(found["action"], action, atol=1e-4)
@@ -167,14 +225,24 @@ def test_a_policy_that_sees_sensors_is_exported_and_senses_on_the_page(tmp_path:
     with normal_numbers(jnp.array([-0.1, 0.1, -1.3, -1.2])):
         lost = [jax.random.bernoulli(state.key, p, (2,)) for p in (0.5, 0.1)]
     np.testing.assert_array_equal(lost, [[True, False], [True, False]])  # quantiles 0 and -1.28
-    save_policy(tmp_path, new_policy(env, "command", "proprioception", recurrent=False, critic_input="privileged"))
-    refuses("sees the group 'proprioception'; the page has 'policy' and 'onboard'", entries, [str(tmp_path)])
+    save_policy(
+        tmp_path,
+        new_policy(env, "command", "proprioception", recurrent=False, critic_input="privileged"),
+    )
+    refuses(
+        "sees the group 'proprioception'; the page has 'policy' and 'onboard'",
+        entries,
+        [str(tmp_path)],
+    )
 
 
 def mixture_of(env: Any) -> Mixture:
     """A mixture of policies without and with a recurrent state."""
-    one, other = (new_policy(env, "position", hidden_sizes=[16], recurrent=x, gru_size=8) for x in (False, True))
-    third = dataclasses.replace(one, params=jax.tree.map(lambda x: jnp.asarray(-np.asarray(x)), one.params))
+    one = new_policy(env, "position", hidden_sizes=[16], recurrent=False, gru_size=8)
+    other = new_policy(env, "position", hidden_sizes=[16], recurrent=True, gru_size=8)
+    third = dataclasses.replace(
+        one, params=jax.tree.map(lambda x: jnp.asarray(-np.asarray(x)), one.params)
+    )
     return Mixture((one, other, third), (0.5, 0.2, 0.3))
 
 
@@ -200,8 +268,13 @@ def test_the_page_draws_a_member_by_its_noise() -> None:
     found = jax.vmap(act)(inputs)
     assert found["next_memory_member"].tolist() == [1, 2, 3, 2]
     means = [each.act(inputs["obs"][0], each.initial_memory())[0] for each in policy.members]
-    np.testing.assert_allclose(found["action"], np.stack([means[i] for i in (0, 1, 2, 1)]), atol=1e-5)
-    assert max(errors(translate.translate(act, sizes, "test"), inputs, jax.device_get(found)).values()) < 1e-4
+    np.testing.assert_allclose(
+        found["action"], np.stack([means[i] for i in (0, 1, 2, 1)]), atol=1e-5
+    )
+    assert (
+        max(errors(translate.translate(act, sizes, "test"), inputs, jax.device_get(found)).values())
+        < 1e-4
+    )
 
 
 @pytest.mark.soak
@@ -221,7 +294,9 @@ def test_the_graph_of_a_match_is_that_of_one_team() -> None:
     assert max(found.values()) < 1e-4
 
 
-def test_what_cannot_be_exported_is_refused_in_a_line(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+def test_what_cannot_be_exported_is_refused_in_a_line(
+    tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
     file = str(tmp_path / "a.onnx")
 
     def refused(*arguments: str) -> str:
@@ -235,7 +310,9 @@ def test_what_cannot_be_exported_is_refused_in_a_line(tmp_path: Path, capsys: An
     monkeypatch.setattr("mqe_jax.export.check.STEPS", 2)
     monkeypatch.setitem(translate.REPLACED, "max", lambda x, low: x + low)  # no ReLU
     said = refused(str(GATE), "--onnx", file)
-    assert "nothing is written" in said and "differs from JAX by" in said and "at most 0.0001" in said
+    assert (
+        "nothing is written" in said and "differs from JAX by" in said and "at most 0.0001" in said
+    )
     monkeypatch.setitem(translate.REPLACED, "max", lambda x, low: jax.lax.nextafter(x, x))
     assert "jax2onnx cannot translate go1gate (" in refused(str(GATE), "--onnx", file)
     with pytest.raises(InputError, match="needs task 'go1gate'; the environment has 'go1tug'"):
@@ -245,5 +322,6 @@ def test_what_cannot_be_exported_is_refused_in_a_line(tmp_path: Path, capsys: An
 @pytest.mark.parametrize("name", ["next_agile_gait", "next_choice_walk_gait"])
 def test_errors_of_gait_phases_are_cyclic(name: str) -> None:
     graph = translate.translate(lambda inputs: {name: 2.0 * inputs["half"]}, {"half": (2,)}, "test")
-    inputs, expected = np.zeros((1, 2), np.float32), np.full((1, 2), 0.9999, np.float32)
+    inputs = np.zeros((1, 2), np.float32)
+    expected = np.full((1, 2), 0.9999, np.float32)
     assert errors(graph, {"half": inputs}, {name: expected})[name] == pytest.approx(1e-4, rel=1e-2)

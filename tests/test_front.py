@@ -1,4 +1,6 @@
-"""The Python API: `learn` is `mqe train`, `evaluate` is `mqe eval`, `render` draws; what they return."""
+"""The Python API: `learn` is `mqe train`, `evaluate` is `mqe eval`, `render` draws; what they
+return.
+"""
 
 import dataclasses
 import json
@@ -40,18 +42,27 @@ FEW |= {"ppo.minibatches": 1, "network.recurrent": False}
         ("go1gate --config demo --total-steps 64", {"config": "demo", "total_steps": 64}, {}),
         ("go1sheep-hard --algorithm mat", {"algorithm": "mat"}, {}),
         ("go1wrestling --set episode_length=5", None, {"episode_length": 5}),
-        ("go1gate --control position --ppo.clip 0.1", {"ppo": {"clip": 0.1}}, {"control": "position"}),
+        (
+            "go1gate --control position --ppo.clip 0.1",
+            {"ppo": {"clip": 0.1}},
+            {"control": "position"},
+        ),
         ("go1gate --config file.yaml", Path("file.yaml"), {}),
         ("go1tug --config paper/mappo --seed 3", TrainConfig(seed=3), {}),
     ],
 )
-def test_settings_are_those_of_the_command(words: str, config: Any, env: dict[str, Any], tmp_path: Path) -> None:
-    Path("file.yaml").write_text("{num_envs: 8, ppo: {epochs: 2}}")  # in the empty folder of the test
+def test_settings_are_those_of_the_command(
+    words: str, config: Any, env: dict[str, Any], tmp_path: Path
+) -> None:
+    # in the empty folder of the test
+    Path("file.yaml").write_text("{num_envs: 8, ppo: {epochs: 2}}")
     command = parse_train(words.split())
     expected = build.for_task(command.settings, command.target, command.overrides())
     if isinstance(config, TrainConfig):
         config = command.settings
-    assert build.for_task(build.settings_of(command.target, config), command.target, env) == expected
+    assert (
+        build.for_task(build.settings_of(command.target, config), command.target, env) == expected
+    )
 
 
 run = pytest.fixture(scope="module")(lambda shared_programs: mqe_jax.learn(fake(), FEW, seed=2))
@@ -68,7 +79,9 @@ def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path:
     assert_same(run.policy.arrays, written.policy.arrays)
     assert run.metrics.keys() == written.metrics.keys() and len(run.metrics["success"]) == 2
     for name in run.metrics.keys() - {"seconds", "fps"}:
-        np.testing.assert_allclose(run.metrics[name], written.metrics[name], rtol=1e-7, err_msg=name)
+        np.testing.assert_allclose(
+            run.metrics[name], written.metrics[name], rtol=1e-7, err_msg=name
+        )
 
 
 def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixture[str]) -> None:
@@ -88,7 +101,10 @@ def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixtur
 def test_evaluations_come_with_the_run() -> None:
     evaluation = {"evaluation.every": 1, "evaluation.episodes": 4}
     alone = mqe_jax.learn("fake", FEW | evaluation)
-    assert [each["env_steps"] for each in alone.evaluations] == [32, 64] and alone.absolute is not None
+    assert [each["env_steps"] for each in alone.evaluations] == [
+        32,
+        64,
+    ] and alone.absolute is not None
     alone.save("saved")
     written = mqe_jax.learn("fake", FEW | evaluation, run_dir="run")
     for other in (mqe_jax.load_run("saved"), written):
@@ -125,7 +141,9 @@ class Still(Stages):
 
 def test_an_own_algorithm_is_trained_and_resumed() -> None:
     halfway = mqe_jax.learn("fake", FEW | {"total_steps": 32}, run_dir="run", stages=Still)
-    with pytest.raises(InputError, match=r"stages: .Stages. is not allowed; .* .Still., the algorithm of"):
+    with pytest.raises(
+        InputError, match=r"stages: .Stages. is not allowed; .* .Still., the algorithm of"
+    ):
         mqe_jax.learn("fake", FEW, run_dir="run", resume=True)
     done = mqe_jax.learn("fake", FEW, run_dir="run", resume=True, stages=Still)
     assert done.finished
@@ -138,16 +156,27 @@ def test_seeds_are_trained_in_one_program_into_their_folders() -> None:
     written = [mqe_jax.load_run(f"runs/seed{seed}") for seed in (1, 3)]
     assert [run.config.seed for run in runs] == [1, 3] == [run.config.seed for run in written]
     alone = mqe_jax.learn("fake", FEW, seed=3)
-    columns = [{k: v for k, v in run.metrics.items() if k not in ("seconds", "fps")} for run in (runs[1], alone)]
-    close = lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)  # noqa: E731
+    columns = [
+        {k: v for k, v in run.metrics.items() if k not in ("seconds", "fps")}
+        for run in (runs[1], alone)
+    ]
+
+    def close(one, other):
+        return np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
+
     jax.tree.map(close, (runs[1].policy.params, columns[0]), (alone.policy.params, columns[1]))
 
 
 def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
     figure = run.plot()
     reward, rate = figure.axes
-    assert (reward.get_ylabel(), rate.get_ylabel()) == ("average step reward", "success rate in training (%)")
-    np.testing.assert_allclose(np.asarray(reward.lines[0].get_xdata()), run.metrics["env_steps"] / 1e6)
+    assert (reward.get_ylabel(), rate.get_ylabel()) == (
+        "average step reward",
+        "success rate in training (%)",
+    )
+    np.testing.assert_allclose(
+        np.asarray(reward.lines[0].get_xdata()), run.metrics["env_steps"] / 1e6
+    )
     assert figure._repr_png_().startswith(b"\x89PNG")  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -160,15 +189,33 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
         ("fake", {"config": 5}, "config: 5 is not allowed; it must be a shipped name"),
         ("fake", {"config": {"ppo.clp": 1}}, r"ppo.clp: unknown name .*did you mean 'clip'"),
         ("fake", {"seed": -1}, "seed: -1 is not allowed"),
-        ("fake", {"resume": True}, "resume: True is not allowed; it must be false without a run_dir"),
+        (
+            "fake",
+            {"resume": True},
+            "resume: True is not allowed; it must be false without a run_dir",
+        ),
         ("fake", {"env": "x"}, "env: 'x' is not allowed"),
-        ("fake", {"resume": "perhaps"}, "resume: 'perhaps' is not allowed; it must be true or false"),
+        (
+            "fake",
+            {"resume": "perhaps"},
+            "resume: 'perhaps' is not allowed; it must be true or false",
+        ),
         ("fake", {"dump_diverged": 5}, "dump_diverged: 5 is not allowed"),
-        (fake(), {"env": {"gate_width": 1}}, "env: .* is not allowed; it must be left out for a batch"),
-        (fake(), {"config": {"opponents": ["idle"]}}, r"opponents: \('idle',\) .* left out for a batch"),
+        (
+            fake(),
+            {"env": {"gate_width": 1}},
+            "env: .* is not allowed; it must be left out for a batch",
+        ),
+        (
+            fake(),
+            {"config": {"opponents": ["idle"]}},
+            r"opponents: \('idle',\) .* left out for a batch",
+        ),
     ],
 )
-def test_what_cannot_be_trained_is_named(task: Any, arguments: dict[str, Any], said: str, capfd: Any) -> None:
+def test_what_cannot_be_trained_is_named(
+    task: Any, arguments: dict[str, Any], said: str, capfd: Any
+) -> None:
     refuses(said, mqe_jax.learn, task, **arguments)
     assert "".join(capfd.readouterr()) == ""
 
@@ -176,7 +223,13 @@ def test_what_cannot_be_trained_is_named(task: Any, arguments: dict[str, Any], s
 @pytest.mark.parametrize("seeds", [5, [], [1.5], "ab", range(65), [1, 1]])
 def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
     refuses(r"seeds.* is not allowed", mqe_jax.learn_seeds, "fake", FEW, seeds=seeds)
-    refuses(r"seeds: .* is not allowed", mqe_jax.make_learner, "fake", FEW, seeds=0 if seeds == 5 else seeds)
+    refuses(
+        r"seeds: .* is not allowed",
+        mqe_jax.make_learner,
+        "fake",
+        FEW,
+        seeds=0 if seeds == 5 else seeds,
+    )
 
 
 def test_what_cannot_be_evaluated_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,16 +241,27 @@ def test_what_cannot_be_evaluated_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_run_of_other_parts_is_named(run: mqe_jax.Run) -> None:
-    tables: list[Any] = [{"a": np.zeros((2, 2))}, {"a": np.zeros(2), "b": np.zeros(3)}, {"a": np.array(["x"])}]
+    tables: list[Any] = [
+        {"a": np.zeros((2, 2))},
+        {"a": np.zeros(2), "b": np.zeros(3)},
+        {"a": np.array(["x"])},
+    ]
     point = {"env_steps": 1, "sampled": {}, "deterministic": {}}
     points: list[Any] = [{}, {**point, "env_steps": -1}, {**point, "x": np.zeros(2)}]
-    wrong = {"policy": [{}], "metrics": [[], *tables], "absolute": [[], *points], "evaluations": [{}, [3], points[1:]]}
+    wrong = {
+        "policy": [{}],
+        "metrics": [[], *tables],
+        "absolute": [[], *points],
+        "evaluations": [{}, [3], points[1:]],
+    }
     for name, values in wrong.items():
         for value in (*values, 3, "idle"):
             refuses(f"^{name}.*: ", dataclasses.replace, run, **{name: value})
     weights = jax.tree.map(lambda x: x * np.nan, run.policy.params)
     with pytest.raises(NonFiniteError, match="params"):
-        dataclasses.replace(run, policy=dataclasses.replace(run.policy, params=weights)).save("broken")
+        dataclasses.replace(run, policy=dataclasses.replace(run.policy, params=weights)).save(
+            "broken"
+        )
     assert list(Path.cwd().iterdir()) == []
 
 
@@ -213,11 +277,14 @@ def test_an_environment_keeps_its_parameters() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wins", "episodes", "low", "high"), [(0, 10, 0.0, 0.2775), (5, 10, 0.2366, 0.7634), (81, 263, 0.2553, 0.3662)]
+    ("wins", "episodes", "low", "high"),
+    [(0, 10, 0.0, 0.2775), (5, 10, 0.2366, 0.7634), (81, 263, 0.2553, 0.3662)],
 )
 def test_intervals_are_wilsons(wins: int, episodes: int, low: float, high: float) -> None:
     """The last one is the example of Newcombe 1998 (Statistics in Medicine 17, 857)."""
-    np.testing.assert_allclose(Rate.of(wins / episodes, episodes), [wins / episodes, low, high], atol=5e-5)
+    np.testing.assert_allclose(
+        Rate.of(wins / episodes, episodes), [wins / episodes, low, high], atol=5e-5
+    )
 
 
 def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
@@ -231,17 +298,29 @@ def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     assert "<tr><td>success_rate</td><td>100.0% (51.0 to 100.0%)</td></tr>" in result._repr_html_()
     shown = {"": str(result), "--long": result.details(), "--json": json.dumps(result.to_dict())}
     for more, text in shown.items():
-        assert cli.main(["eval", "fake", "--policy", "forward", "--episodes", "4", *more.split()]) == 0
+        assert (
+            cli.main(["eval", "fake", "--policy", "forward", "--episodes", "4", *more.split()]) == 0
+        )
         assert capfd.readouterr().out == f"{text}\n"
         assert more == "--json" or max(map(len, text.splitlines())) <= 80
 
 
 def test_a_table_of_a_match_has_what_happened() -> None:
-    """Its success is its wins; causes that ended no episode and counts of faults that are zero are left out."""
+    """Its success is its wins; causes that ended no episode and counts of faults that are zero are
+    left out.
+    """
     shares = {"divergence": 0.25, "fall": 0.0, "time_limit": 0.75}
     match = {"win_rate": 0.75, "draw_rate": 0.25, "loss_rate": 0.0}
-    about = {"policy": "runs/a_b", "actions": "mean", "opponent": "scripted", "sides": "both", "seed": 0}
-    result = Result("go1tug", 4, 0.75, 0.0, {}, 0.0, 9.5, 0, 1, shares, {"both_touched": 0.5}, match, about)
+    about = {
+        "policy": "runs/a_b",
+        "actions": "mean",
+        "opponent": "scripted",
+        "sides": "both",
+        "seed": 0,
+    }
+    result = Result(
+        "go1tug", 4, 0.75, 0.0, {}, 0.0, 9.5, 0, 1, shares, {"both_touched": 0.5}, match, about
+    )
     assert [tuple(re.split(" {2,}", row)[:2]) for row in str(result).splitlines()] == [
         ("task", "go1tug"),
         ("policy", "runs/a_b, mean actions"),
@@ -260,9 +339,14 @@ def test_a_table_of_a_match_has_what_happened() -> None:
         ("both touched", "0.5"),
         ("diverged episodes", "1"),
     ]
-    labelled = dataclasses.replace(result, labels={"both_touched": "goal touched by all", "one": "not in this task"})
+    labelled = dataclasses.replace(
+        result, labels={"both_touched": "goal touched by all", "one": "not in this task"}
+    )
     rows = [row.split("  ")[0] for row in str(labelled).splitlines()]
-    assert rows[6:10] == ["win", "draw", "loss", "goal touched by all"] and not {"both touched", "one"} & {*rows}
+    assert rows[6:10] == ["win", "draw", "loss", "goal touched by all"] and not {
+        "both touched",
+        "one",
+    } & {*rows}
     assert labelled.to_dict() == result.to_dict()
     against = dataclasses.replace(result, by_opponent={"population/1/response-champion": result})
     assert max(map(len, str(against).splitlines())) <= 80
@@ -295,7 +379,9 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
     assert about == {"policy": "forward", "opponent": "scripted", "sides": "both", "seed": 0}
     assert isinstance(played["batch"], BothSides) and played["policy"].second.name == "scripted"
     for wrong in ({"episodes": 5}, {"num_envs": 3}):
-        with pytest.raises(InputError, match=f"{next(iter(wrong))}: . is not allowed; it must be even"):
+        with pytest.raises(
+            InputError, match=f"{next(iter(wrong))}: . is not allowed; it must be even"
+        ):
             evaluate("go1tug", "forward", **(options | wrong))
     for measured in (lambda: evaluate("go1tug", "forward", impl="c"), lambda: cli.main(words)):
         measured()
@@ -309,7 +395,9 @@ def test_halves_of_the_environments_play_equally_many_episodes() -> None:
             return dataclasses.replace(after, outcome=Outcome(1.0 * (jnp.arange(4) >= 2)[:, None]))
 
     policy = mqe_jax.load_policy("idle", FakeEnv())  # pyright: ignore[reportArgumentType, reportCallIssue]
-    assert evaluate_batch(Halves(FakeEnv(), 4), policy, 6, jax.random.PRNGKey(0)).success_rate == 0.5
+    assert (
+        evaluate_batch(Halves(FakeEnv(), 4), policy, 6, jax.random.PRNGKey(0)).success_rate == 0.5
+    )
 
 
 def test_a_clip_shows_itself_and_is_saved(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,7 @@
-"""Bad input: Python calls and their bounds, and fuzz tests. The answer is one line that names the field or the file."""
+"""Bad input: Python calls and their bounds, and fuzz tests.
+
+The answer is one line that names the field or the file.
+"""
 
 import contextlib
 import dataclasses
@@ -49,7 +52,8 @@ from mqe_jax.walk.torchscript import read_torchscript
 from tests import fake_env, inputs
 from tests.inputs import refuses
 
-KEY, NAN = jax.random.PRNGKey(0), math.nan
+KEY = jax.random.PRNGKey(0)
+NAN = math.nan
 LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3))
 WALLS = np.full((3, 2, 3), NAN)
 FRAME = np.zeros((16, 16, 3), np.uint8)
@@ -60,24 +64,40 @@ RATINGS = games.Estimate(np.zeros(1), np.zeros(1), np.zeros(1))
 @pytest.fixture(scope="module")
 def made() -> dict[str, Any]:
     """What the calls need: a task and a match, both without the walk policy, and the fake task."""
-    task, match, fake = make("go1gate", control="position"), make("go1tug", control="position"), fake_env.FakeEnv()
+    task = make("go1gate", control="position")
+    match = make("go1tug", control="position")
+    fake = fake_env.FakeEnv()
     poses = (np.zeros((3, fake.mj_model.nq)), np.zeros((3, 2, 3)), np.zeros((3, 2, 4)))
     config = override(TrainConfig(), {"num_envs": 2, "total_steps": 16, "rollout_steps": 8})
-    state, matches = jax.eval_shape(task.reset, KEY), VectorEnv(match, 2)
+    state = jax.eval_shape(task.reset, KEY)
+    matches = VectorEnv(match, 2)
     team = versus(matches, "idle")
     return {
-        "sumo": make("go1wrestling", control="position"), "walks": make("go1tug", num_envs=2),
-        "task": task, "state": state, "match": match, "fake": fake, "batch": fake_env.FakeVectorEnv(fake, 2),
-        "config": config, "matches": matches, "team": team, "states": jax.eval_shape(matches.reset, KEY),
-        "other": jax.eval_shape(match.reset, KEY), "teams": jax.eval_shape(team.reset, KEY),
-        "episode": recording.Episode(*poses, dt=0.02), "idle": load_policy("idle", match),
-        "gif": Path("a.gif"), "long": recording.Episode(*(np.zeros((99, *pose.shape[1:])) for pose in poses), dt=0.02),
+        "sumo": make("go1wrestling", control="position"),
+        "walks": make("go1tug", num_envs=2),
+        "task": task,
+        "state": state,
+        "match": match,
+        "fake": fake,
+        "batch": fake_env.FakeVectorEnv(fake, 2),
+        "config": config,
+        "matches": matches,
+        "team": team,
+        "states": jax.eval_shape(matches.reset, KEY),
+        "other": jax.eval_shape(match.reset, KEY),
+        "teams": jax.eval_shape(team.reset, KEY),
+        "episode": recording.Episode(*poses, dt=0.02),
+        "idle": load_policy("idle", match),
+        "gif": Path("a.gif"),
+        "long": recording.Episode(*(np.zeros((99, *pose.shape[1:])) for pose in poses), dt=0.02),
         "act": lambda obs, memory, key: (jnp.zeros((*obs.shape[:2], 3)), memory),
-    }  # fmt: skip
+    }
 
 
 def _evaluate(x: Any, episodes: Any = 2, key: Any = KEY, **options: Any) -> Any:
-    return evaluate_batch(options.pop("env", x["batch"]), options.pop("act", x["act"]), episodes, key, **options)
+    return evaluate_batch(
+        options.pop("env", x["batch"]), options.pop("act", x["act"]), episodes, key, **options
+    )
 
 
 def _record(x: Any, key: Any = KEY, **options: Any) -> Any:
@@ -94,7 +114,10 @@ READERS = (load_yaml, read_torchscript)
 FILES = ((load_policy, "/dev/zero"), *product((*READERS, load_recording), ("/", "/dev/zero")))
 CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("task: ", lambda x, v: make(v), (3, [], None)),
-    *((name, lambda x, v, name=name: make("go1gate", **{name: v}), (3, [])) for name in ("impl", "control", "robot")),
+    *(
+        (name, lambda x, v, name=name: make("go1gate", **{name: v}), (3, []))
+        for name in ("impl", "control", "robot")
+    ),
     ("num_envs: ", lambda x, v: make("go1gate", num_envs=v), (NAN, 1.5, 0, True, 10**9, None, [])),
     ("skill_weights: ", lambda x, v: make("go1gate", skill_weights=v), ("a\0b", "", "x" * 300)),
     ("commands", lambda x, v: make("go1gate", commands=3), (None,)),
@@ -104,76 +127,216 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("env: ", lambda x, v: VectorEnv(v, 2), ("go1gate", None, QuadrupedEnv)),
     ("key: ", lambda x, v: x["matches"].reset(v), (3, "x", None, np.zeros(2))),
     ("key: ", lambda x, v: x["task"].reset(v), (3, "x", None, np.zeros(3, np.uint32))),
-    ("policy: ", lambda x, v: _evaluate(x, act=lambda obs, memory, key: v), (None, np.zeros((2, 2, 3)), (1, 2, 3))),
+    (
+        "policy: ",
+        lambda x, v: _evaluate(x, act=lambda obs, memory, key: v),
+        (None, np.zeros((2, 2, 3)), (1, 2, 3)),
+    ),
     ("episodes: ", lambda x, v: _evaluate(x, v), (0, -1, 1.5, NAN, "many", True, 10**12, b"1")),
     ("block: ", lambda x, v: _evaluate(x, block=v), (0, NAN, 1.5)),
     ("max_steps: ", lambda x, v: _evaluate(x, max_steps=v), (0, NAN, -1)),
     ("key: ", lambda x, v: _evaluate(x, key=v), (3, None, "k")),
     ("policy: ", lambda x, v: _evaluate(x, act=v), (None, 3, dict)),
-    ("policy: ", lambda x, v: _evaluate(x, env=x["matches"], act=mqe_jax.load_policy(v, x["match"])), ("idle",)),
-    ("memory: ", lambda x, v: _evaluate(x, act=mqe_jax.load_policy("forward", x["fake"]), memory=v), (np.zeros(2),)),
+    (
+        "policy: ",
+        lambda x, v: _evaluate(x, env=x["matches"], act=mqe_jax.load_policy(v, x["match"])),
+        ("idle",),
+    ),
+    (
+        "memory: ",
+        lambda x, v: _evaluate(x, act=mqe_jax.load_policy("forward", x["fake"]), memory=v),
+        (np.zeros(2),),
+    ),
     ("env: ", lambda x, v: _evaluate(x, env=v), (None, "go1gate", 3)),
     ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),
-    ("source: ", lambda x, v: mqe_jax.load_policy(v), (3, None, [], "", "a\0b", "x" * 300, "x" * 9999)),
+    (
+        "source: ",
+        lambda x, v: mqe_jax.load_policy(v),
+        (3, None, [], "", "a\0b", "x" * 300, "x" * 9999),
+    ),
     ("env: ", lambda x, v: mqe_jax.load_policy("scripted", v), ("go1gate",)),
-    ("opponents", lambda x, v: versus(x["matches"], v), ([], 3, [3], None, [dict], ["idle", fake_env], {"idle"})),
+    (
+        "opponents",
+        lambda x, v: versus(x["matches"], v),
+        ([], 3, [3], None, [dict], ["idle", fake_env], {"idle"}),
+    ),
     ("key: ", lambda x, v: x["team"].reset(v), (3, None)),
-    ("state: ", lambda x, v: x["team"].step(x.get(v, v), np.zeros((2, 1, 12))), (None, 3, "state", "states")),
+    (
+        "state: ",
+        lambda x, v: x["team"].step(x.get(v, v), np.zeros((2, 1, 12))),
+        (None, 3, "state", "states"),
+    ),
     ("state: ", lambda x, v: x["team"].change(x.get(v, v), 0, v), (None, 3, "state", "states")),
     ("block: ", lambda x, v: x["team"].change(x["teams"], v, None), (None, -1, "x", 1.5)),
     ("policy: ", lambda x, v: x["team"].change(x["teams"], 0, v), (None, 3, TrainedPolicy)),
-    ("state: ", lambda x, v: x["task"].step(x.get(v, v), np.zeros((2, 12), np.float32)), (None, 3, "states", "other")),
-    ("state: ", lambda x, v: x["matches"].step(x.get(v, v), np.zeros((2, 2, 12))), (None, 3, "state", "other")),
+    (
+        "state: ",
+        lambda x, v: x["task"].step(x.get(v, v), np.zeros((2, 12), np.float32)),
+        (None, 3, "states", "other"),
+    ),
+    (
+        "state: ",
+        lambda x, v: x["matches"].step(x.get(v, v), np.zeros((2, 2, 12))),
+        (None, 3, "state", "other"),
+    ),
     ("assistance: ", lambda x, v: x["task"].reset(KEY, v), LEVELS),
-    ("policy: ", lambda x, v: load_policy("go1tug", make("go1tug", impl="c", num_envs=1, robot=v)), ("go2",)),
-    ("deterministic: ", lambda x, v: load_policy("idle", x["match"], deterministic=v), (None, 3, "x")),
+    (
+        "policy: ",
+        lambda x, v: load_policy("go1tug", make("go1tug", impl="c", num_envs=1, robot=v)),
+        ("go2",),
+    ),
+    (
+        "deterministic: ",
+        lambda x, v: load_policy("idle", x["match"], deterministic=v),
+        (None, 3, "x"),
+    ),
     ("parts: ", lambda x, v: x["matches"].share(v), (0, -1, True, NAN, np.zeros(3))),
     ("num_envs: ", lambda x, v: x["task"].with_num_envs(v), (0, None, True, "x")),
     ("name: ", lambda x, v: x["match"].object_pose(None, v), ("cyl", None, [])),
-    ("obs: ", lambda x, v: load_policy("scripted", x["walks"]).act(v, (), KEY), (None, "x", np.zeros((2, 1, 9)), 3)),
+    (
+        "obs: ",
+        lambda x, v: load_policy("scripted", x["walks"]).act(v, (), KEY),
+        (None, "x", np.zeros((2, 1, 9)), 3),
+    ),
     ("data: ", lambda x, v: x["match"].object_pose(v, "cylinder"), (None, 3, KEY)),
-    ("obs: ", lambda x, v: all_agents(x["match"], x["idle"]).act(v, ((), ()), KEY), (None, np.zeros((2, 1, 10)))),
-    ("key: ", lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), ((), ()), v), (None, 3)),
-    ("memory: ", lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), v, KEY), (None, ())),
+    (
+        "obs: ",
+        lambda x, v: all_agents(x["match"], x["idle"]).act(v, ((), ()), KEY),
+        (None, np.zeros((2, 1, 10))),
+    ),
+    (
+        "key: ",
+        lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), ((), ()), v),
+        (None, 3),
+    ),
+    (
+        "memory: ",
+        lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), v, KEY),
+        (None, ()),
+    ),
     ("num_envs: ", lambda x, v: x["idle"].initial_memory(v), (0, NAN, "x")),
-    ("key: ", lambda x, v: load_policy("random", x["match"]).act(jnp.zeros((2, 1, 10)), (), v), (None, 3, "x")),
-    ("needs: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), needs=v), (None, (1, 2, 3))),
+    (
+        "key: ",
+        lambda x, v: load_policy("random", x["match"]).act(jnp.zeros((2, 1, 10)), (), v),
+        (None, 3, "x"),
+    ),
+    (
+        "needs: ",
+        lambda x, v: dataclasses.replace(load_policy("go1tug"), needs=v),
+        (None, (1, 2, 3)),
+    ),
     ("config: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), config=v), (None, {})),
-    ("metadata: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), metadata=v), (None, "x")),
-    ("deterministic: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), deterministic=v), (None, 1)),
-    ("params: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), params=v), (None, {}, np.zeros(3))),
-    ("normalizer: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), normalizer=v), (None, 3)),
+    (
+        "metadata: ",
+        lambda x, v: dataclasses.replace(load_policy("go1tug"), metadata=v),
+        (None, "x"),
+    ),
+    (
+        "deterministic: ",
+        lambda x, v: dataclasses.replace(load_policy("go1tug"), deterministic=v),
+        (None, 1),
+    ),
+    (
+        "params: ",
+        lambda x, v: dataclasses.replace(load_policy("go1tug"), params=v),
+        (None, {}, np.zeros(3)),
+    ),
+    (
+        "normalizer: ",
+        lambda x, v: dataclasses.replace(load_policy("go1tug"), normalizer=v),
+        (None, 3),
+    ),
     ("task: ", lambda x, v: mqe_jax.evaluate(v, "idle"), (None, 3, "x" * 300, [])),
     ("env", lambda x, v: mqe_jax.evaluate("go1tug", "idle", env=v), (3, "x", [], {1: 2})),
     ("impl: ", lambda x, v: mqe_jax.evaluate("go1tug", "idle", impl=v), (None, 3, np.zeros(3))),
-    ("deterministic: ", lambda x, v: mqe_jax.render("go1tug", "idle", deterministic=v), (None, 3, np.zeros(3))),
-    ("policy: ", lambda x, v: mqe_jax.evaluate(x["match"], load_policy("idle", x[v])), ("task", "fake")),
-    ("opponent: ", lambda x, v: mqe_jax.evaluate(x["match"], "idle", load_policy("idle", x[v])), ("task", "sumo")),
+    (
+        "deterministic: ",
+        lambda x, v: mqe_jax.render("go1tug", "idle", deterministic=v),
+        (None, 3, np.zeros(3)),
+    ),
+    (
+        "policy: ",
+        lambda x, v: mqe_jax.evaluate(x["match"], load_policy("idle", x[v])),
+        ("task", "fake"),
+    ),
+    (
+        "opponent: ",
+        lambda x, v: mqe_jax.evaluate(x["match"], "idle", load_policy("idle", x[v])),
+        ("task", "sumo"),
+    ),
     ("env", lambda x, v: mqe_jax.learn("go1plane", "demo", env=v), (3, "x", [], {1: 2})),
     ("resume: ", lambda x, v: mqe_jax.learn("go1plane", "demo", resume=v), (None, 0, "x")),
     ("start: ", lambda x, v: mqe_jax.learn("go1plane", {"start": v}), ("x" * 300, "")),
-    ("seeds", lambda x, v: mqe_jax.learn_seeds("go1plane", "demo", seeds=v), (None, 3, [], [-1], range(65), "ab")),
-    ("seeds: ", lambda x, v: mqe_jax.make_learner("go1plane", "demo", seeds=v), (None, 0, True, 10**12)),
-    ("actions: ", lambda x, v: Recording("a", {}, "c", "command", {"x": np.zeros(2)}, v), (np.zeros(2),)),
-    ("params: ", lambda x, v: Recording("a", v, "c", "command", {}, np.zeros((2, 1, 1))), (None, {"control": "c"})),
+    (
+        "seeds",
+        lambda x, v: mqe_jax.learn_seeds("go1plane", "demo", seeds=v),
+        (None, 3, [], [-1], range(65), "ab"),
+    ),
+    (
+        "seeds: ",
+        lambda x, v: mqe_jax.make_learner("go1plane", "demo", seeds=v),
+        (None, 0, True, 10**12),
+    ),
+    (
+        "actions: ",
+        lambda x, v: Recording("a", {}, "c", "command", {"x": np.zeros(2)}, v),
+        (np.zeros(2),),
+    ),
+    (
+        "params: ",
+        lambda x, v: Recording("a", v, "c", "command", {}, np.zeros((2, 1, 1))),
+        (None, {"control": "c"}),
+    ),
     ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
     ("mixture: ", lambda x, v: save_mixture("folder", v), (None, 3, Mixture)),
     ("members: ", lambda x, v: Mixture(v, (1.0,)), (None, 3, (), ("a",), (load_policy,) * 5)),
-    ("weights", lambda x, v: Mixture((load_policy("go1tug"),), v), (None, 3, (), (0.5,), (NAN,), (0.5, 0.5))),
-    ("num_envs: ", lambda x, v: Mixture((load_policy("go1tug"),), (1.0,)).initial_memory(v), (0, NAN, "x")),
+    (
+        "weights",
+        lambda x, v: Mixture((load_policy("go1tug"),), v),
+        (None, 3, (), (0.5,), (NAN,), (0.5, 0.5)),
+    ),
+    (
+        "num_envs: ",
+        lambda x, v: Mixture((load_policy("go1tug"),), (1.0,)).initial_memory(v),
+        (0, NAN, "x"),
+    ),
     ("policy: ", lambda x, v: zoo.ship(v, zoo.card("go1tug")), (None, 3, Mixture)),
-    ("folder: ", lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v), (None, 3, "")),
+    (
+        "folder: ",
+        lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v),
+        (None, 3, ""),
+    ),
     ("policies", lambda x, v: mqe_jax.tournament("go1tug", v), (None, 3, [], [3], {})),
     ("task: ", lambda x, v: mqe_jax.tournament(v, ["idle"]), ("x",)),
     ("task: ", lambda x, v: mqe_jax.exploitability(v, "idle", "a"), ("go1gate", "x", 3)),
     ("policy: ", lambda x, v: mqe_jax.exploitability("go1tug", v, "a"), (None, 3, "x", "")),
-    ("seeds", lambda x, v: mqe_jax.exploitability("go1tug", "idle", "a", seeds=v), (None, 3, [], [-1], [1, 1])),
-    ("episodes: ", lambda x, v: mqe_jax.exploitability("go1tug", "idle", "a", episodes=v), (None, 3, 0, "x")),
-    ("polic", lambda x, v: mqe_jax.double_oracle("go1tug", v, "a"), (None, 3, [], ["x"], ["go1tug"] * 2, ["idle"])),
-    ("rounds: ", lambda x, v: mqe_jax.double_oracle("go1tug", ["go1tug"], "a", rounds=v), (None, 0, "x")),
+    (
+        "seeds",
+        lambda x, v: mqe_jax.exploitability("go1tug", "idle", "a", seeds=v),
+        (None, 3, [], [-1], [1, 1]),
+    ),
+    (
+        "episodes: ",
+        lambda x, v: mqe_jax.exploitability("go1tug", "idle", "a", episodes=v),
+        (None, 3, 0, "x"),
+    ),
+    (
+        "polic",
+        lambda x, v: mqe_jax.double_oracle("go1tug", v, "a"),
+        (None, 3, [], ["x"], ["go1tug"] * 2, ["idle"]),
+    ),
+    (
+        "rounds: ",
+        lambda x, v: mqe_jax.double_oracle("go1tug", ["go1tug"], "a", rounds=v),
+        (None, 0, "x"),
+    ),
     ("scripted: ", lambda x, v: register_task(TASKS["go1gate"], v), (3, "x")),
     ("policy: ", lambda x, v: register_scripted("go1gate", "mine", v), (None, 3, "x")),
-    ("name: ", lambda x, v: register_scripted("go1gate", v, lambda obs: obs["base"]), (None, 3, "")),
+    (
+        "name: ",
+        lambda x, v: register_scripted("go1gate", v, lambda obs: obs["base"]),
+        (None, 3, ""),
+    ),
     ("num_envs: ", lambda x, v: mqe_jax.bench("go1gate", num_envs=v), (None, 0, "x")),
     ("skill: ", lambda x, v: mqe_jax.train_skill(v, "runs/a"), (None, 3, "walc")),
     ("scenario", lambda x, v: mqe_jax.evaluate_skill("walk", scenarios=v), (3, ["flatt"], [3])),
@@ -181,23 +344,47 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("match: ", lambda x, v: TeamEnv(x.get(v, v), "idle"), (None, 3, "matches")),
     ("key: ", lambda x, v: TeamEnv(x["match"], "idle").reset(v), (None, 3)),
     ("assistance: ", lambda x, v: TeamEnv(x["match"], "idle").reset(KEY, v), LEVELS),
-    ("state: ", lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))), (None, "state")),
-    ("env: ", lambda x, v: recording.record_episodes(x.get(v, v), x["act"], KEY), (None, 3, "matches")),
+    (
+        "state: ",
+        lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))),
+        (None, "state"),
+    ),
+    (
+        "env: ",
+        lambda x, v: recording.record_episodes(x.get(v, v), x["act"], KEY),
+        (None, 3, "matches"),
+    ),
     ("episode: ", lambda x, v: _render(x, episode=v), (None, 3, [])),
     ("env: ", lambda x, v: scene_xml(x.get(v, v)), (None, "go1gate", "matches")),
     ("demonstrator: ", lambda x, v: Demonstrated(x["task"], 2, v), (None, 3, TrainedPolicy)),
     ("robot: ", lambda x, v: robots.register(v), (None, "go1")),
     ("path: ", lambda x, v: read_curve(v), (None, 3, "", "a\0b")),
-    ("draw_reward: ", lambda x, v: versus(x["matches"], ["idle"], draw_reward=v), (NAN, "x", 1e300)),
+    (
+        "draw_reward: ",
+        lambda x, v: versus(x["matches"], ["idle"], draw_reward=v),
+        (NAN, "x", 1e300),
+    ),
     ("env: ", lambda x, v: versus(v, ["idle"]), (None, "go1tug")),
     ("env: ", lambda x, v: Mirror(v), (None, 3)),
     ("episodes: ", lambda x, v: _record(x, episodes=v), (0, NAN, 1.5, 10**8)),
     ("seconds: ", lambda x, v: _record(x, seconds=v), (0, NAN, math.inf, -1, 1e-9, "x")),
     ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
     ("key: ", lambda x, v: _record(x, v), (None, 7)),
-    ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (v, memory)), (None, np.zeros((1, 2, 4)))),
-    ("policy: ", lambda x, v: _record(x, act=lambda obs, memory, key: (np.zeros((1, 2, 3)), v)), (3, None, [])),
-    ("episode: ", lambda x, v: _render(x, episode=dataclasses.replace(x["episode"], **{v: WALLS})), ("mocap_pos",)),
+    (
+        "policy: ",
+        lambda x, v: _record(x, act=lambda obs, memory, key: (v, memory)),
+        (None, np.zeros((1, 2, 4))),
+    ),
+    (
+        "policy: ",
+        lambda x, v: _record(x, act=lambda obs, memory, key: (np.zeros((1, 2, 3)), v)),
+        (3, None, []),
+    ),
+    (
+        "episode: ",
+        lambda x, v: _render(x, episode=dataclasses.replace(x["episode"], **{v: WALLS})),
+        ("mocap_pos",),
+    ),
     ("size", lambda x, v: _render(x, size=v), ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))),
     ("fps: ", lambda x, v: _render(x, fps=v), (-1, 0, NAN, math.inf, "x")),
     ("speed: ", lambda x, v: _render(x, speed=v), (0, -1, NAN)),
@@ -209,73 +396,146 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("episode: ", lambda x, v: render.render_episode(x["match"], x["episode"], x["gif"]), (None,)),
     ("output: ", lambda x, v: _render(x, episode=x["long"], size=(4096, 4096), fps=50), (None,)),
     ("env: ", lambda x, v: needs_of(v, x["config"]), (None, "task")),
-    ("processes: ", lambda x, v: make_learner(x["batch"], x["config"], processes=v), (None, 0, "x")),
+    (
+        "processes: ",
+        lambda x, v: make_learner(x["batch"], x["config"], processes=v),
+        (None, 0, "x"),
+    ),
     ("key: ", lambda x, v: make_learner(x["batch"], x["config"]).init(v), (None, 3)),
     ("state: ", lambda x, v: make_learner(x["batch"], x["config"]).update(v), (None, 3)),
     ("state: ", lambda x, v: policy_of(v, x["batch"], x["config"]), (None, {})),
     ("name: ", lambda x, v: register_network(v), (None, 3)),
     ("network: ", lambda x, v: register_network("x")(v), (None, 3, dict)),
     ("skill: ", lambda x, v: skills.register(x.get(v, v)), (None, Path, "task")),
-    *((n, lambda x, v, n=n: save_tree(**{**SAVED, n: v}), ([], {"a": KEY})) for n in ("metadata", "kind")),
-    *((n, lambda x, v, n=n: save_tree(**{**SAVED, n: {"a": v}}), ("x", [b"a"])) for n in ("path", "tree")),
+    *(
+        (n, lambda x, v, n=n: save_tree(**{**SAVED, n: v}), ([], {"a": KEY}))
+        for n in ("metadata", "kind")
+    ),
+    *(
+        (n, lambda x, v, n=n: save_tree(**{**SAVED, n: {"a": v}}), ("x", [b"a"]))
+        for n in ("path", "tree")
+    ),
     ("kind: ", lambda x, v: load_tree("a", {}, kind=v), (None, "x", [])),
     ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), ("", 3)),
     ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
     ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
     ("TrainConfig: ", lambda x, v: build(TrainConfig, v), (None, [1], "x")),
     ("policy: ", lambda x, v: read_policy(v), (None, 3, "\0")),
-    ("num_envs: ", lambda x, v: gymnasium.VectorEnv("go1plane", v, impl="c"), (0, NAN, 1.5, True, None, 10**12)),
-    ("spawn_joint_scale", lambda x, v: make("go1gate", spawn_joint_scale=v), ((1, 0), (NAN, 1), (1,), "64x64", 3)),
+    (
+        "num_envs: ",
+        lambda x, v: gymnasium.VectorEnv("go1plane", v, impl="c"),
+        (0, NAN, 1.5, True, None, 10**12),
+    ),
+    (
+        "spawn_joint_scale",
+        lambda x, v: make("go1gate", spawn_joint_scale=v),
+        ((1, 0), (NAN, 1), (1,), "64x64", 3),
+    ),
     ("rewards", lambda x, v: make("go1gate", rewards=v), (3, "x", [], {"x": 1})),
     ("randomization: ", lambda x, v: make("go1gate", randomization=v), (3, "x", [])),
     ("action: ", lambda x, v: x["task"].step(x["state"], v), (np.zeros((1, 2, 12)), 3, [])),
     ("unknown name", lambda x, v: build(TrainConfig, {v: 1}), ("", 3, b"a", "a" * 5000, "\0")),
     ("ppo: ", lambda x, v: override(TrainConfig(), {"ppo": v}), (3, "x", [], None)),
-    ("unknown name", lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}), ("self", "__dataclass_self__", "init")),
-    ("path: ", lambda x, v: v[0](v[1]), tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0")))),
+    (
+        "unknown name",
+        lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}),
+        ("self", "__dataclass_self__", "init"),
+    ),
+    (
+        "path: ",
+        lambda x, v: v[0](v[1]),
+        tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0"))),
+    ),
     ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),
     ("env: ", lambda x, v: save_recording("a.npz", v, x["states"], KEY), (None, "go1gate")),
     ("recording: ", lambda x, v: replay(v), (None, "a.npz")),
-    ("policy: ", lambda x, v: tournament.play(x["matches"], v, [], KEY), (None, "idle", TrainedPolicy)),
-    ("policies", lambda x, v: tournament.round_robin(x["matches"], v, KEY), (None, [], {}, {"a": "idle"})),
-    ("results: ", lambda x, v: tournament.scores(v), (None, 3, np.ones(3), np.ones((2, 2)), np.full((2, 2, 3), NAN))),
+    (
+        "policy: ",
+        lambda x, v: tournament.play(x["matches"], v, [], KEY),
+        (None, "idle", TrainedPolicy),
+    ),
+    (
+        "policies",
+        lambda x, v: tournament.round_robin(x["matches"], v, KEY),
+        (None, [], {}, {"a": "idle"}),
+    ),
+    (
+        "results: ",
+        lambda x, v: tournament.scores(v),
+        (None, 3, np.ones(3), np.ones((2, 2)), np.full((2, 2, 3), NAN)),
+    ),
     ("results: ", lambda x, v: games.analyse(v), (None, GAMES)),
-    ("payoff: ", lambda x, v: games.nash(v), (None, 3, np.ones((1, 2)), np.ones((2, 2)), np.full((2, 2), NAN))),
-    ("rates: ", lambda x, v: games.mates(v, 1), (None, np.ones((1, 2)), np.full((2, 2), 2.0), np.full((1, 1), NAN))),
-    ("rates: ", lambda x, v: games.partners(v, 1), (None, np.ones(2), np.ones((0, 2)), np.full((1, 2), 2.0))),
+    (
+        "payoff: ",
+        lambda x, v: games.nash(v),
+        (None, 3, np.ones((1, 2)), np.ones((2, 2)), np.full((2, 2), NAN)),
+    ),
+    (
+        "rates: ",
+        lambda x, v: games.mates(v, 1),
+        (None, np.ones((1, 2)), np.full((2, 2), 2.0), np.full((1, 1), NAN)),
+    ),
+    (
+        "rates: ",
+        lambda x, v: games.partners(v, 1),
+        (None, np.ones(2), np.ones((0, 2)), np.full((1, 2), 2.0)),
+    ),
     ("reference: ", lambda x, v: tournament.rate(GAMES, v), (None, -1, 1, "a")),
     ("episodes", lambda x, v: recording.best(v), (None, [], [3])),
     ("episodes", lambda x, v: recording.typical(v), (None, [], [3])),
     ("episode: ", lambda x, v: render.render_frames(x["fake"], v), (None, 3)),
-    ("frames: ", lambda x, v: clips.write_clip("a.gif", v, 25.0), (None, 3, [], ["x"], [WALLS], [FRAME, FRAME[:8]])),
+    (
+        "frames: ",
+        lambda x, v: clips.write_clip("a.gif", v, 25.0),
+        (None, 3, [], ["x"], [WALLS], [FRAME, FRAME[:8]]),
+    ),
     ("output", lambda x, v: clips.write_clip(v, [FRAME], 25.0), ("a.txt", "a")),
     ("Episode: ", lambda x, v: recording.Episode(v, v, v, 0.1), (None, WALLS)),
-    ("dt: ", lambda x, v: recording.Episode(WALLS[:, 0], WALLS[:, :0], np.zeros((3, 0, 4)), v), (None, -1.0, 0)),
+    (
+        "dt: ",
+        lambda x, v: recording.Episode(WALLS[:, 0], WALLS[:, :0], np.zeros((3, 0, 4)), v),
+        (None, -1.0, 0),
+    ),
     ("tables", lambda x, v: curves.plot_curves(v, "a"), (None, [], [3])),
     ("name: ", lambda x, v: robots.get(v), (None, 3, {}, [])),
     ("not a regular file", lambda x, v: v[0](v[1]), FILES),
-]  # fmt: skip
+]
 
 
-@pytest.mark.parametrize(("said", "call", "value"), [(*row[:2], value) for row in CALLS for value in row[2]])
+@pytest.mark.parametrize(
+    ("said", "call", "value"), [(*row[:2], value) for row in CALLS for value in row[2]]
+)
 def test_bad_calls(
-    said: str, call: Any, value: Any, made: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    said: str,
+    call: Any,
+    value: Any,
+    made: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """An InputError that names the argument; nothing is written."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as error:
         call(made, value)
-    assert said in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 1000
+    assert (
+        said in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 1000
+    )
     assert list(tmp_path.iterdir()) == []
 
 
 def kinds() -> dict[str, Any]:
-    return {name: kind for name, kind in vars(limits).items() if getattr(kind, "__origin__", None) in (int, float)}
+    return {
+        name: kind
+        for name, kind in vars(limits).items()
+        if getattr(kind, "__origin__", None) in (int, float)
+    }
 
 
 @pytest.mark.parametrize("name", kinds())
 def test_every_kind_has_both_bounds(name: str) -> None:
-    """Numbers at the bounds are accepted, those just outside, NaN, infinity, booleans and texts refused."""
+    """Numbers at the bounds are accepted, those just outside, NaN, infinity, booleans and texts
+    refused.
+    """
     kind = kinds()[name]
     low, high = limits.bounds(kind)
     assert math.isfinite(low) and math.isfinite(high) and low < high
@@ -284,14 +544,31 @@ def test_every_kind_has_both_bounds(name: str) -> None:
         assert check("x", value, kind) == value
     step = 1 if whole else 1e-9
     outside = (low - max(step, step * abs(low)), high + max(step, step * abs(high)))
-    for value in (*outside, NAN, math.inf, -math.inf, True, "x", None, [], *([low + 0.5] if whole else [])):
+    for value in (
+        *outside,
+        NAN,
+        math.inf,
+        -math.inf,
+        True,
+        "x",
+        None,
+        [],
+        *([low + 0.5] if whole else []),
+    ):
         refuses(r"^x: ", check, "x", value, kind)
 
 
-def test_memory_is_compared_before_it_is_allocated(made: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_compared_before_it_is_allocated(
+    made: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert 2**26 < memory.free_memory() < 2**50
     monkeypatch.setattr(memory, "free_memory", lambda: 2.0**30)
-    refuses(r"num_envs: 131072 needs .* GB or more; at most 0\.5 GB may be used", VectorEnv, made["task"], 2**17)
+    refuses(
+        r"num_envs: 131072 needs .* GB or more; at most 0\.5 GB may be used",
+        VectorEnv,
+        made["task"],
+        2**17,
+    )
     config = override(made["config"], {"rollout_steps": 10_000, "num_envs": 100_000})
     batch = fake_env.FakeVectorEnv(made["fake"], 100_000)
     refuses("rollout_steps: 10000 needs", train, batch, config, "run")
@@ -299,7 +576,9 @@ def test_memory_is_compared_before_it_is_allocated(made: dict[str, Any], monkeyp
 
 @contextlib.contextmanager
 def refusing(*names: str) -> Iterator[None]:
-    """Accepts an InputError of one line that has one of the names, if any; nothing else may be raised."""
+    """Accepts an InputError of one line that has one of the names, if any; nothing else may be
+    raised.
+    """
     try:
         yield
     except InputError as error:
@@ -320,7 +599,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @example(("go1gate", "episode_length", 1e-9))
 @example(("go1gate", "friction", 1e300))
 def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str, Any]) -> None:
-    """In every settings class: training, sweeps, walking, networks and the parameters of all tasks."""
+    """In every settings class: training, sweeps, walking, networks and the parameters of all
+    tasks.
+    """
     name, field, value = case
     needed = {"tasks": ("go1gate",)} if name == "sweep" else {}
     refuses(field.split(".")[-1], build, inputs.settings_classes()[name], {field: value} | needed)
@@ -329,7 +610,9 @@ def test_a_number_outside_its_bounds_is_refused_by_its_name(case: tuple[str, str
 @inputs.CASES
 @given(inputs.wrong_flags())
 def test_flags_are_parsed_or_refused(words: list[str]) -> None:
-    """A number outside its bounds is not parsed; other texts may be allowed where a text belongs."""
+    """A number outside its bounds is not parsed; other texts may be allowed where a text
+    belongs.
+    """
     with refusing():
         try:
             command = parse(words)
@@ -342,8 +625,11 @@ def test_flags_are_parsed_or_refused(words: list[str]) -> None:
 @pytest.mark.parametrize(("kind", "read"), [(TrainConfig, load_config), (Sweep, load_sweep)])
 @inputs.CASES
 @given(data=st.data())
-def test_yaml_of_settings_is_read_or_refused(kind: Any, read: Any, folder: Path, data: st.DataObject) -> None:
-    file, needed = folder / "settings.yaml", "tasks: [go1gate]\n" if kind is Sweep else ""
+def test_yaml_of_settings_is_read_or_refused(
+    kind: Any, read: Any, folder: Path, data: st.DataObject
+) -> None:
+    file = folder / "settings.yaml"
+    needed = "tasks: [go1gate]\n" if kind is Sweep else ""
     file.write_text(needed + data.draw(inputs.yaml_text(kind)), encoding="utf-8", errors="replace")
     with refusing(file.name):
         read(file)
@@ -354,7 +640,9 @@ TREE = {"weights": jnp.arange(12.0).reshape(3, 4), "count": jnp.int32(7)}
 
 @inputs.CASES
 @given(data=st.data(), kind=st.sampled_from(["policy", "checkpoint"]))
-def test_a_damaged_policy_or_checkpoint_is_refused(folder: Path, data: st.DataObject, kind: str) -> None:
+def test_a_damaged_policy_or_checkpoint_is_refused(
+    folder: Path, data: st.DataObject, kind: str
+) -> None:
     file = folder / f"{kind}.safetensors"
     save_tree(file, TREE, {"task": "fake", "dims": [2, 1, 2, 3, 2], "config": {}}, kind=kind)
     whole = file.read_bytes()
@@ -364,4 +652,6 @@ def test_a_damaged_policy_or_checkpoint_is_refused(folder: Path, data: st.DataOb
         read_policy(file)
     with refusing(file.name):
         read = load_tree(file, TREE, kind=kind).tree
-        assert all(bool((read[name] == TREE[name]).all()) for name in TREE), "read with other values"
+        assert all(bool((read[name] == TREE[name]).all()) for name in TREE), (
+            "read with other values"
+        )

@@ -1,4 +1,7 @@
-"""Hostile files: YAML, JSON, CSV, safetensors, policies, archives. Each is refused in one line, within the limits."""
+"""Hostile files: YAML, JSON, CSV, safetensors, policies, archives.
+
+Each is refused in one line, within the limits.
+"""
 
 import functools
 import json
@@ -39,7 +42,8 @@ def peak() -> int:
 
 
 ALIASES = "".join(
-    f"{'abcdefgh'[i]}: &{'abcdefgh'[i]} [{', '.join(['*' + 'abcdefgh'[i - 1]] * 9)}]\n" for i in range(1, 8)
+    f"{'abcdefgh'[i]}: &{'abcdefgh'[i]} [{', '.join(['*' + 'abcdefgh'[i - 1]] * 9)}]\n"
+    for i in range(1, 8)
 )
 YAMLS = {
     "aliases": "a: &a [x, x]\n" + ALIASES,
@@ -68,7 +72,9 @@ def test_bad_yaml(case: str, tmp_path: Path) -> None:
     assert str(error.value).startswith(str(path)) and len(str(error.value)) < 500
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "[" * 33 + "]" * 33, "9" * 5000, "{", '{"a": 1} x', ""])
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, "[" * 33 + "]" * 33, "9" * 5000, "{", '{"a": 1} x', ""]
+)
 def test_bad_json(text: str) -> None:
     refuses(r"^x: damaged, or not JSON", parse_json, text, "x")
 
@@ -80,7 +86,10 @@ def test_bad_json(text: str) -> None:
         [],
         {"evaluations": [{}], "absolute": None},
         {"evaluations": [], "absolute": {"env_steps": "x"}},
-        {"evaluations": [{"env_steps": 1, "sampled": {"x": math.nan}, "deterministic": {}}], "absolute": None},
+        {
+            "evaluations": [{"env_steps": 1, "sampled": {"x": math.nan}, "deterministic": {}}],
+            "absolute": None,
+        },
     ],
     ids=str,
 )
@@ -91,7 +100,14 @@ def test_evaluations_of_another_form(content: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [os.urandom(2000), b"\0" * 100, b"env_steps,average_step_reward\n1", b"a,b\n" + b"x" * 200_000, b'"', b""],
+    [
+        os.urandom(2000),
+        b"\0" * 100,
+        b"env_steps,average_step_reward\n1",
+        b"a,b\n" + b"x" * 200_000,
+        b'"',
+        b"",
+    ],
     ids=["random", "zeros", "short row", "long field", "quote", "empty"],
 )
 def test_bad_metrics(content: bytes, tmp_path: Path) -> None:
@@ -123,9 +139,12 @@ def tensors(dtype: str, size: int, metadata: dict[str, str] | None = None) -> by
 
 
 @pytest.mark.parametrize(
-    ("dtype", "size"), [("F8_E4M3", 1), ("F4", 1), ("X", 4), ("F32", 3), ("C64", 8), ("I64", 8), ("BOOL", 1)]
+    ("dtype", "size"),
+    [("F8_E4M3", 1), ("F4", 1), ("X", 4), ("F32", 3), ("C64", 8), ("I64", 8), ("BOOL", 1)],
 )
-def test_weights_of_types_that_are_not_floating_point(dtype: str, size: int, tmp_path: Path) -> None:
+def test_weights_of_types_that_are_not_floating_point(
+    dtype: str, size: int, tmp_path: Path
+) -> None:
     path = tmp_path / "w.safetensors"
     path.write_bytes(tensors(dtype, size))
     refuses(rf"^weights {path}: damaged, or not a safetensors file", read_tensors, path, "weights")
@@ -134,7 +153,16 @@ def test_weights_of_types_that_are_not_floating_point(dtype: str, size: int, tmp
 
 SIZES = {"agents": 1, "observation": 1, "privileged": 1, "action": 1, "values": 1}
 METADATA = [
-    *("[]", "3", "null", '{"needs": 3}', '{"needs": [1]}', '{"needs": {"task": []}}', "[" * 5000, '{"config": []}'),
+    *(
+        "[]",
+        "3",
+        "null",
+        '{"needs": 3}',
+        '{"needs": [1]}',
+        '{"needs": {"task": []}}',
+        "[" * 5000,
+        '{"config": []}',
+    ),
     *(
         json.dumps({"needs": {"task": "probe", "dims": {**SIZES, "agents": value}}, "config": {}})
         for value in (-1, 1e300, True, None, [], "x")
@@ -169,14 +197,22 @@ def encrypted(content: bytes) -> bytes:
 LINEAR = named("weight", tensor((1,), (1,)))
 ARCHIVES: dict[str, Callable[[], bytes]] = {
     "large member": lambda: archived(module(LINEAR), bytes(limits.WEIGHTS_BYTES)),
-    "one number as a large tensor": lambda: archived(module(named("w", tensor((2**14, 2**14), (0, 0))))),
-    "many large tensors": lambda: archived(module(*(named(str(i), tensor((2**12, 2**12), (0, 0))) for i in range(9)))),
+    "one number as a large tensor": lambda: archived(
+        module(named("w", tensor((2**14, 2**14), (0, 0))))
+    ),
+    "many large tensors": lambda: archived(
+        module(*(named(str(i), tensor((2**12, 2**12), (0, 0))) for i in range(9)))
+    ),
     "NaN": lambda: archived(module(LINEAR), struct.pack("<f", math.nan)),
     "negative size": lambda: archived(module(named("w", tensor((-1,), (1,))))),
     "beyond its storage": lambda: archived(module(named("w", tensor((2,), (1,))))),
-    "module in itself": lambda: archived(b"c__torch__.x\nM\n)\x81q\x00}(" + named("a", b"h\x00") + b"ub"),
+    "module in itself": lambda: archived(
+        b"c__torch__.x\nM\n)\x81q\x00}(" + named("a", b"h\x00") + b"ub"
+    ),
     "module twice": lambda: archived(module(named("a", module() + b"q\x00"), named("b", b"h\x00"))),
-    "depth": lambda: archived((b"c__torch__.x\nM\n)\x81}(" + named("a", b"")) * 3000 + b"N" + b"ub" * 3000),
+    "depth": lambda: archived(
+        (b"c__torch__.x\nM\n)\x81}(" + named("a", b"")) * 3000 + b"N" + b"ub" * 3000
+    ),
     "memo": lambda: archived(b"Nr\xff\xff\xff\x7f"),
     "class": lambda: archived(b"cos\nsystem\n(X\x04\x00\x00\x00truetR"),
     "root": lambda: archived(b"K\x01"),
@@ -184,7 +220,10 @@ ARCHIVES: dict[str, Callable[[], bytes]] = {
     "encrypted": lambda: encrypted(archived(module(LINEAR))),
     "no archive": lambda: b"hello",
     "the start of an archive": lambda: b"PK\x03\x04",
-    **{f"pickle {i}": functools.partial(zipped, text, {"0": bytes(4)}) for i, text in enumerate(inputs.PICKLES)},
+    **{
+        f"pickle {i}": functools.partial(zipped, text, {"0": bytes(4)})
+        for i, text in enumerate(inputs.PICKLES)
+    },
 }
 
 
@@ -205,7 +244,8 @@ def test_a_recording_whose_parameters_are_none(name: str, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("case", ARCHIVES)
 def test_bad_archives(case: str, tmp_path: Path) -> None:
-    path, before = tmp_path / "bad.jit", peak()
+    path = tmp_path / "bad.jit"
+    before = peak()
     path.write_bytes(ARCHIVES[case]())
     said = "its members have" if case == "large member" else ""
     refuses(rf"bad\.jit: damaged, or not a TorchScript Sequential.*{said}", read_torchscript, path)
@@ -213,10 +253,12 @@ def test_bad_archives(case: str, tmp_path: Path) -> None:
     refuses(r"bad\.jit", load_recording, path)
 
 
-# -- impossible content, whose checksum is right -----------------------------------------------------------------------
+# -- impossible content, whose checksum is right
 
 PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
-SETTINGS = settings(normalization__observations=True, ppo__epochs=1, ppo__minibatches=1, total_steps=32)
+SETTINGS = settings(
+    normalization__observations=True, ppo__epochs=1, ppo__minibatches=1, total_steps=32
+)
 
 
 @pytest.fixture(scope="module")
@@ -226,8 +268,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def refuses_rewritten(said: str, kind: str, run: Path, name: str, value: Any, metadata: dict[str, Any]) -> None:
-    """Asserts that a run is refused with a value in the last place of the first array whose name starts so."""
+def refuses_rewritten(
+    said: str, kind: str, run: Path, name: str, value: Any, metadata: dict[str, Any]
+) -> None:
+    """Asserts that a run is refused with a value in the last place of the first array whose name
+    starts so.
+    """
     path = run / "policy.safetensors" if kind == "policy" else checkpoint.list_checkpoints(run)[-1]
     arrays, about = checkpoint._read(path, kind)
     name = next(other for other in arrays if other.startswith(name))
@@ -267,11 +313,19 @@ NUMBERS = {
 }
 
 
-@pytest.mark.parametrize(("kind", "name", "value"), [(kind, *row) for kind, rows in NUMBERS.items() for row in rows])
-def test_impossible_numbers(kind: str, name: str, value: float, trained: Path, tmp_path: Path) -> None:
-    """The updates of a checkpoint are those of its name: a run that seems to be finished is not, however untrained."""
+@pytest.mark.parametrize(
+    ("kind", "name", "value"), [(kind, *row) for kind, rows in NUMBERS.items() for row in rows]
+)
+def test_impossible_numbers(
+    kind: str, name: str, value: float, trained: Path, tmp_path: Path
+) -> None:
+    """The updates of a checkpoint are those of its name: a run that seems to be finished is not,
+    however untrained.
+    """
     run = Path(shutil.copytree(trained, tmp_path / "run"))
-    refuses_rewritten(rf"({name}.* holds .*; a number from|holds 1000000 updates)", kind, run, name, value, {})
+    refuses_rewritten(
+        rf"({name}.* holds .*; a number from|holds 1000000 updates)", kind, run, name, value, {}
+    )
 
 
 @pytest.mark.parametrize(
@@ -285,31 +339,54 @@ def test_impossible_numbers(kind: str, name: str, value: float, trained: Path, t
         ("policy", {"needs": {"task": ["probe"]}}, r"its settings cannot be read \(task"),
     ],
 )
-def test_impossible_metadata(kind: str, metadata: Any, said: str, trained: Path, tmp_path: Path) -> None:
+def test_impossible_metadata(
+    kind: str, metadata: Any, said: str, trained: Path, tmp_path: Path
+) -> None:
     name = "learning_rate" if kind == "checkpoint" else "normalizer/samples"
-    refuses_rewritten(said, kind, Path(shutil.copytree(trained, tmp_path / "run")), name, 1e-3, metadata)
+    refuses_rewritten(
+        said, kind, Path(shutil.copytree(trained, tmp_path / "run")), name, 1e-3, metadata
+    )
 
 
 @pytest.mark.parametrize("name", ["games", "score", "born"])
 def test_a_pool_of_impossible_numbers(name: str, tmp_path: Path) -> None:
     members: Any = pool.new_pool({"params": np.ones(2, np.float32)}, 3)
-    tree = {"extra": {"pool": members._replace(**{name: np.array([0, 0, -2], getattr(members, name).dtype)})}}
+    tree = {
+        "extra": {
+            "pool": members._replace(**{name: np.array([0, 0, -2], getattr(members, name).dtype)})
+        }
+    }
     checkpoint.save_tree(tmp_path / "a", tree, {}, kind="checkpoint")
-    refuses(rf"a: extra/pool/{name} holds -2", checkpoint.load_tree, tmp_path / "a", tree, kind="checkpoint")
+    refuses(
+        rf"a: extra/pool/{name} holds -2",
+        checkpoint.load_tree,
+        tmp_path / "a",
+        tree,
+        kind="checkpoint",
+    )
     with pytest.raises(InputError, match=rf"a: extra/pool/{name} holds -2"):
         checkpoint.load_tree(tmp_path / "a", members, kind="checkpoint", part="extra/pool/")
 
 
 def test_weights_that_no_network_has() -> None:
     layers = {"0.weight": np.full((32, 6), 1e20, np.float32), "0.bias": np.zeros(32, np.float32)}
-    with pytest.raises(InputError, match=r"^weights: 0\.weight holds magnitudes to 1e\+20; at most 10000 is allowed"):
+    with pytest.raises(
+        InputError,
+        match=r"^weights: 0\.weight holds magnitudes to 1e\+20; at most 10000 is allowed",
+    ):
         linear_layers("weights", layers, {"0": (6, 32)})
 
 
 @pytest.mark.parametrize("steps", ["16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16"])
 def test_steps_that_do_not_increase(steps: str, tmp_path: Path) -> None:
-    (tmp_path / "metrics.csv").write_text("env_steps,average_step_reward\n" + steps.replace("\n", ",1\n") + ",1\n")
-    refuses(r"metrics\.csv: its env_steps must be positive and increase", read_curve, tmp_path / "metrics.csv")
+    (tmp_path / "metrics.csv").write_text(
+        "env_steps,average_step_reward\n" + steps.replace("\n", ",1\n") + ",1\n"
+    )
+    refuses(
+        r"metrics\.csv: its env_steps must be positive and increase",
+        read_curve,
+        tmp_path / "metrics.csv",
+    )
 
 
 def test_a_finished_run_whose_rows_end_earlier(trained: Path, tmp_path: Path) -> None:

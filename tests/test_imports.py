@@ -12,7 +12,11 @@ PACKAGE = ROOT / "mqe_jax"
 def modules() -> dict[str, Path]:
     """Returns the source files by module, without the package's own name."""
     paths = {path.relative_to(PACKAGE).with_suffix(""): path for path in PACKAGE.rglob("*.py")}
-    return {".".join(parts.parts).removesuffix(".__init__"): path for parts, path in paths.items() if len(parts.parts)}
+    return {
+        ".".join(parts.parts).removesuffix(".__init__"): path
+        for parts, path in paths.items()
+        if len(parts.parts)
+    }
 
 
 def imported(path: Path, names: set[str]) -> set[str]:
@@ -25,7 +29,11 @@ def imported(path: Path, names: set[str]) -> set[str]:
                 full = f"{base}.{alias.name}" if base else alias.name
                 found.add(full if full in names else base)
         elif isinstance(node, ast.Import):
-            found |= {alias.name.removeprefix("mqe_jax.") for alias in node.names if alias.name.startswith("mqe_jax.")}
+            found |= {
+                alias.name.removeprefix("mqe_jax.")
+                for alias in node.names
+                if alias.name.startswith("mqe_jax.")
+            }
     return found - {""}
 
 
@@ -50,4 +58,6 @@ def test_commands_do_not_import_each_other() -> None:
 
 def test_networks_and_optimisers_are_our_own() -> None:
     for path in PACKAGE.rglob("*.py"):
-        assert not re.search(r"^\s*(import|from) (flax|optax)\b", path.read_text(encoding="utf-8"), re.MULTILINE), path
+        assert not re.search(
+            r"^\s*(import|from) (flax|optax)\b", path.read_text(encoding="utf-8"), re.MULTILINE
+        ), path

@@ -1,4 +1,6 @@
-"""SIGINT and SIGTERM: one line, exit code 130 or 143; SIGKILL too leaves a run that resumes exactly."""
+"""SIGINT and SIGTERM: one line, exit code 130 or 143; SIGKILL too leaves a run that resumes
+exactly.
+"""
 
 import signal
 import subprocess
@@ -15,26 +17,52 @@ from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from tests import fake_env
 from tests.training import assert_same_run, rows, without_progress
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc")
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="reads the handlers from Linux's /proc"
+)
 ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}
 SIGNALS = pytest.mark.parametrize("number", list(ENDS), ids=lambda number: number.name)
 FAKE = ["train", "fake", "--num-envs", "4", "--rollout-steps", "4", "--total-steps", str(300 * 16)]
-FAKE += ["--ppo.minibatches", "1", "--ppo.epochs", "1", "--network.hidden-sizes", "4", "--checkpoint.every", "100000"]
+FAKE += [
+    "--ppo.minibatches",
+    "1",
+    "--ppo.epochs",
+    "1",
+    "--network.hidden-sizes",
+    "4",
+    "--checkpoint.every",
+    "100000",
+]
 FAKE += ["--network.no-recurrent"]
 PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_env.py"))]
 GATE = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
-GATE += ["--num-envs", "4", "--rollout-steps", "8", "--ppo.minibatches", "2", "--checkpoint.every", "100000"]
+GATE += [
+    "--num-envs",
+    "4",
+    "--rollout-steps",
+    "8",
+    "--ppo.minibatches",
+    "2",
+    "--checkpoint.every",
+    "100000",
+]
 GATE += ["--total-steps", str(100 * 32)]
 
 
 def start(command: list[str]) -> subprocess.Popen[str]:
-    # A shell starts background jobs with SIGINT ignored, which children inherit; C signals are reset by this.
+    # A shell starts background jobs with SIGINT ignored, which children inherit; C signals are
+    # reset by this.
     return subprocess.Popen(
-        ["env", "--default-signal=INT", *command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        ["env", "--default-signal=INT", *command],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
 
 
-def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 300) -> None:
+def wait_for(
+    condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 300
+) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()[1]
@@ -74,15 +102,23 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
 
 
 @pytest.mark.usefixtures("shared_programs")
-def test_an_interrupted_training_is_saved_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_training_is_saved_and_resumes_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fake_env.install(monkeypatch)
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    whole = tmp_path / "whole"
+    stopped = tmp_path / "stopped"
     process = start([*PROGRAM, *FAKE, "--run-dir", str(stopped)])
     wait_for(lambda: updates(stopped) >= 3, process)
     (line,) = end(process, signal.SIGTERM)
-    assert line == f"mqe: terminated; resume with the same command and --resume; the run is in {stopped}"
+    assert (
+        line
+        == f"mqe: terminated; resume with the same command and --resume; the run is in {stopped}"
+    )
     saved = checkpoint_step(list_checkpoints(stopped)[-1]) // 16
-    assert updates(stopped) - 1 <= saved <= updates(stopped) < 300, "the last complete update is not saved"
+    assert updates(stopped) - 1 <= saved <= updates(stopped) < 300, (
+        "the last complete update is not saved"
+    )
     assert cli.main([*FAKE, "--run-dir", str(stopped), "--resume"]) == 0
     assert cli.main([*FAKE, "--run-dir", str(whole)]) == 0
     assert_same_run(whole, stopped)
@@ -139,7 +175,9 @@ def test_a_later_signal_does_not_wait_for_the_saving(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("sigint")
 def test_without_the_command_line_only_sigint_is_deferred() -> None:
-    """As in a notebook, where a later one raises KeyboardInterrupt; an ignored one stays ignored."""
+    """As in a notebook, where a later one raises KeyboardInterrupt; an ignored one stays
+    ignored.
+    """
     with interrupts.defer() as signalled:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
@@ -163,7 +201,8 @@ def test_an_ignored_signal_stays_ignored(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 def test_sigkill_and_resume_changes_nothing(tmp_path: Path) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole = tmp_path / "whole"
+    killed = tmp_path / "killed"
     command = [*GATE, "--total-steps", str(12 * 32), "--checkpoint.every", "1", "--run-dir"]
     process = start([*command, str(killed)])
     wait_for(lambda: len(list_checkpoints(killed)) >= 2, process)

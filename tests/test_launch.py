@@ -27,8 +27,28 @@ from tests.test_interrupts import PROGRAM, updates, wait_for
 from tests.training import assert_same_run, without_progress
 
 MQE = [sys.executable, "-m", "mqe_jax.cli"]
-TRAIN = ["train", "go1gate", "--impl", "c", "--control", "position", "--num-envs", "4", "--rollout-steps", "4"]
-TRAIN += ["--ppo.minibatches", "2", "--ppo.epochs", "2", "--ppo.groups", "2", "--network.hidden-sizes", "8"]
+TRAIN = [
+    "train",
+    "go1gate",
+    "--impl",
+    "c",
+    "--control",
+    "position",
+    "--num-envs",
+    "4",
+    "--rollout-steps",
+    "4",
+]
+TRAIN += [
+    "--ppo.minibatches",
+    "2",
+    "--ppo.epochs",
+    "2",
+    "--ppo.groups",
+    "2",
+    "--network.hidden-sizes",
+    "8",
+]
 TRAIN += ["--network.no-recurrent", "--checkpoint.every", "1", "--normalization.observations"]
 TWO = ["--processes", "2"]
 
@@ -37,14 +57,23 @@ TWO = ["--processes", "2"]
     ("words", "said"),
     [
         (TRAIN, "processes: missing; give --processes N, or start with srun or mpirun"),
-        ([*TWO, "--devices", "0", *TRAIN], "devices: '0' is not allowed; it must be as many as processes, 2"),
+        (
+            [*TWO, "--devices", "0", *TRAIN],
+            "devices: '0' is not allowed; it must be as many as processes, 2",
+        ),
         *(
-            ([*TWO, *command], f"command: {' '.join(command)!r} is not allowed; it must be train, skill train or sweep")
+            (
+                [*TWO, *command],
+                f"command: {' '.join(command)!r} is not allowed; it must be train, skill train or "
+                "sweep",
+            )
             for command in ([], ["eval", "go1gate"], ["walk", "eval"])
         ),
     ],
 )
-def test_what_cannot_be_launched(words: list[str], said: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_launched(
+    words: list[str], said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["launch", *words]) == 2
     assert said in capfd.readouterr().err
 
@@ -52,15 +81,26 @@ def test_what_cannot_be_launched(words: list[str], said: str, capfd: pytest.Capt
 @pytest.mark.parametrize(
     ("variables", "said"),
     [
-        ({"SLURM_PROCID": "0", "SLURM_LOCALID": "y"}, "SLURM_LOCALID: 'y' is not allowed; it must be a number"),
-        ({"OMPI_COMM_WORLD_RANK": "-1"}, "OMPI_COMM_WORLD_RANK: '-1' is not allowed; it must be a number"),
+        (
+            {"SLURM_PROCID": "0", "SLURM_LOCALID": "y"},
+            "SLURM_LOCALID: 'y' is not allowed; it must be a number",
+        ),
+        (
+            {"OMPI_COMM_WORLD_RANK": "-1"},
+            "OMPI_COMM_WORLD_RANK: '-1' is not allowed; it must be a number",
+        ),
         *(
-            ({launch.MEMBER: wrong}, f"{launch.MEMBER}: {wrong!r} is not allowed; it must be left out")
+            (
+                {launch.MEMBER: wrong},
+                f"{launch.MEMBER}: {wrong!r} is not allowed; it must be left out",
+            )
             for wrong in ("0/2", "2/2@7", "0/2@0", "0/2@65536")
         ),
     ],
 )
-def test_variables_that_srun_and_mpirun_do_not_set(variables: Any, said: str, monkeypatch: Any, capfd: Any) -> None:
+def test_variables_that_srun_and_mpirun_do_not_set(
+    variables: Any, said: str, monkeypatch: Any, capfd: Any
+) -> None:
     monkeypatch.delenv("SLURM_PROCID", raising=False)
     monkeypatch.setattr(os, "_exit", lambda code: None)
     for name, value in variables.items():
@@ -69,12 +109,19 @@ def test_variables_that_srun_and_mpirun_do_not_set(variables: Any, said: str, mo
     assert said in capfd.readouterr().err
 
 
-def test_a_mistake_that_all_processes_find_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_mistake_that_all_processes_find_is_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     for later in range(2):
-        script = f"import os, sys, time; time.sleep({later} ^ int(os.environ['INDEX'])); sys.exit('mqe: num_envs: 3')"
+        script = (
+            f"import os, sys, time; time.sleep({later} ^ int(os.environ['INDEX'])); "
+            "sys.exit('mqe: num_envs: 3')"
+        )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(launch, "PROGRAM", [sys.executable, "-c"])
-            assert launch._supervise((script,), [{"INDEX": "0"}, {"INDEX": "1"}], together=True) == 1
+            assert (
+                launch._supervise((script,), [{"INDEX": "0"}, {"INDEX": "1"}], together=True) == 1
+            )
         assert capfd.readouterr().err.splitlines() == ["mqe: num_envs: 3"]
 
 
@@ -89,7 +136,9 @@ def started(words: list[str], **options: Any) -> Iterator[subprocess.Popen[str]]
 
 
 def children(process: subprocess.Popen[str]) -> list[int]:
-    return list(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
+    return list(
+        map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())
+    )
 
 
 def mqe(*words: str, program: list[str] = MQE) -> None:
@@ -103,15 +152,20 @@ def lines(said: str) -> list[str]:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("task", ["fake", "go1gate"])
-def test_two_processes_equal_one(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_processes_equal_one(
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fake_env.install(monkeypatch)
-    one, two = tmp_path / "one", tmp_path / "two"
+    one = tmp_path / "one"
+    two = tmp_path / "two"
     train = ["train", task, *(TRAIN[TRAIN.index("--num-envs") :] if task == "fake" else TRAIN[2:])]
     train += ["--total-steps", "16", "--run-dir"]
     mqe("launch", *TWO, *train, str(two), program=PROGRAM if task == "fake" else MQE)
     assert cli.main([*train, str(one)]) == 0
     assert_same_run(one, two, 1e-5)
-    names = [sorted(path.name.partition("tfevents")[0] for path in run.rglob("*")) for run in (one, two)]
+    names = [
+        sorted(path.name.partition("tfevents")[0] for path in run.rglob("*")) for run in (one, two)
+    ]
     assert names[0] == names[1]
 
 
@@ -132,7 +186,16 @@ def test_a_run_resumes_on_another_number_of_processes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_one_that_ends_ends_all(which: int, number: signal.Signals, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    words = [*MQE, "launch", *TWO, *TRAIN, "--total-steps", "1600000", "--checkpoint.every", "100000"]
+    words = [
+        *MQE,
+        "launch",
+        *TWO,
+        *TRAIN,
+        "--total-steps",
+        "1600000",
+        "--checkpoint.every",
+        "100000",
+    ]
     with started([*words, "--run-dir", str(run)]) as process:
         wait_for(lambda: updates(run) > 5, process)
         both = children(process)
@@ -142,10 +205,15 @@ def test_one_that_ends_ends_all(which: int, number: signal.Signals, tmp_path: Pa
         assert time.monotonic() - began < 15
     (line,) = lines(said)
     if number == signal.SIGKILL:
-        assert line.startswith("mqe: a process of the training was killed by SIGKILL; the same command with --resume")
+        assert line.startswith(
+            "mqe: a process of the training was killed by SIGKILL; the same command with --resume"
+        )
         assert process.returncode == 137
     else:
-        assert line == f"mqe: terminated; resume with the same command and --resume; the run is in {run}"
+        assert (
+            line
+            == f"mqe: terminated; resume with the same command and --resume; the run is in {run}"
+        )
         assert process.returncode == 143
         assert f"step_{updates(run) * 16:012d}" == list_checkpoints(run)[-1].stem
     assert not any(Path(f"/proc/{child}").exists() for child in both)
@@ -160,11 +228,16 @@ def test_a_terminal_that_interrupts(tmp_path: Path) -> None:
         assert {os.getpgid(child) for child in children(process)}.isdisjoint([process.pid])
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=60)
-    assert lines(said) == ["mqe: interrupted; the same command with --resume continues"] and process.returncode == 130
+    assert (
+        lines(said) == ["mqe: interrupted; the same command with --resume continues"]
+        and process.returncode == 130
+    )
     assert f"step_{updates(run) * 16:012d}" == list_checkpoints(run)[-1].stem
 
 
-def test_the_process_that_was_killed_is_named_where_all_have_ended(monkeypatch: Any, capfd: Any) -> None:
+def test_the_process_that_was_killed_is_named_where_all_have_ended(
+    monkeypatch: Any, capfd: Any
+) -> None:
     monkeypatch.setattr(launch, "PROGRAM", [sys.executable, "-c"])
     survivor = f"import sys; print({devices.PEER_ENDED!r}, file=sys.stderr); sys.exit(2)"
     killed = "import os; os.kill(os.getpid(), 9)"
@@ -172,7 +245,10 @@ def test_the_process_that_was_killed_is_named_where_all_have_ended(monkeypatch: 
     for process in both:
         process.popen.wait(60)
     assert launch._wait(both, lambda: None) == 137
-    assert capfd.readouterr().err == "mqe: a process of the training was killed by SIGKILL; " + launch._RESUME + "\n"
+    assert (
+        capfd.readouterr().err
+        == "mqe: a process of the training was killed by SIGKILL; " + launch._RESUME + "\n"
+    )
 
 
 SRUN = """#!/bin/sh
@@ -203,11 +279,20 @@ def test_on_one_host_nobody_else_can_join() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    connected = [f"socket.socket().connect_ex(('{host}', {port})) == 0" for host in ("127.0.0.1", "127.0.0.2")]
-    program = f"import socket; from mqe_jax.cli.launch import join; join(); print({', '.join(connected)}, flush=True)"
+    connected = [
+        f"socket.socket().connect_ex(('{host}', {port})) == 0"
+        for host in ("127.0.0.1", "127.0.0.2")
+    ]
+    program = (
+        "import socket; from mqe_jax.cli.launch import join; join(); "
+        f"print({', '.join(connected)}, flush=True)"
+    )
     environment = {**os.environ, launch.MEMBER: f"0/1@{port}"}
     with subprocess.Popen(
-        [sys.executable, "-c", program], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", program],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline().decode().split() == ["True", "False"]
@@ -221,17 +306,33 @@ def test_a_port_of_slurm_that_another_program_uses(foreign: str) -> None:
     with contextlib.ExitStack() as stack:
         listener = socket.create_server((foreign, 0), family=family, dualstack_ipv6=":" in foreign)
         port = str(stack.enter_context(listener).getsockname()[1])
-        job = {"SLURM_JOB_ID": "4242", "SLURM_STEP_NODELIST": "127.0.0.1", "SLURM_NTASKS": "2", launch.MEMBER: "auto"}
+        job = {
+            "SLURM_JOB_ID": "4242",
+            "SLURM_STEP_NODELIST": "127.0.0.1",
+            "SLURM_NTASKS": "2",
+            launch.MEMBER: "auto",
+        }
         environment = {**os.environ, **job, "JAX_COORDINATOR_PORT": port}
-        words = [sys.executable, "-c", "from mqe_jax.cli import launch; launch.LIMIT = 1.0; launch.join()"]
+        words = [
+            sys.executable,
+            "-c",
+            "from mqe_jax.cli import launch; launch.LIMIT = 1.0; launch.join()",
+        ]
         ranks = [{"SLURM_PROCID": index, "SLURM_LOCALID": index} for index in "01"]
-        both = [started(words, env={**environment, **rank}, stdin=subprocess.PIPE) for rank in ranks]
+        both = [
+            started(words, env={**environment, **rank}, stdin=subprocess.PIPE) for rank in ranks
+        ]
         for process in [stack.enter_context(one) for one in both]:
             assert process.stderr is not None
             said.append(process.stderr.read())
             assert process.wait() > 0, "killed by a signal"
-    assert f"coordinator: 127.0.0.1:{port} cannot be used (Address already in use); set JAX_COORDINATOR_PORT" in said[0]
-    assert said[1].startswith(f"mqe: coordinator: the other processes did not come to 127.0.0.1:{port} within 1 s")
+    assert (
+        f"coordinator: 127.0.0.1:{port} cannot be used (Address already in use); set "
+        "JAX_COORDINATOR_PORT" in said[0]
+    )
+    assert said[1].startswith(
+        f"mqe: coordinator: the other processes did not come to 127.0.0.1:{port} within 1 s"
+    )
 
 
 def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,17 +347,25 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (first["CUDA_VISIBLE_DEVICES"], second["CUDA_VISIBLE_DEVICES"]) == ("4", "5")
     assert first[launch.MEMBER].startswith("0/2@")
     assert second[launch.MEMBER] == first[launch.MEMBER].replace("0/2", "1/2")
-    assert [own["CUDA_VISIBLE_DEVICES"] for own in members(*TWO, "--devices", "7", "1")] == ["7", "1"]
-    device, alone = "CUDA_VISIBLE_DEVICES", {launch.MEMBER: "alone"}
+    assert [own["CUDA_VISIBLE_DEVICES"] for own in members(*TWO, "--devices", "7", "1")] == [
+        "7",
+        "1",
+    ]
+    device = "CUDA_VISIBLE_DEVICES"
+    alone = {launch.MEMBER: "alone"}
     assert members("--processes", "1") == [{**alone, device: "4"}]
     monkeypatch.delenv(device)
     monkeypatch.setattr(launch, "_gpus", lambda: 2)
     assert [own[device] for own in members(*TWO)] == ["0", "1"]
     said = "processes: 3 is not allowed; it must be at most the number of this host's GPUs, 2"
     refuses(said, members, "--processes", "3")
-    with pytest.raises(InputError, match="devices: '1, 2' is not allowed; it must be from 0 to 1: this host has 2"):
+    with pytest.raises(
+        InputError, match="devices: '1, 2' is not allowed; it must be from 0 to 1: this host has 2"
+    ):
         members(*TWO, "--devices", "1", "2")
-    with pytest.raises(InputError, match="devices: '1, 1' is not allowed; it must be a GPU of its own for each"):
+    with pytest.raises(
+        InputError, match="devices: '1, 1' is not allowed; it must be a GPU of its own for each"
+    ):
         members(*TWO, "--devices", "1", "1")
     shared = launch.Launch(processes=2, devices=[1, 1], command=("sweep", "sweep.yaml"))._members()
     assert [own[device] for own in shared] == ["1", "1"]
@@ -278,14 +387,31 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_jax_raises_where_another_process_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = "UNKNOWN: Gloo AllGather failed: [external/gloo/gloo/transport/tcp/pair.cc:538] Connection reset by peer"
+    text = (
+        "UNKNOWN: Gloo AllGather failed: [external/gloo/gloo/transport/tcp/pair.cc:538] "
+        "Connection reset by peer"
+    )
     monkeypatch.setattr(jax, "process_count", lambda: 2)
-    lost = "INTERNAL: NCCL operation async_err failed: remote process exited or there was a network error"
-    for error in (jax.errors.JaxRuntimeError(text), ValueError(text), jax.errors.JaxRuntimeError(lost)):
+    lost = (
+        "INTERNAL: NCCL operation async_err failed: remote process exited or there was a "
+        "network error"
+    )
+    for error in (
+        jax.errors.JaxRuntimeError(text),
+        ValueError(text),
+        jax.errors.JaxRuntimeError(lost),
+    ):
         with pytest.raises(ConnectionError, match=devices.PEER_ENDED), devices.translate_errors():
             raise error
-    memory = "NCCL operation ncclCommInitRank() failed: unhandled cuda error. Last NCCL warning: 'out of memory'."
-    for other in (ValueError("shapes"), InputError("run_dir: Gloo"), jax.errors.JaxRuntimeError(memory)):
+    memory = (
+        "NCCL operation ncclCommInitRank() failed: unhandled cuda error. Last NCCL warning: "
+        "'out of memory'."
+    )
+    for other in (
+        ValueError("shapes"),
+        InputError("run_dir: Gloo"),
+        jax.errors.JaxRuntimeError(memory),
+    ):
         with pytest.raises(type(other), match=re.escape(str(other))), devices.translate_errors():
             raise other
 
@@ -294,7 +420,7 @@ def test_lines_of_the_coordination_service_are_not_shown(monkeypatch: Any, capfd
     """What JAX writes where process 0 of a training that has ended leaves before the others."""
     said = """go1gate: 1,024 of 1,024 steps
 W1126 00:01:02.123456     123 grpc_client.cc:1] lost
-Additional GRPC error information from remote target coordination_service while calling /xla.x/WatchTasks:
+Additional GRPC error information from remote target coordination_service calling /x/WatchTasks:
 :CANCELLED:CANCELLED [type.googleapis.com/tensorflow.DerivedStatus='']
 === Source Location Trace: ===
 external/xla+/xla/tsl/distributed_runtime/rpc/grpc_util.h:89

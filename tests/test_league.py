@@ -1,4 +1,6 @@
-"""Leagues: the pool of earlier policies, who plays whom in training, and runs with a pool that are resumed."""
+"""Leagues: the pool of earlier policies, who plays whom in training, and runs with a pool that are
+resumed.
+"""
 
 import dataclasses
 import json
@@ -36,12 +38,16 @@ SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes
 
 def config_of(sources: tuple[str, ...] = SOURCES, **settings: Any) -> TrainConfig:
     whole = {**SETTINGS, "num_envs": 8, "total_steps": 512, "opponents": sources, "league": SMALL}
-    return build(TrainConfig, {**whole, "network": {"recurrent": False, "hidden_sizes": [8]}, **settings})
+    return build(
+        TrainConfig, {**whole, "network": {"recurrent": False, "hidden_sizes": [8]}, **settings}
+    )
 
 
 @pytest.fixture(scope="module")
 def history() -> list[TrainState]:
-    """States of a training after each update; episodes have ten steps, a rollout four, a snapshot is due every one."""
+    """States of a training after each update; episodes have ten steps, a rollout four, a snapshot
+    is due every one.
+    """
     config = config_of()
     league = League(matches(num_envs=8), SOURCES, config)
     return updated(league.env, config, 9, league=league)[0]
@@ -52,7 +58,9 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
     network = config_of().network.build(needs_of(versus(matches(), ["idle"]), config_of()).dims)
     for state in history:
         newest, older, uniform, idle = state.rollout.env_state.opponents
-        jax.tree.map(np.testing.assert_array_equal, newest.arrays.params, network.policy_params(state.params))
+        jax.tree.map(
+            np.testing.assert_array_equal, newest.arrays.params, network.policy_params(state.params)
+        )
         assert not bool(newest.waiting.any()) and idle.arrays == ()
         for block, opponent in ((1, older), (2, uniform)):
             member = int(state.extra.member[block])
@@ -62,24 +70,38 @@ def test_the_policy_joins_the_pool_and_plays_against_itself(history: list[TrainS
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_a_league_begins_with_its_policies(resumed: bool, history: list[TrainState], tmp_path: Path) -> None:
+def test_a_league_begins_with_its_policies(
+    resumed: bool, history: list[TrainState], tmp_path: Path
+) -> None:
     """With that it starts from or, resumed without environments, with its members."""
     start: dict[str, Any] = {} if resumed else {"start": str(tmp_path)}
-    config, state, file = config_of(**start), history[9], None
+    config = config_of(**start)
+    state = history[9]
+    file = None
     league = League(matches(num_envs=8), SOURCES, config)
     if resumed:
         metadata = {"task": league.env.name, "config": to_mapping(config), "environments": False}
-        file = save_checkpoint(tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1)
+        file = save_checkpoint(
+            tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1
+        )
     else:
         save_policy(tmp_path, policy_of(state, league.env, config, env_steps=0))
     learner, processes = own_learner(league.env, config, league)
-    begun, _ = first_state(league.env, learner, processes, config, file, SeedBatch(learner.init, 1).shared, league)
-    seats, before = ([seat.arrays for seat in each.rollout.env_state.opponents] for each in (begun, state))
+    begun, _ = first_state(
+        league.env, learner, processes, config, file, SeedBatch(learner.init, 1).shared, league
+    )
+    seats, before = (
+        [seat.arrays for seat in each.rollout.env_state.opponents] for each in (begun, state)
+    )
     mine = league._own(begun)
     jax.tree.map(np.testing.assert_array_equal, mine.params, league._own(state).params)
-    jax.tree.map(np.testing.assert_array_equal, seats, before if resumed else [mine] * 3 + seats[3:])
+    jax.tree.map(
+        np.testing.assert_array_equal, seats, before if resumed else [mine] * 3 + seats[3:]
+    )
     if not resumed:
-        jax.tree.map(lambda x, own: np.testing.assert_array_equal(x[0], own), begun.extra.pool.arrays, mine)
+        jax.tree.map(
+            lambda x, own: np.testing.assert_array_equal(x[0], own), begun.extra.pool.arrays, mine
+        )
 
 
 def test_a_block_plays_another_member_after_its_episodes(history: list[TrainState]) -> None:
@@ -89,12 +111,17 @@ def test_a_block_plays_another_member_after_its_episodes(history: list[TrainStat
     assert not waiting[5]  # their episodes ended, and those against the new member have begun
     games = [float(jnp.sum(state.extra.pool.games)) for state in history]
     assert games[2] == 0 and games[3] == pytest.approx(4) and games[8] > games[5]
-    assert all(not bool(o.outcomes.any()) for state in history[1:] for o in state.rollout.env_state.opponents)
+    assert all(
+        not bool(o.outcomes.any())
+        for state in history[1:]
+        for o in state.rollout.env_state.opponents
+    )
 
 
 def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
     env = versus(matches(), ["idle", "forward"], draw_reward=-2.0)
-    step, still = jax.jit(env.step), jnp.zeros((4, 1, 12))
+    step = jax.jit(env.step)
+    still = jnp.zeros((4, 1, 12))
     state = env.reset(KEY)
     for i in range(10):
         state = step(state, still)
@@ -112,7 +139,8 @@ def test_outcomes_are_counted_once_and_a_draw_can_cost() -> None:
 def test_the_time_limit_may_end_episodes_for_the_learner(task: str) -> None:
     inner = matches(task)
     env = Deadline(inner) if task == "go1gate" else versus(Deadline(inner), ["idle"])
-    step, still = jax.jit(env.step), jnp.zeros((4, env.num_agents, 12))
+    step = jax.jit(env.step)
+    still = jnp.zeros((4, env.num_agents, 12))
     state = jax.jit(env.reset)(KEY)
     assert state.privileged_obs.shape[1] == env.privileged_observation_size
     for i in range(10):
@@ -125,17 +153,56 @@ def test_the_time_limit_may_end_episodes_for_the_learner(task: str) -> None:
 
 def test_a_league_has_more_members_than_blocks_and_environments_of_its_own_process() -> None:
     few = config_of(league={**SMALL, "members": 2})
-    refuses("league.members: 2 .*more than the blocks that play members, 2", League, matches(num_envs=8), SOURCES, few)
+    refuses(
+        "league.members: 2 .*more than the blocks that play members, 2",
+        League,
+        matches(num_envs=8),
+        SOURCES,
+        few,
+    )
     env = League(matches(num_envs=8), SOURCES, config_of()).env.share(2)
     assert env.num_envs == env.inner.num_envs == 4
 
 
 def training(steps: int, *more: str) -> list[str]:
     """Arguments of a training of `go1tug` in a league, with a snapshot every update of 16 steps."""
-    arguments = ["train", "go1tug", "--impl", "c", "--set", "control=position", "--set", "episode_length=0.1"]
-    arguments += ["--num-envs", "4", "--rollout-steps", "4", "--ppo.minibatches", "1", "--ppo.epochs", "1"]
-    arguments += ["--network.hidden-sizes", "8", "--config", "paper/mappo", "--total-steps", str(steps)]
-    arguments += ["--league.snapshot-steps", "16", "--league.episodes", "1", "--league.members", "3", *more]
+    arguments = [
+        "train",
+        "go1tug",
+        "--impl",
+        "c",
+        "--set",
+        "control=position",
+        "--set",
+        "episode_length=0.1",
+    ]
+    arguments += [
+        "--num-envs",
+        "4",
+        "--rollout-steps",
+        "4",
+        "--ppo.minibatches",
+        "1",
+        "--ppo.epochs",
+        "1",
+    ]
+    arguments += [
+        "--network.hidden-sizes",
+        "8",
+        "--config",
+        "paper/mappo",
+        "--total-steps",
+        str(steps),
+    ]
+    arguments += [
+        "--league.snapshot-steps",
+        "16",
+        "--league.episodes",
+        "1",
+        "--league.members",
+        "3",
+        *more,
+    ]
     return arguments + [word for source in SOURCES for word in ("--opponent", source)]
 
 
@@ -143,7 +210,8 @@ def training(steps: int, *more: str) -> list[str]:
 def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     evaluations = ["--evaluation.every", "4", "--evaluation.episodes", "2"]
     arguments = training(96, "--checkpoint.every", "2", "--num-seeds", "2", *evaluations)
-    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    whole = tmp_path / "whole"
+    halves = tmp_path / "halves"
     assert cli.main([*arguments, "--run-dir", str(whole)]) == 0
     assert cli.main([*arguments, "--run-dir", str(halves)]) == 0
     for seed in ("seed0", "seed1"):
@@ -153,18 +221,28 @@ def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
         assert_same_run(whole / seed, halves / seed)
         assert "checkpoint/extra/pool/rating" in content(whole / seed)
     header = (whole / "seed0" / "metrics.csv").read_text().splitlines()[0].split(",")
-    assert {"league/win/newest", "league/loss/idle", "league/rating", "league/members"} <= set(header)
+    assert {"league/win/newest", "league/loss/idle", "league/rating", "league/members"} <= set(
+        header
+    )
 
 
 @pytest.mark.parametrize("task", MATCHES)
 def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> None:
     config = base_config(task, None)
-    assert {"newest", "older", "scripted"} <= set(config.opponents) and config.num_envs % len(config.opponents) == 0
+    assert {"newest", "older", "scripted"} <= set(config.opponents) and config.num_envs % len(
+        config.opponents
+    ) == 0
     assert make(task, impl="c", num_envs=1, **config.training_env).params.frozen_time == 0
-    override(config, {"evaluation": {"every": 50}})  # its episodes are shared by the fixed opponents
+    # its episodes are shared by the fixed opponents
+    override(config, {"evaluation": {"every": 50}})
     if task == "go1wrestling":
-        assert dict(config.train_env) == {"frozen_time": 0.0, "rewards": {"push": 3.0, "approach": 1.0}}
-    assert base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
+        assert dict(config.train_env) == {
+            "frozen_time": 0.0,
+            "rewards": {"push": 3.0, "approach": 1.0},
+        }
+    assert (
+        base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
+    )
 
 
 def test_ratings_recover_the_strengths_behind_many_games() -> None:
@@ -183,30 +261,54 @@ def test_ratings_recover_the_strengths_behind_many_games() -> None:
 def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> None:
     def interval(games: int) -> tuple[float, float]:
         results = np.full((policies, policies, 3), [0, games, 0])
-        results[0, 1:], results[1:, 0] = [games, 0, 0], [0, 0, games]
+        results[0, 1:] = [games, 0, 0]
+        results[1:, 0] = [0, 0, games]
         value, low, high = (bound[0] for bound in tournament.rate(results, reference=1))
         assert low < value < high
         return low, high
 
-    few, many = interval(4), interval(256)
+    few = interval(4)
+    many = interval(256)
     assert few[1] - few[0] > 200 and few[0] < many[0] and few[1] < many[1]
 
 
 @pytest.mark.parametrize("params", [{"control": "position"}, {"commands": ["vx", "yaw_rate"]}])
-def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(params: dict[str, Any]) -> None:
-    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == ["idle", "random"]
+def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(
+    params: dict[str, Any],
+) -> None:
+    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == [
+        "idle",
+        "random",
+    ]
     changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
     assert (
-        setup.environments("c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1).eval_env
+        setup.environments(
+            "c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1
+        ).eval_env
         is not None
     )
 
 
-def test_a_tournament_meets_every_pair_on_both_sides(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
-    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1)) == ["scripted", "idle", "random"]
+def test_a_tournament_meets_every_pair_on_both_sides(
+    tmp_path: Path, monkeypatch: Any, capfd: Any
+) -> None:
+    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1)) == [
+        "scripted",
+        "idle",
+        "random",
+    ]
     monkeypatch.setattr(setup, "reference_opponents", lambda env: ["scripted", "idle"])
     capfd.readouterr()
-    arguments = ["go1revolvingdoor", "forward", "--impl", "c", "--set", "line_x=0.8", "--episodes", "4"]
+    arguments = [
+        "go1revolvingdoor",
+        "forward",
+        "--impl",
+        "c",
+        "--set",
+        "line_x=0.8",
+        "--episodes",
+        "4",
+    ]
     assert cli.main(["tournament", *arguments, "-o", str(tmp_path), "--json"]) == 0
     result = json.loads(capfd.readouterr().out)
     assert result["policies"] == ["forward", "scripted", "idle"]
@@ -217,14 +319,21 @@ def test_a_tournament_meets_every_pair_on_both_sides(tmp_path: Path, monkeypatch
     assert result["results"][2][1][2] >= 3, "an idle robot loses as team 0 too"
     rated = {row["policy"]: row for row in result["ratings"]}
     assert rated["scripted"]["value"] == 0 and rated["idle"]["worst"]["value"] < -0.5
-    payoff, both = np.array(result["payoff"]["value"]), np.array(result["results"])
-    np.testing.assert_allclose(payoff, (both[..., 0] - both[..., 2] + both[..., 2].T - both[..., 0].T) / 8)
+    payoff = np.array(result["payoff"]["value"])
+    both = np.array(result["results"])
+    np.testing.assert_allclose(
+        payoff, (both[..., 0] - both[..., 2] + both[..., 2].T - both[..., 0].T) / 8
+    )
     assert rated["idle"]["mean"]["value"] == pytest.approx(payoff[2, :2].mean())
     assert sum(row["nash_weight"]["value"] for row in rated.values()) == pytest.approx(1)
     assert (tmp_path / "tournament.png").stat().st_size > 5000
     rows = (tmp_path / "tournament.csv").read_text().splitlines()
     assert len(rows) == 10 and rows[3].startswith(f"forward,idle,{won[0, 2]},")
-    assert (tmp_path / "policies.csv").read_text().startswith("policy,rating,rating_low,rating_high,mean,")
+    assert (
+        (tmp_path / "policies.csv")
+        .read_text()
+        .startswith("policy,rating,rating_low,rating_high,mean,")
+    )
     monkeypatch.setattr(tournament, "round_robin", lambda *arguments: pytest.fail("played"))
     assert cli.main(["tournament", *arguments, "-o", str(tmp_path / "tournament.csv")]) == 2
     assert "output: " in capfd.readouterr().err

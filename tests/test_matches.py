@@ -50,22 +50,30 @@ def test_both_sides_observe_the_same_of_a_mirrored_state(task: str) -> None:
     euler = random.uniform(-0.5, 0.5, (agents, 3)) + np.array([0, 0, 1.0])
     middle = np.array([*env.center, 0.0])
     if env.symmetry == "turn":
-        other, turned = 2 * middle - position, euler + np.array([0, 0, PI])
+        other = 2 * middle - position
+        turned = euler + np.array([0, 0, PI])
         other[:, 2] = position[:, 2]
     else:
-        other, turned = position * [1, -1, 1], euler * [-1, 1, -1]
+        other = position * [1, -1, 1]
+        turned = euler * [-1, 1, -1]
     swap = np.roll(np.arange(agents), agents // 2)
-    there, here = {}, {}
+    there = {}
+    here = {}
     if "cylinder" in env.objects:
-        there, here = {"cylinder": [0.3]}, {"cylinder": [-0.3]}
+        there = {"cylinder": [0.3]}
+        here = {"cylinder": [-0.3]}
     if "ball" in env.objects:
         there = {"ball": [6.0, 1.0, 0.1, 1, 0, 0, 0]}
         here = {"ball": [8.0, -1.0, 0.1, 1, 0, 0, 0]}
     first = placed(env, position, euler, there)
     second = placed(env, other[swap], turned[swap], here)
     if "cylinder" in env.objects:
-        first = dataclasses.replace(first, task=dataclasses.replace(first.task, previous_y=jnp.float32(0.2)))
-        second = dataclasses.replace(second, task=dataclasses.replace(second.task, previous_y=jnp.float32(-0.2)))
+        first = dataclasses.replace(
+            first, task=dataclasses.replace(first.task, previous_y=jnp.float32(0.2))
+        )
+        second = dataclasses.replace(
+            second, task=dataclasses.replace(second.task, previous_y=jnp.float32(-0.2))
+        )
     np.testing.assert_allclose(observation(env, first), observation(env, second)[swap], atol=1e-5)
     assert np.abs(observation(env, first) - observation(env, second)).max() > 0.1
 
@@ -73,7 +81,9 @@ def test_both_sides_observe_the_same_of_a_mirrored_state(task: str) -> None:
 def test_actions_are_mirrored_where_left_and_right_are_swapped() -> None:
     command = TASKS["go1revolvingdoor"](impl="c")
     action = jnp.array([[0.1, 0.2, 0.3]] * 2)
-    np.testing.assert_allclose(command.unmirror_action(action), action * np.array([[1, 1, 1], [1, -1, -1]]))
+    np.testing.assert_allclose(
+        command.unmirror_action(action), action * np.array([[1, 1, 1], [1, -1, -1]])
+    )
     env = made("go1revolvingdoor")
     legs = jnp.arange(12.0)[None] / 12
     mirrored = 12 * np.asarray(env.unmirror_action(jnp.tile(legs, (2, 1))))
@@ -87,25 +97,36 @@ def tug_state(env: Any, y: float, ends: tuple[float, float] = (-1.3, 1.63)) -> A
     """Robot 0 is 1.43 m and robot 1 1.5 m from the axis when the cylinder is at 0.13."""
     position = [[1.6, end, 0.3] for end in ends]
     state = placed(env, position, [[0, 0, PI / 2], [0, 0, -PI / 2]], {"cylinder": [y]})
-    return dataclasses.replace(state, task=dataclasses.replace(state.task, previous_y=jnp.float32(0.08)))
+    return dataclasses.replace(
+        state, task=dataclasses.replace(state.task, previous_y=jnp.float32(0.08))
+    )
 
 
 def test_tug_observation_and_rewards() -> None:
     env = made("go1tug")
     state = tug_state(env, 0.13)
     obs = observation(env, state)
-    np.testing.assert_allclose(obs[0], [1.6, -1.3, 0.3, 0, 0, PI / 2, 0.13, 0, 1.43, 0.08], atol=1e-5)
-    np.testing.assert_allclose(obs[1], [1.6, -1.63, 0.3, 0, 0, PI / 2, -0.13, 0, 1.5, -0.08], atol=1e-5)
+    np.testing.assert_allclose(
+        obs[0], [1.6, -1.3, 0.3, 0, 0, PI / 2, 0.13, 0, 1.43, 0.08], atol=1e-5
+    )
+    np.testing.assert_allclose(
+        obs[1], [1.6, -1.63, 0.3, 0, 0, PI / 2, -0.13, 0, 1.5, -0.08], atol=1e-5
+    )
     before = tug_state(env, 0.1, ends=(-1.4, 1.5))
     terms, reward = terms_of(env, before, state)
-    # Own terms: the cylinder is 0.13 m on robot 1's half, and moved on; robot 0 came 0.07 m closer to it, robot 1
-    # got 0.1 m away. Less the opponent's: 0.13 m and 0.17 m.
+    # Own terms: the cylinder is 0.13 m on robot 1's half, and moved on; robot 0 came 0.07 m closer
+    # to it, robot 1 got 0.1 m away. Less the opponent's: 0.13 m and 0.17 m.
     np.testing.assert_allclose(terms["push"], [0.13, -0.13], atol=1e-6)
     np.testing.assert_allclose(terms["approach"], [0.17, -0.17], atol=1e-6)
     np.testing.assert_allclose(reward, [10 * 0.13 + 2 * 0.17, -10 * 0.13 - 2 * 0.17], atol=1e-5)
-    # From y 0.1 back to 0.06, still on robot 1's half: that counts half. On robot 0's half: it counts for robot 1.
-    np.testing.assert_allclose(terms_of(env, before, tug_state(env, 0.06))[0]["push"], [0.03, -0.03], atol=1e-6)
-    np.testing.assert_allclose(terms_of(env, before, tug_state(env, -0.2))[0]["push"], [-0.2, 0.2], atol=1e-6)
+    # From y 0.1 back to 0.06, still on robot 1's half: that counts half. On robot 0's half: it
+    # counts for robot 1.
+    np.testing.assert_allclose(
+        terms_of(env, before, tug_state(env, 0.06))[0]["push"], [0.03, -0.03], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        terms_of(env, before, tug_state(env, -0.2))[0]["push"], [-0.2, 0.2], atol=1e-6
+    )
     # At rest it counts whole, on either half.
     for y in (0.1, -0.1):
         rest = tug_state(env, y)
@@ -120,10 +141,14 @@ def test_tug_result_and_end() -> None:
     state = tug_state(env, 0.0)
     assert not stepped(env, state).terminated
     assert stepped(env, dataclasses.replace(state, step=jnp.int32(env.max_steps - 1))).truncated
-    fallen = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0, 0, 0]], {"cylinder": [0.13]})
+    fallen = placed(
+        env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0, 0, 0]], {"cylinder": [0.13]}
+    )
     assert stepped(env, fallen).terminated
     assert result(env, fallen) == (0, 1)  # a fall loses, also with the cylinder on the other half
-    both = placed(env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0.9, 0, 0]], {"cylinder": [0.13]})
+    both = placed(
+        env, [[1.6, -2, 0.3], [1.6, 2, 0.3]], [[0.9, 0, 0], [0.9, 0, 0]], {"cylinder": [0.13]}
+    )
     assert result(env, both) == (0, 0)
 
 
@@ -131,13 +156,18 @@ def test_the_arena_moves_the_middle_and_spawn_noise_counts() -> None:
     env: Any = make("go1tug", impl="c", control="position", cylinder={"x": 2.1}, spawn_noise=0.05)
     assert env.center == (2.1, 0.0)
     spawn = np.asarray(jax.jit(jax.vmap(env.spawn))(jax.random.split(jax.random.PRNGKey(0), 64)))
-    assert np.abs(spawn[..., 0] - 2.1).max() <= 1.05 and 0.04 < np.abs(np.abs(spawn[..., 1]) - 2.5).max() <= 0.05
+    assert (
+        np.abs(spawn[..., 0] - 2.1).max() <= 1.05
+        and 0.04 < np.abs(np.abs(spawn[..., 1]) - 2.5).max() <= 0.05
+    )
 
 
 def test_a_diverged_match_is_a_draw() -> None:
     env = made("go1wrestling")
     state = initial(env)
-    state = dataclasses.replace(state, data=state.data.replace(qvel=jnp.full_like(state.data.qvel, jnp.nan)))
+    state = dataclasses.replace(
+        state, data=state.data.replace(qvel=jnp.full_like(state.data.qvel, jnp.nan))
+    )
     after = stepped(env, state)
     assert after.terminated and float(after.metrics["diverged"]) == 1
     assert after.outcome.result.tolist() == [[0, 1, 0]] * 2
@@ -146,8 +176,11 @@ def test_a_diverged_match_is_a_draw() -> None:
 @pytest.mark.parametrize("task", ["go1revolvingdoor", "go1wrestling", "go1bridge"])
 def test_a_duel_is_seen_by_both_in_their_own_frames(task: str) -> None:
     env = made(task)
-    obs = observation(env, placed(env, [[1.0, -0.5, 0.3], [2.0, 0.7, 0.4]], [[0.1, 0.2, 0.3], [0, 0, -1.0]]))
-    first, second = [1.0, -0.5, 0.3, 0.1, 0.2, 0.3], [2.0, 0.7, 0.4, 0, 0, -1.0]
+    obs = observation(
+        env, placed(env, [[1.0, -0.5, 0.3], [2.0, 0.7, 0.4]], [[0.1, 0.2, 0.3], [0, 0, -1.0]])
+    )
+    first = [1.0, -0.5, 0.3, 0.1, 0.2, 0.3]
+    second = [2.0, 0.7, 0.4, 0, 0, -1.0]
     x = 2 * env.center[0]
     mirrored = {
         "reflect": ([2.0, -0.7, 0.4, 0, 0, 1.0], [1.0, 0.5, 0.3, -0.1, 0.2, -0.3]),
@@ -160,10 +193,12 @@ def test_a_duel_is_seen_by_both_in_their_own_frames(task: str) -> None:
 def test_door_rewards_result_and_end() -> None:
     env = made("go1revolvingdoor")
     state = placed(env, [[3.9, 0.0, 0.3], [3.0, 0.5, 0.3]])
-    before = placed(env, [[3.93, 0.0, 0.3], [2.85, 0.0, 0.3]])  # 0.08 m and 1 m from the line's middle
+    # 0.08 m and 1 m from the line's middle
+    before = placed(env, [[3.93, 0.0, 0.3], [2.85, 0.0, 0.3]])
     terms, reward = terms_of(env, before, state)
     np.testing.assert_allclose(terms["win"], [1, -1])
-    # Robot 0 is 0.05 m from the line's middle, robot 1 hypot(0.85, 0.5) = 0.98615 m: 0.03 m and 0.01385 m closer.
+    # Robot 0 is 0.05 m from the line's middle, robot 1 hypot(0.85, 0.5) = 0.98615 m: 0.03 m and
+    # 0.01385 m closer.
     np.testing.assert_allclose(terms["approach"], [0.01615, -0.01615], atol=1e-4)
     np.testing.assert_allclose(reward, [10.01615, -10.01615], atol=1e-4)
     assert result(env, state) == (1, 0) and stepped(env, state).terminated
@@ -183,14 +218,17 @@ def ring(env: Any, first: Any, second: Any, roll: float = 0.0) -> Any:
 
 def test_wrestling_rewards_result_and_end() -> None:
     env = made("go1wrestling")
-    inside, out = [3.1, -0.5, 0.7], [3.1, 1.75, 0.7]
+    inside = [3.1, -0.5, 0.7]
+    out = [3.1, 1.75, 0.7]
     play = ring(env, inside, [3.1, 0.6, 0.7])
     assert result(env, play) == (0, 0) and not stepped(env, play).terminated
     np.testing.assert_allclose(terms_of(env, play, play)[1], [0, 0])
     won = ring(env, inside, out)
     assert result(env, won) == (1, 0) and stepped(env, won).terminated
     np.testing.assert_allclose(terms_of(env, won, won)[1], [10, -10])
-    np.testing.assert_allclose(terms_of(env, play, ring(env, [1.3, 0.0, 0.7], [3.1, 0.6, 0.7]))[1], [-10, 10])
+    np.testing.assert_allclose(
+        terms_of(env, play, ring(env, [1.3, 0.0, 0.7], [3.1, 0.6, 0.7]))[1], [-10, 10]
+    )
     assert result(env, ring(env, [3.1, -1.75, 0.7], out)) == (0, 0)
     assert result(env, ring(env, inside, [3.1, 0.6, 0.7], roll=1.26)) == (1, 0)  # over 0.4 pi
     assert result(env, ring(env, inside, [3.1, 0.6, 0.7], roll=1.25)) == (0, 0)
@@ -199,7 +237,8 @@ def test_wrestling_rewards_result_and_end() -> None:
 
 def test_wrestling_has_terms_for_pushing_and_approach_that_only_training_weighs() -> None:
     env = made("go1wrestling")
-    before, after = ring(env, [3.1, -0.5, 0.7], [3.1, 0.6, 0.7]), ring(env, [3.1, 0.1, 0.7], [3.1, 1.0, 0.7])
+    before = ring(env, [3.1, -0.5, 0.7], [3.1, 0.6, 0.7])
+    after = ring(env, [3.1, 0.1, 0.7], [3.1, 1.0, 0.7])
     terms, reward = terms_of(env, before, after)
     np.testing.assert_allclose(reward, [0, 0])
     # The first robot came 0.4 m nearer to the centre and pushed the other 0.4 m away from it.
@@ -252,8 +291,11 @@ STARTS = {
 
 @pytest.mark.parametrize("task", STARTS)
 def test_robots_start_as_listed(task: str) -> None:
-    env, (mean, spread) = made(task), STARTS[task]
-    away = np.asarray(jax.jit(jax.vmap(env.spawn))(jax.random.split(jax.random.PRNGKey(0), 64))) - mean
+    env = made(task)
+    (mean, spread) = STARTS[task]
+    away = (
+        np.asarray(jax.jit(jax.vmap(env.spawn))(jax.random.split(jax.random.PRNGKey(0), 64))) - mean
+    )
     assert np.all(np.abs(away) <= np.array(spread) + 1e-5)
     for side in (away, -away):
         assert np.all(side[..., 0].max(axis=0) > 0.8 * spread[0])

@@ -25,7 +25,9 @@ rates:
   measure: evaluate
   tasks: [go1gate, go1tug]
   arguments: {policy: "{task}", episodes: 100}
-  variants: {scripted: {opponent: scripted}, heavy: {env: {robot: go2, randomization.payload: [3, 3]}}}
+  variants:
+    scripted: {opponent: scripted}
+    heavy: {env: {robot: go2, randomization.payload: [3, 3]}}
 """
 
 
@@ -35,17 +37,28 @@ def test_a_part_measures_policies(
     calls: list[Any] = []
 
     def evaluate(
-        task: str, policy: Any = None, opponent: Any = None, *, env: Any = None, episodes: int, impl: str
+        task: str,
+        policy: Any = None,
+        opponent: Any = None,
+        *,
+        env: Any = None,
+        episodes: int,
+        impl: str,
     ) -> Any:
         calls.append((task, policy, opponent, env, impl))
         if len(calls) == 2:
             raise KeyboardInterrupt
         return SimpleNamespace(
-            to_dict=lambda: {"win_rate": 0.5, "episodes": episodes, "intervals": {"win_rate": [0.4, 0.6]}}
+            to_dict=lambda: {
+                "win_rate": 0.5,
+                "episodes": episodes,
+                "intervals": {"win_rate": [0.4, 0.6]},
+            }
         )
 
     monkeypatch.setattr(playing, "evaluate", evaluate)
-    file, folder = tmp_path / "strength.yaml", tmp_path / "out"
+    file = tmp_path / "strength.yaml"
+    folder = tmp_path / "out"
     file.write_text(MEASURES)
     arguments = ["sweep", str(file), "--part", "rates", "--folder", str(folder), "--impl", "c"]
     assert cli.main([*arguments, "--dry-run"]) == 0
@@ -54,26 +67,47 @@ def test_a_part_measures_policies(
     assert cli.main(arguments) == 0 == cli.main(arguments)
     assert calls[0] == ("go1gate", "go1gate", "scripted", None, "c") and len(calls) == 5
     task, policy, _, env, _ = calls[-1]
-    assert (task, policy.task, policy.needs.robot, env["robot"]) == ("go1tug", "go1tug", "go2", "go2")
+    assert (task, policy.task, policy.needs.robot, env["robot"]) == (
+        "go1tug",
+        "go1tug",
+        "go2",
+        "go2",
+    )
     (folder / "results" / "go1tug" / "heavy" / "result.json").unlink()
-    assert cli.main([*arguments, "--cells", "*/scripted", "--dry-run"]) == 0 and "go1tug" not in capfd.readouterr().out
+    assert (
+        cli.main([*arguments, "--cells", "*/scripted", "--dry-run"]) == 0
+        and "go1tug" not in capfd.readouterr().out
+    )
     assert cli.main([*arguments, "--cells", "go1tug/*"]) == 0 and len(calls) == 6
     rows = list(csv.DictReader((folder / "rates.csv").open()))
     assert [(row["task"], row["variant"]) for row in rows] == list(
         itertools.product(("go1gate", "go1tug"), ("scripted", "heavy"))
     )
-    assert [rows[0][name] for name in ("rate", "value", "low", "high")] == ["win_rate", "0.5", "0.4", "0.6"]
+    assert [rows[0][name] for name in ("rate", "value", "low", "high")] == [
+        "win_rate",
+        "0.5",
+        "0.4",
+        "0.6",
+    ]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"seeds": [0]}, "seeds: [0] is not allowed; it must be left out: the part measures policies"),
+        (
+            {"seeds": [0]},
+            "seeds: [0] is not allowed; it must be left out: the part measures policies",
+        ),
         ({"time_limit": 5.0}, "time_limit: 5.0 is not allowed"),
-        ({"cells": ["go1tug/heavi"]}, "cells: 'go1tug/heavi' matches no cell (did you mean 'go1tug/heavy'?)"),
+        (
+            {"cells": ["go1tug/heavi"]},
+            "cells: 'go1tug/heavi' matches no cell (did you mean 'go1tug/heavy'?)",
+        ),
     ],
 )
-def test_options_of_trainings_are_refused(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+def test_options_of_trainings_are_refused(
+    tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
     (tmp_path / "strength.yaml").write_text(MEASURES)
     with pytest.raises(InputError, match=re.escape(message)):
         sweeping.sweep(tmp_path / "strength.yaml", tmp_path, part="rates", dry_run=True, **options)
@@ -82,7 +116,10 @@ def test_options_of_trainings_are_refused(tmp_path: Path, options: dict[str, Any
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("measure: evaluates", "measure: 'evaluates' is not allowed; it must be one of evaluate, tournament"),
+        (
+            "measure: evaluates",
+            "measure: 'evaluates' is not allowed; it must be one of evaluate, tournament",
+        ),
         ("tasks: [go1gat]", "did you mean 'go1gate'"),
         (
             "arguments: {episode: 3}",
@@ -92,31 +129,49 @@ def test_options_of_trainings_are_refused(tmp_path: Path, options: dict[str, Any
             "by_task: {go1tug: {episodes: 64}}",
             "by_task: 'go1tug' is not allowed; it must be one of the part's tasks: go1g",
         ),
-        ("by_task: {go1gate: 64}", "by_task.go1gate: 64 is not allowed; it must be a mapping of arguments"),
+        (
+            "by_task: {go1gate: 64}",
+            "by_task.go1gate: 64 is not allowed; it must be a mapping of arguments",
+        ),
         (
             "arguments: {policy: ['no/*']}",
             "arguments.policy: 'no/*' is not allowed; it must be a pattern of files that",
         ),
     ],
 )
-def test_measurements_that_cannot_be_made_are_named(tmp_path: Path, change: str, message: str) -> None:
+def test_measurements_that_cannot_be_made_are_named(
+    tmp_path: Path, change: str, message: str
+) -> None:
     part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
     with pytest.raises(InputError, match=re.escape(message)):
         measuring.plan(build(sweeps.Measurement, part), tmp_path)
 
 
-def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(tmp_path: Path, monkeypatch: Any) -> None:
+def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("go1gate-seed1", "go1gate-seed0", "go1tug-seed0"):
         Path(name).touch()
-    part = {"measure": "tournament", "tasks": ["go1gate", "go1tug"], "arguments": {"policies": ["{task}-*"], "seed": 3}}
+    part = {
+        "measure": "tournament",
+        "tasks": ["go1gate", "go1tug"],
+        "arguments": {"policies": ["{task}-*"], "seed": 3},
+    }
     part |= {
         "by_task": {"go1tug": {"policies": ["{task}", "{task}-*"], "episodes": 64}},
         "variants": {"v": {"seed": 4}},
     }
-    gate, tug = (item.arguments for item in measuring.plan(build(sweeps.Measurement, part), tmp_path))
+    gate, tug = (
+        item.arguments for item in measuring.plan(build(sweeps.Measurement, part), tmp_path)
+    )
     assert gate == {"impl": "auto", "policies": ["go1gate-seed0", "go1gate-seed1"], "seed": 4}
-    assert tug == {"impl": "auto", "policies": ["go1tug", "go1tug-seed0"], "seed": 4, "episodes": 64}
+    assert tug == {
+        "impl": "auto",
+        "policies": ["go1tug", "go1tug-seed0"],
+        "seed": 4,
+        "episodes": 64,
+    }
 
 
 def published(part: str) -> sweeps.Measurement:
@@ -143,13 +198,19 @@ class Started(Exception):
     ("part", "tasks"),
     [
         ("pools", ["go1gate"]),
-        *(pytest.param(part, ["*"], marks=pytest.mark.soak) for part in ("pools", "oracle", "exploitability")),
+        *(
+            pytest.param(part, ["*"], marks=pytest.mark.soak)
+            for part in ("pools", "oracle", "exploitability")
+        ),
     ],
 )
-def test_published_trainings_can_start(part: str, tasks: list[str], monkeypatch: Any, tmp_path: Path) -> None:
+def test_published_trainings_can_start(
+    part: str, tasks: list[str], monkeypatch: Any, tmp_path: Path
+) -> None:
     """They are planned and checked with all of their settings, but not begun."""
     monkeypatch.chdir(CONFIGS.parent)
-    plan, begun = sweeping.sweep, []
+    plan = sweeping.sweep
+    begun = []
 
     def start(file: Path, folder: Path, **options: Any) -> Any:
         begun.extend(plan(file, folder, **options, dry_run=True)["left"]["jobs"])
@@ -161,21 +222,32 @@ def test_published_trainings_can_start(part: str, tasks: list[str], monkeypatch:
     for item in measuring.plan(settings, tmp_path, impl="c"):
         if item.task in tasks or tasks == ["*"]:
             with pytest.raises(Started):
-                pkgutil.resolve_name(measuring.MEASURES[settings.measure])(item.task, **item.arguments)
+                pkgutil.resolve_name(measuring.MEASURES[settings.measure])(
+                    item.task, **item.arguments
+                )
     assert {job["task"] for job in begun} == set(settings.tasks if tasks == ["*"] else tasks)
     assert all(job["steps_left"] >= 5_000_000 for job in begun)
 
 
-def test_a_measurement_that_trains_has_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_measurement_that_trains_has_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = {"exploitability_lower_bound": {"value": 0.2}}
-    monkeypatch.setattr(exploiting, "exploitability", lambda task, policy, folder, impl: {**found, "folder": folder})
+    monkeypatch.setattr(
+        exploiting, "exploitability", lambda task, policy, folder, impl: {**found, "folder": folder}
+    )
     part = {"measure": "exploitability", "tasks": ["go1tug"], "arguments": {"policy": "{task}"}}
     measuring.measure(build(sweeps.Measurement, part), tmp_path)
     place = tmp_path / "results" / "go1tug" / "plain"
-    assert json.loads((place / "result.json").read_text())["result"] == {**found, "folder": str(place / "runs")}
+    assert json.loads((place / "result.json").read_text())["result"] == {
+        **found,
+        "folder": str(place / "runs"),
+    }
 
 
-def test_a_team_trains_on_with_mates_and_is_mixed_with_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_team_trains_on_with_mates_and_is_mixed_with_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[Any] = []
 
     def train(file: Path, folder: Path, impl: str) -> Any:
@@ -189,11 +261,23 @@ def test_a_team_trains_on_with_mates_and_is_mixed_with_others(tmp_path: Path, mo
 
     monkeypatch.setattr(sweeping, "sweep", train)
     monkeypatch.setattr(pooling, "tournament", mix)
-    options: dict[str, Any] = {"settings": {"num_envs": 4}, "total_steps": 48, "impl": "c", "episodes": 2}
+    options: dict[str, Any] = {
+        "settings": {"num_envs": 4},
+        "total_steps": 48,
+        "impl": "c",
+        "episodes": 2,
+    }
     result = pooling.pool_of_mates("go1gate", "before", ["a", "b"], ["new"], tmp_path, **options)
     settings = {"num_envs": 4, "start": "before", "mates": ("a", "b"), "total_steps": 48}
     policies = [str(tmp_path / "runs" / "go1gate" / "default" / "seed0"), "before", "new"]
     assert asked[0][:3] == (("go1gate",), ("default",), (0,)) and asked[0][4] == "c"
-    assert {name: tuple(x) if isinstance(x, list) else x for name, x in asked[0][3].items()} == settings
+    assert {
+        name: tuple(x) if isinstance(x, list) else x for name, x in asked[0][3].items()
+    } == settings
     assert asked[1] == ("go1gate", policies, {"impl": "c", "episodes": 2})
-    assert result == {"start": "before", "mates": ["a", "b"], "task": "go1gate", "policies": policies}
+    assert result == {
+        "start": "before",
+        "mates": ["a", "b"],
+        "task": "go1gate",
+        "policies": policies,
+    }

@@ -33,7 +33,10 @@ OBS = jax.random.normal(KEY, (64, 1, 12))
 def members() -> tuple[Any, ...]:
     """Policies that act with different means; the second has a recurrent state."""
     env = versus(matches(), ["idle"])
-    return tuple(new_policy(env, seed, network={"hidden_sizes": [8], "recurrent": seed == 1}) for seed in range(3))
+    return tuple(
+        new_policy(env, seed, network={"hidden_sizes": [8], "recurrent": seed == 1})
+        for seed in range(3)
+    )
 
 
 def mean(members: Any, *weights: float) -> Mixture:
@@ -46,7 +49,9 @@ def test_a_member_is_drawn_by_its_weight_and_stays_for_the_episode(members: Any)
     obs = jnp.tile(OBS[:1], (4000, 1, 1))
     first, memory = act(obs, policy.initial_memory(4000), KEY)
     drawn = np.asarray(memory["member"])
-    assert np.bincount(drawn.astype(int), minlength=4)[1:] / 4000 == pytest.approx([0.5, 0.25, 0.25], abs=0.03)
+    assert np.bincount(drawn.astype(int), minlength=4)[1:] / 4000 == pytest.approx(
+        [0.5, 0.25, 0.25], abs=0.03
+    )
     own = [member.acting(True).act(obs, member.initial_memory(4000))[0] for member in members]
     np.testing.assert_allclose(first, np.stack(own)[drawn.astype(int) - 1, range(4000)], atol=1e-6)
     _, later = act(obs, memory, jax.random.PRNGKey(1))
@@ -54,12 +59,15 @@ def test_a_member_is_drawn_by_its_weight_and_stays_for_the_episode(members: Any)
 
 
 @pytest.mark.parametrize(
-    "weights", [(0.0, 1.0, 0.0), (0.0, 0.6, 0.4), (0.7, 0.3, 0.0), (1 / 3, 1 / 3, 1 / 3), (1.0, 0.0, 1e-20)]
+    "weights",
+    [(0.0, 1.0, 0.0), (0.0, 0.6, 0.4), (0.7, 0.3, 0.0), (1 / 3, 1 / 3, 1 / 3), (1.0, 0.0, 1e-20)],
 )
 def test_a_member_without_weight_never_acts(weights: tuple[float, ...], members: Any) -> None:
     policy = mean(members, *weights)
     _, memory = jax.jit(policy.act)(jnp.tile(OBS, (20, 1, 1)), policy.initial_memory(1280), KEY)
-    assert {*np.asarray(memory["member"]).astype(int).tolist()} == {i + 1 for i, x in enumerate(weights) if x > 0.1}
+    assert {*np.asarray(memory["member"]).astype(int).tolist()} == {
+        i + 1 for i, x in enumerate(weights) if x > 0.1
+    }
 
 
 def test_without_a_key_the_heaviest_member_acts(members: Any) -> None:
@@ -75,7 +83,8 @@ def test_without_a_key_the_heaviest_member_acts(members: Any) -> None:
 def test_a_new_member_is_drawn_in_each_episode(members: Any) -> None:
     policy = Mixture(members, (0.4, 0.3, 0.3))
     env = versus(matches(num_envs=16), [policy])
-    step, state = jax.jit(env.step), env.reset(KEY)
+    step = jax.jit(env.step)
+    state = env.reset(KEY)
     drawn = []
     for _ in range(21):  # episodes have ten steps
         state = step(state, jnp.zeros((16, 1, 12)))
@@ -92,22 +101,30 @@ def test_a_mixture_acts_wherever_a_policy_does(members: Any, tmp_path: Path) -> 
     loaded = load_policy(file)
     assert (loaded.weights, loaded.metadata) == (policy.weights, {"note": "x"})
     for copy in (loaded, pickle.loads(pickle.dumps(policy)), load_policy(tmp_path, matches().env)):
-        assert_same(copy.act(OBS, copy.initial_memory(64), KEY), policy.act(OBS, policy.initial_memory(64), KEY))
+        assert_same(
+            copy.act(OBS, copy.initial_memory(64), KEY),
+            policy.act(OBS, policy.initial_memory(64), KEY),
+        )
     assert load_policy(file, deterministic=True).deterministic
     params = {"control": "position", "episode_length": 0.1}
     playing = players("go1revolvingdoor", file, file, env=params, impl="c", num_envs=4)
     assert evaluate_batch(playing.batch, playing.policy, 4, KEY).episodes == 4
     assert playing.about["actions"] == "sampled"
-    alone = players(file, impl="c", num_envs=4)  # the task and its parameters are those of the members
+    # the task and its parameters are those of the members
+    alone = players(file, impl="c", num_envs=4)
     assert alone.env.name == "go1revolvingdoor" and alone.env.control == "position"
     sides: Any = BothSides(matches(num_envs=4))
     assert tournament.play(sides, policy, [policy, members[0]], KEY).sum() == 4
 
 
-def test_a_training_meets_a_mixture_and_resumes_in_its_episodes(members: Any, tmp_path: Path) -> None:
+def test_a_training_meets_a_mixture_and_resumes_in_its_episodes(
+    members: Any, tmp_path: Path
+) -> None:
     env = versus(matches(), [Mixture(members, (0.4, 0.3, 0.3)), "idle"])
     learner = make_learner(env, members[0].config)
-    template = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))[0].rollout.env_state
+    template = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))[
+        0
+    ].rollout.env_state
     state = jax.jit(env.step)(jax.jit(env.reset)(KEY), jnp.zeros((4, 1, 12)))
     save_tree(tmp_path / "a", state, {}, kind="checkpoint")
     kept = load_tree(tmp_path / "a", template, kind="checkpoint").tree
@@ -116,11 +133,15 @@ def test_a_training_meets_a_mixture_and_resumes_in_its_episodes(members: Any, tm
 
 def test_a_mixture_acts_with_its_own_skill_in_a_match_of_several() -> None:
     policy = load_policy("go1tug", deterministic=True)
-    env = make("go1tug", impl="c", num_envs=1, **parameters_for("go1tug", policy, "population/1/late"))
-    mixture, alone = load_as("opponent", Mixture((policy, policy), (0.5, 0.5)), env), load_as("opponent", policy, env)
+    env = make(
+        "go1tug", impl="c", num_envs=1, **parameters_for("go1tug", policy, "population/1/late")
+    )
+    mixture = load_as("opponent", Mixture((policy, policy), (0.5, 0.5)), env)
+    alone = load_as("opponent", policy, env)
     assert isinstance(mixture, Translated)
     obs = OBS[..., : env.observation_size]
-    one, other = (each.act(obs, each.initial_memory(64), KEY)[0] for each in (mixture, alone))
+    one = mixture.act(obs, mixture.initial_memory(64), KEY)[0]
+    other = alone.act(obs, alone.initial_memory(64), KEY)[0]
     np.testing.assert_allclose(one, other, atol=1e-6)
 
 
@@ -151,8 +172,12 @@ def test_what_is_no_mixture_is_refused(said: str, changes: dict[str, Any], membe
 
 
 def test_members_have_the_same_needs(members: Any) -> None:
-    other = dataclasses.replace(members[1], needs=dataclasses.replace(members[1].needs, robot="go2"))
-    with pytest.raises(InputError, match=r"members: \"robot 'go2' of member 1\" is not allowed; .* member 0, 'go1'"):
+    other = dataclasses.replace(
+        members[1], needs=dataclasses.replace(members[1].needs, robot="go2")
+    )
+    with pytest.raises(
+        InputError, match=r"members: \"robot 'go2' of member 1\" is not allowed; .* member 0, 'go1'"
+    ):
         Mixture((members[0], other), (0.5, 0.5))
     with pytest.raises(InputError, match="memory: "):
         Mixture(members, (1.0, 0.0, 0.0)).act(OBS, (), KEY)

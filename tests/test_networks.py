@@ -1,4 +1,6 @@
-"""Algorithms and networks: their settings, the multi-agent transformer, and every network in every use."""
+"""Algorithms and networks: their settings, the multi-agent transformer, and every network in every
+use.
+"""
 
 import functools
 import math
@@ -45,8 +47,12 @@ def learn(algorithm: str, pay: Any, updates: int, *changes: dict[str, Any]) -> n
 
 
 @pytest.mark.parametrize(("algorithm", "cooperates"), [("jrpo", True), ("ippo", False)])
-def test_only_the_joint_ratio_cooperates_for_a_public_good(algorithm: str, cooperates: bool) -> None:
-    """Individual ratios converge to the Nash equilibrium, -0.5 each; the joint ratio contributes all, +0.5 each."""
+def test_only_the_joint_ratio_cooperates_for_a_public_good(
+    algorithm: str, cooperates: bool
+) -> None:
+    """Individual ratios converge to the Nash equilibrium, -0.5 each; the joint ratio contributes
+    all, +0.5 each.
+    """
     reward = learn(algorithm, probes.pay_public_good, 50, PLAIN)[-5:].mean()
     assert reward >= 0.45 if cooperates else reward <= -0.45
 
@@ -55,7 +61,10 @@ def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
     log_std = -1.2
     fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}
     small = {"network": {"width": 16, "deviation": "free"}, "optimizer": {"learning_rate": 3e-3}}
-    assert -learn("mat", probes.pay_meeting, 100, small, fixed)[-20:].mean() / math.exp(2 * log_std) <= 1.2
+    assert (
+        -learn("mat", probes.pay_meeting, 100, small, fixed)[-20:].mean() / math.exp(2 * log_std)
+        <= 1.2
+    )
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -63,12 +72,15 @@ def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
     config = base_config("go1gate", None, algorithm)
     again = override(config, preset(algorithm))
     assert again == config, algorithm
-    assert config.action_scale == 0.5 and config.num_envs == 500 and config.total_steps == 40_000_000
+    assert (
+        config.action_scale == 0.5 and config.num_envs == 500 and config.total_steps == 40_000_000
+    )
     assert isinstance(config.network, Mat if algorithm == "mat" else ActorCritic)
 
 
 def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
-    demo, joint = base_config("go1gate", "demo"), base_config("go1gate", "demo", "jrpo")
+    demo = base_config("go1gate", "demo")
+    joint = base_config("go1gate", "demo", "jrpo")
     assert (joint.ppo.ratio, joint.ppo.value) == ("joint", "joint")
     assert joint.network == override(demo, {"network.critic_input": "observations"}).network
     assert base_config("go1gate", "demo", "mat").network == Mat()
@@ -97,13 +109,17 @@ def dims(agents: int) -> EnvDims:
 def made(agents: int, **settings: Any) -> tuple[Network, Params, jax.Array]:
     """A network with strong weights, so that every path counts, and observations (4, A, 5)."""
     network = Mat(gain=1.0, width=8, **settings).build(dims(agents))
-    network = network._replace(init=jax.jit(network.init), act=jax.jit(network.act), evaluate=jax.jit(network.evaluate))
+    network = network._replace(
+        init=jax.jit(network.init), act=jax.jit(network.act), evaluate=jax.jit(network.evaluate)
+    )
     return network, network.init(KEY), jax.random.normal(KEY, (4, agents, 5))
 
 
 def log_probs(network: Network, params: Params, obs: jax.Array, action: jax.Array) -> np.ndarray:
     first = jnp.zeros(obs.shape[:1], bool)
-    return np.asarray(network.evaluate(params, NO_MEMORY, first, obs, obs[..., 0, :1], action).log_prob)
+    return np.asarray(
+        network.evaluate(params, NO_MEMORY, first, obs, obs[..., 0, :1], action).log_prob
+    )
 
 
 @pytest.mark.parametrize(
@@ -127,7 +143,8 @@ def test_an_agent_that_takes_no_part_is_left_out_of_the_sequence() -> None:
     alone, its_density, _ = fewer.act(fewer.policy_params(params), (), obs[:, there], None)
     np.testing.assert_allclose(action[:, there], alone, atol=1e-5)
     np.testing.assert_allclose(density[:, there], its_density, atol=1e-5)
-    first, taken = jnp.zeros(4, bool), jax.random.normal(KEY, (4, 4, 2))
+    first = jnp.zeros(4, bool)
+    taken = jax.random.normal(KEY, (4, 4, 2))
     one = network.evaluate(params, NO_MEMORY, first, obs, obs[..., 0, :1], taken, active)
     two = fewer.evaluate(params, NO_MEMORY, first, obs[:, there], obs[..., 0, :1], taken[:, there])
     np.testing.assert_allclose(one.log_prob[:, there], two.log_prob, atol=1e-5)
@@ -153,13 +170,19 @@ def test_settings_that_do_not_fit_are_named() -> None:
     refuses(r"ppo\.value", Mat().build, dims(3)._replace(values=1))
 
 
-# -- every registered network in every use -----------------------------------------------------------------------------
+# -- every registered network in every use
 
 
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "actor_critic": [
         {"recurrent": False, "hidden_sizes": (4, 4), "action_mean": "tanh", "activation": "elu"},
-        {"recurrent": True, "gru_size": 4, "hidden_sizes": (4,), "openrl_layers": True, "share_policy": False},
+        {
+            "recurrent": True,
+            "gru_size": 4,
+            "hidden_sizes": (4,),
+            "openrl_layers": True,
+            "share_policy": False,
+        },
     ],
     "blocks": [{"gru_size": 4, "hidden_sizes": (4,), "entity_sizes": (4,), "chunk_length": 2}],
     "mat": [{"width": 8, "heads": 2, "blocks": 1}],
@@ -189,13 +212,17 @@ def show_widely(width: int, hidden: jax.Array, step: jax.Array) -> jax.Array:
 
 
 def probe(network: str) -> Any:
-    """Environments of the sizes that a network needs, with the attributes that the viewer and the export read."""
+    """Environments of the sizes that a network needs, with the attributes that the viewer and the
+    export read.
+    """
     skilled = {"walk": OBSERVATION_SIZE, "agile": FRAME_SIZE + NOW_SIZE}
     agents = 1 if network in skilled else 2
     width = skilled[network] - agents if network in skilled else 5
     show = functools.partial(show_widely, width)
     teams = (tuple(range(agents)),)
-    env = Probe(show, pay_each, 4, agents, action_size=12, features=width, max_episode_steps=3, teams=teams)
+    env = Probe(
+        show, pay_each, 4, agents, action_size=12, features=width, max_episode_steps=3, teams=teams
+    )
     blocks = (Block("one_hot", 2), entities("pair", "robot", 2, 1, masked=True), Block("rest", 1))
     described = {"describe": lambda group: {"blocks": blocks}} if network == "blocks" else {}
     for name, value in {"dt": 0.02, "control": "torque", "robot": GO1, **described}.items():
@@ -205,7 +232,9 @@ def probe(network: str) -> Any:
 
 def test_every_registered_network_is_here() -> None:
     assert walk_network.WalkNetwork is NETWORKS["walk"]
-    assert set(VARIANTS) == {name for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")}
+    assert set(VARIANTS) == {
+        name for name, kind in NETWORKS.items() if kind.__module__.startswith("mqe_jax")
+    }
 
 
 @pytest.mark.usefixtures("shared_programs")
@@ -213,10 +242,17 @@ def test_every_registered_network_is_here() -> None:
 def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
     network: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    once = {"checkpoint__every": 1, "evaluation": {"every": 2, "episodes": 4}, "ppo__epochs": 1, "total_steps": 3 * 16}
-    env, config = probe(network["name"]), settings(**once, loggers=(), network=network)
+    once = {
+        "checkpoint__every": 1,
+        "evaluation": {"every": 2, "episodes": 4},
+        "ppo__epochs": 1,
+        "total_steps": 3 * 16,
+    }
+    env = probe(network["name"])
+    config = settings(**once, loggers=(), network=network)
     configs = [config, override(config, {"seed": 1})]
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    whole = tmp_path / "whole"
+    stopped = tmp_path / "stopped"
     folders = [[parent / name for name in ("seed0", "seed1")] for parent in (whole, stopped)]
 
     def copy(state: Any, row: dict[str, float]) -> None:

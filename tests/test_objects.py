@@ -1,4 +1,6 @@
-"""Objects and NPCs: motion of boxes, balls, sheep and the defender, and the tasks with objects and sheep."""
+"""Objects and NPCs: motion of boxes, balls, sheep and the defender, and the tasks with objects and
+sheep.
+"""
 
 import dataclasses
 from typing import Any
@@ -26,13 +28,16 @@ herd = pytest.fixture(scope="module")(lambda: made("go1sheep-hard"))
 
 
 def plain(**objects: objects.Object) -> Any:
-    return compile_scene(Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects))
+    return compile_scene(
+        Scene(Track((SpawnArea(2.0), Plane(8.0)), walled=False), num_robots=1, objects=objects)
+    )
 
 
 @pytest.mark.parametrize(
     ("position", "yaw", "ball", "move"),
     [
-        # Where it should be: 3 m before the goal, 0.6 of the way to a ball 5 m away; it faces away from the goal.
+        # Where it should be: 3 m before the goal, 0.6 of the way to a ball 5 m away; it faces away
+        # from the goal.
         ((9.0, 0.0), np.pi, (7.0, 0.0), (0.0, 0.0, 0.0)),
         # 0.3 m too near the goal: forward, which is away from it. 2 m too near: as fast as it may.
         ((9.3, 0.0), np.pi, (7.0, 0.0), (0.3, 0.0, 0.0)),
@@ -56,7 +61,8 @@ def test_sheep_observation(herd: Any) -> None:
     state = dataclasses.replace(initial(herd), anchors=jnp.array([[8.5, 0.4]]))
     for number in range(9):
         state = with_object(herd, state, f"sheep{number}", [number, -0.1 * number])
-    obs, info = observation(herd, state), np.asarray(herd.read(state.data).base_info)
+    obs = observation(herd, state)
+    info = np.asarray(herd.read(state.data).base_info)
     sheep = [place for number in range(9) for place in (number, -0.1 * number)]
     for agent in range(2):
         expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], 8.5, 0.4, *sheep]
@@ -64,11 +70,18 @@ def test_sheep_observation(herd: Any) -> None:
 
 
 def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
-    env: Any = make("go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False)
+    env: Any = make(
+        "go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False
+    )
     state = initial(env)
     state = with_object(env, state, "sheep0", [2.0, 1.0])
     index = env.index.base_qpos
-    qpos = state.data.qpos.at[index[0, :2]].set(jnp.array([1.2, 1.0])).at[index[1, :2]].set(jnp.array([0.5, -1.5]))
+    qpos = (
+        state.data.qpos.at[index[0, :2]]
+        .set(jnp.array([1.2, 1.0]))
+        .at[index[1, :2]]
+        .set(jnp.array([0.5, -1.5]))
+    )
     state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
     step = jax.jit(env.step)
     after = step(state, jnp.zeros((2, 12)))
@@ -79,13 +92,15 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
     cornered = dataclasses.replace(cornered, data=cornered.data.replace(qpos=qpos))
     for _ in range(50):
         cornered = step(cornered, jnp.zeros((2, 12)))
-    assert float(env.sheep(cornered.data)[0, 1]) < 1.85  # the side wall is at 2.0, the sheep's radius 0.2
+    # the side wall is at 2.0, the sheep's radius 0.2
+    assert float(env.sheep(cornered.data)[0, 1]) < 1.85
 
 
 def test_pushbox_rewards_and_success(box_env: Any) -> None:
     state = dataclasses.replace(initial(box_env), anchors=jnp.array([[4.5, 0.2]]))
     state = with_object(box_env, state, "box", [4.47, 0.2, 0.5, 1, 0, 0, 0])
-    robots, no = box_env.read(state.data), jnp.array(False)
+    robots = box_env.read(state.data)
+    no = jnp.array(False)
     ahead = with_object(box_env, state, "box", [4.49, 0.2, 0.5, 1, 0, 0, 0])
     reward = terms_of(box_env, state, ahead)[1]
     np.testing.assert_allclose(reward, [10 * 0.02] * 2, atol=1e-4)
@@ -94,28 +109,40 @@ def test_pushbox_rewards_and_success(box_env: Any) -> None:
     reward = terms_of(box_env, state, behind)[1]
     np.testing.assert_allclose(reward, [10 * 0.05 + 1] * 2, atol=1e-4)
     assert float(box_env.outcome(behind, robots, no)["success"]) == 1
-    start = dataclasses.replace(behind, task=dataclasses.replace(behind.task, start=jnp.float32(2.2)))
+    start = dataclasses.replace(
+        behind, task=dataclasses.replace(behind.task, start=jnp.float32(2.2))
+    )
     assert float(box_env.outcome(start, robots, no)["distance"]) == pytest.approx(2.32, abs=1e-4)
 
 
 def test_pushbox_observation(box_env: Any) -> None:
     state = with_object(box_env, initial(box_env), "box", [3.0, 0.4, 0.5, 0.8, 0, 0, 0.6])
-    obs, info = observation(box_env, state), np.asarray(box_env.read(state.data).base_info)
+    obs = observation(box_env, state)
+    info = np.asarray(box_env.read(state.data).base_info)
     for agent in range(2):
-        expected = [*np.eye(2)[agent], *info[agent], *info[1 - agent], *np.asarray(state.anchors[0])]
+        expected = [
+            *np.eye(2)[agent],
+            *info[agent],
+            *info[1 - agent],
+            *np.asarray(state.anchors[0]),
+        ]
         np.testing.assert_allclose(obs[agent], [*expected, 3.0, 0.4, 0.8, 0, 0, 0.6], atol=1e-6)
 
 
 def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
     easy = made("go1sheep-easy")
     state = dataclasses.replace(initial(easy), anchors=jnp.array([[5.0, 0.3]]))
-    before, after = (with_object(easy, state, "sheep0", [x, 0.3]) for x in (4.98, 5.01))
+    before = with_object(easy, state, "sheep0", [4.98, 0.3])
+    after = with_object(easy, state, "sheep0", [5.01, 0.3])
     reward = terms_of(easy, before, after)[1]
     np.testing.assert_allclose(reward, [1 + 2 * 0.03] * 2, atol=1e-4)
 
     state = dataclasses.replace(initial(herd), anchors=jnp.array([[8.5, 0.0]]))
-    for number in range(9):  # two are through; the others stand 3 m and 4 m away from the gate: hypot = 5
-        state = with_object(herd, state, f"sheep{number}", [8.6 + number, 0.0] if number < 2 else [5.5, 4.0])
+    # two are through; the others stand 3 m and 4 m away from the gate: hypot = 5
+    for number in range(9):
+        state = with_object(
+            herd, state, f"sheep{number}", [8.6 + number, 0.0] if number < 2 else [5.5, 4.0]
+        )
     reward = terms_of(herd, state, state)[1]
     np.testing.assert_allclose(reward, [2 + 7 * np.exp(-2.5)] * 2, atol=1e-4)
     for failed, share in ((False, 2 / 9), (True, 0.0)):
@@ -124,21 +151,32 @@ def test_sheep_rewards_easy_and_hard(herd: Any) -> None:
 
 
 def test_shaping_terms_of_sheep_dog(herd: Any) -> None:
-    """Of two sheep that move, one passes the gate from 0.5 m before it, the other comes 1 m nearer to its centre."""
+    """Of two sheep that move, one passes the gate from 0.5 m before it, the other comes 1 m nearer
+    to its centre.
+    """
     before = dataclasses.replace(initial(herd), anchors=jnp.array([[8.5, 0.0]]))
     for number in range(9):
         before = with_object(herd, before, f"sheep{number}", [5.5, 4.0])  # 5 m away
     before = with_object(herd, before, "sheep0", [8.0, 0.0])
     after = with_object(herd, with_object(herd, before, "sheep0", [8.6, 0.0]), "sheep1", [6.1, 3.2])
-    forth, back = terms_of(herd, before, after)[0], terms_of(herd, after, before)[0]
-    assert float(forth["crossing"]) == 1 and float(forth["gathering"]) == pytest.approx(1.5, abs=1e-5)
-    assert float(back["crossing"]) == -1 and float(back["gathering"]) == pytest.approx(-1.5, abs=1e-5)
+    forth = terms_of(herd, before, after)[0]
+    back = terms_of(herd, after, before)[0]
+    assert float(forth["crossing"]) == 1 and float(forth["gathering"]) == pytest.approx(
+        1.5, abs=1e-5
+    )
+    assert float(back["crossing"]) == -1 and float(back["gathering"]) == pytest.approx(
+        -1.5, abs=1e-5
+    )
     weights = herd.params.rewards
     assert weights.crossing == weights.gathering == weights.failure == 0
     fallen = placed(herd, [[2.0, -1.0, 0.5], [2.0, 1.0, 0.3]], angles(roll=(0.9, 0.0)))
     standing = placed(herd, [[2.0, -1.0, 0.3], [2.0, 1.0, 0.3]])
     moments = [Moment(state, herd.read(state.data)) for state in (standing, fallen)]
-    failures = [herd.rewards(now, now, jnp.array(bump))["failure"] for now in moments for bump in (False, True)]
+    failures = [
+        herd.rewards(now, now, jnp.array(bump))["failure"]
+        for now in moments
+        for bump in (False, True)
+    ]
     assert [bool(x) for x in failures] == [False, True, True, True]
 
 
@@ -153,14 +191,22 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
 
 @pytest.mark.parametrize(
     ("task", "share"),
-    [("go1gate", 0.9), *(pytest.param(task, 0.6, marks=pytest.mark.soak) for task in ("go1sheep-hard", "go1seesaw"))],
+    [
+        ("go1gate", 0.9),
+        *(
+            pytest.param(task, 0.6, marks=pytest.mark.soak)
+            for task in ("go1sheep-hard", "go1seesaw")
+        ),
+    ],
 )
 def test_the_scripted_policy_wins(task: str, share: float) -> None:
     from mqe_jax.train.evaluate import evaluate_batch
 
     batch = VectorEnv(make(task, impl="c", num_envs=16), 16)
     plan = jax.vmap(scripted_policy(batch.env))
-    result = evaluate_batch(batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0))
+    result = evaluate_batch(
+        batch, lambda obs, memory, _: (plan(obs), memory), 16, jax.random.PRNGKey(0)
+    )
     assert result.to_dict()["success_rate"] >= share
 
 
@@ -182,7 +228,10 @@ def faster(spec: mujoco.MjSpec, name: str) -> None:
     ("add", "message"),
     [
         (motor, r"objects: thing: Own.add\(\) changes the scene's actuators from 12 to 13"),
-        (lambda spec, name: spec.worldbody.add_body(name=name, mocap=True), "mocap bodies from 0 to 1"),
+        (
+            lambda spec, name: spec.worldbody.add_body(name=name, mocap=True),
+            "mocap bodies from 0 to 1",
+        ),
         (lambda spec, name: spec.delete(spec.actuator("robot0/FL_hip")), "actuators from 12 to 11"),
         (lambda spec, name: spec.worldbody.add_body(name="crate"), "adds no body 'object/thing'"),
         (faster, "timestep from 0.005 to 0.001"),

@@ -1,4 +1,6 @@
-"""Policies that see sensors: their default settings, their teachers, what they need of an environment, resumed runs."""
+"""Policies that see sensors: their default settings, their teachers, what they need of an
+environment, resumed runs.
+"""
 
 import dataclasses
 import functools
@@ -25,7 +27,17 @@ from mqe_jax.train.runner import train_seeds
 from mqe_jax.train.stages import Stages
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import FAST, Probe, ProbeState, Stop, assert_same_run, random_params, settings, stop_after, updated
+from tests.training import (
+    FAST,
+    Probe,
+    ProbeState,
+    Stop,
+    assert_same_run,
+    random_params,
+    settings,
+    stop_after,
+    updated,
+)
 
 SENSES = {"senses": "onboard"}
 TINY: dict[str, Any] = {
@@ -34,7 +46,13 @@ TINY: dict[str, Any] = {
     "rollout_steps": 4,
     "total_steps": 3 * 8,
     "ppo": {"epochs": 1, "minibatches": 1},
-    "network": {"hidden_sizes": (8,), "gru_size": 4, "entity_sizes": (4,), "chunk_length": 2, "openrl_layers": False},
+    "network": {
+        "hidden_sizes": (8,),
+        "gru_size": 4,
+        "entity_sizes": (4,),
+        "chunk_length": 2,
+        "openrl_layers": False,
+    },
     "curriculum": {"demonstrator": None, "assistance": 0.0},
     "checkpoint.every": 1,
     "loggers": (),
@@ -48,7 +66,9 @@ def test_sensors_select_the_settings_of_policies_that_see_them() -> None:
     assert train.overrides() == SENSES and train.settings.imitation.teacher == "go1gate"
     assert (train.settings.group, train.settings.network.name) == ("onboard", "blocks")
     assert train.settings == settings_of("go1gate", {"imitation.teacher": "go1gate"}, SENSES)
-    network: Any = parse_train(["go1gate", "--set", "senses=onboard", "--network.gru-size", "7"]).settings.network
+    network: Any = parse_train(
+        ["go1gate", "--set", "senses=onboard", "--network.gru-size", "7"]
+    ).settings.network
     assert network.gru_size == 7
     plain = parse_train(["go1gate", "--senses", "full"]).settings
     assert plain == parse_train(["go1gate"]).settings and plain.group == "policy"
@@ -73,7 +93,13 @@ def test_a_task_gets_what_its_teacher_needs(monkeypatch: pytest.MonkeyPatch) -> 
     }
     given = for_task(config, "go1gate", {"skill": "walk"})
     assert given.env["skill"] == "walk"
-    refuses(r"imitation\.teacher: go1gate needs skill 'agile'.* has 'walk'", prepare, "go1gate", given, impl="c")
+    refuses(
+        r"imitation\.teacher: go1gate needs skill 'agile'.* has 'walk'",
+        prepare,
+        "go1gate",
+        given,
+        impl="c",
+    )
 
 
 @functools.cache
@@ -87,7 +113,10 @@ def test_policies_without_sensors_send_no_messages() -> None:
     senses = {"senses": ["proprioception", {"name": "messages", "numbers": 2}]}
     _, cast = prepare("go1gate", TINY, senses, impl="c")
     obs = Observations(jnp.ones((3, 2, 16)))
-    act = lambda policy: policy.act(obs, policy.initial_memory(3), jax.random.PRNGKey(0))[0]  # noqa: E731
+
+    def act(policy):
+        return policy.act(obs, policy.initial_memory(3), jax.random.PRNGKey(0))[0]
+
     action = act(cast.teacher)
     assert action.shape == (3, 2, 5) == (3, 2, cast.env.action_size) and not action[..., 3:].any()
     shipped = zoo.load("go1gate")
@@ -98,17 +127,27 @@ def test_policies_without_sensors_send_no_messages() -> None:
 
 def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
     (config,), cast = onboard()
-    needs, random = needs_of(cast.env, config), np.random.default_rng(0)
-    network, features = config.network.build(needs.dims), config.network.features(needs.dims)
+    needs = needs_of(cast.env, config)
+    random = np.random.default_rng(0)
+    network = config.network.build(needs.dims)
+    features = config.network.features(needs.dims)
     statistics = running_init(needs.dims.observation, features)
-    policy = TrainedPolicy(network.policy_params(random_params(network)), statistics, needs, config, {}, True)
+    policy = TrainedPolicy(
+        network.policy_params(random_params(network)), statistics, needs, config, {}, True
+    )
     env = make("go1gate", impl="c", num_envs=1, skill=("walk", "agile"), **SENSES)
-    layout, met = env.groups["onboard"], load_as("opponent", policy, env)
+    layout = env.groups["onboard"]
+    met = load_as("opponent", policy, env)
     assert layout.size == needs.dims.observation + 1
-    memory, own, last = met.initial_memory(3), policy.initial_memory(3), jnp.zeros((3, 2, 3))
+    memory = met.initial_memory(3)
+    own = policy.initial_memory(3)
+    last = jnp.zeros((3, 2, 3))
     for _ in range(2):
-        here, key = jnp.asarray(random.normal(size=(3, 2, layout.size)), jnp.float32), jax.random.PRNGKey(0)
-        action, memory = met.act(Observations(jnp.zeros((3, 2, 16)), None, {"onboard": here}), memory, key)
+        here = jnp.asarray(random.normal(size=(3, 2, layout.size)), jnp.float32)
+        key = jax.random.PRNGKey(0)
+        action, memory = met.act(
+            Observations(jnp.zeros((3, 2, 16)), None, {"onboard": here}), memory, key
+        )
         seen = jnp.concatenate([*(layout.split(here) | {"action": last}).values()], axis=-1)
         last, own = policy.act(seen, own)
         assert action.shape == (3, 2, 4) and np.abs(last).max() > 0.01
@@ -118,19 +157,30 @@ def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
 def test_other_sensors_are_named_with_both_values() -> None:
     (config,), cast = onboard()
     needs = needs_of(cast.env, config)
-    policy: Any = SimpleNamespace(task="go1gate", agents=2, needs=needs, config=config, act=None, initial_memory=None)
+    policy: Any = SimpleNamespace(
+        task="go1gate", agents=2, needs=needs, config=config, act=None, initial_memory=None
+    )
     check_policy(policy, cast.env)
     blind = make("go1gate", impl="c", num_envs=1)
     first, near, *others = needs.senses
     for senses, message in (
         ("full", "needs group 'onboard'; the environment has 'entities, policy, proprioception'"),
-        ([first], r"needs senses \('proprioception', 'detections', 'lidar'\); .* has \('proprioception',\)"),
-        ([first, {**near, "range": 4.0}, *others], "needs senses.detections.range 6.0; the environment has 4.0"),
+        (
+            [first],
+            r"needs senses \('proprioception', 'detections', 'lidar'\); .* has "
+            r"\('proprioception',\)",
+        ),
+        (
+            [first, {**near, "range": 4.0}, *others],
+            "needs senses.detections.range 6.0; the environment has 4.0",
+        ),
     ):
         with pytest.raises(InputError, match=message):
             check_policy(policy, make("go1gate", impl="c", num_envs=1, senses=senses))
     forged = override(needs, {"dims": needs.dims._replace(blocks=needs.dims.blocks[::-1])})
-    assert forged.mismatches(needs) == {} != Needs(task="go1gate", dims=needs.dims).mismatches(needs)
+    assert (
+        forged.mismatches(needs) == {} != Needs(task="go1gate", dims=needs.dims).mismatches(needs)
+    )
     assert parameters_for("go1gate", policy) == {"senses": needs.senses}
     check_policy(zoo.load("go1gate"), blind)  # of before files described blocks
 
@@ -144,7 +194,9 @@ class SeeingState(ProbeState):
 
 
 class Seeing(Probe):
-    """Environments whose group `signs` shows the sign alone; the second entry of an action moves nothing."""
+    """Environments whose group `signs` shows the sign alone; the second entry of an action moves
+    nothing.
+    """
 
     def moving(self, action: jax.Array) -> jax.Array:
         return action[..., :1]
@@ -163,7 +215,9 @@ class Seeing(Probe):
 class Counter:
     """A teacher that sees the sign alone, and remembers the number of steps of an episode."""
 
-    task, agents, groups = "probe", 2, ("signs",)
+    task = "probe"
+    agents = 2
+    groups = ("signs",)
 
     def initial_memory(self, num_envs: int) -> jax.Array:
         return jnp.zeros(num_envs)
@@ -174,17 +228,33 @@ class Counter:
 
 def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
     """Its memory passes from rollout to rollout, and starts anew with each episode."""
-    show = lambda hidden, step: jnp.stack([hidden, step.astype(jnp.float32)], axis=-1)  # noqa: E731
-    env = Seeing(show, probes.pay_one, num_envs=32, action_size=2, features=2, max_episode_steps=3, odd_episode_steps=5)
+
+    def show(hidden, step):
+        return jnp.stack([hidden, step.astype(jnp.float32)], axis=-1)
+
+    env = Seeing(
+        show,
+        probes.pay_one,
+        num_envs=32,
+        action_size=2,
+        features=2,
+        max_episode_steps=3,
+        odd_episode_steps=5,
+    )
     shown: list[Any] = []
 
     class Watched(Stages):
         def update(self, carry: Any, batch: Batch, now: Any, key: jax.Array) -> Any:
-            jax.debug.callback(lambda *x: shown.append(x), batch.obs, batch.teacher_action, ordered=True)
+            jax.debug.callback(
+                lambda *x: shown.append(x), batch.obs, batch.teacher_action, ordered=True
+            )
             return super().update(carry, batch, now, key)
 
     config = settings(
-        FAST, imitation={"teacher": "scripted", "until": 1.0}, action_scale=0.5, network__log_std_min=-1.0
+        FAST,
+        imitation={"teacher": "scripted", "until": 1.0},
+        action_scale=0.5,
+        network__log_std_min=-1.0,
     )
     metrics = updated(env, config, 12, stages=Watched, teacher=Counter())[1]
     for obs, action in shown:
@@ -198,7 +268,9 @@ def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
 class Pacer:
     """A teacher that remembers the number of its steps."""
 
-    task, agents, groups = "go1gate", 2, ("policy",)
+    task = "go1gate"
+    agents = 2
+    groups = ("policy",)
 
     def initial_memory(self, num_envs: int) -> jax.Array:
         return jnp.zeros(num_envs)
@@ -212,9 +284,14 @@ class Pacer:
 def test_a_training_with_sensors_resumes_bit_for_bit(tmp_path: Path) -> None:
     """Noise, delay, drift and dropout included."""
     late = {"all": {"noise": 0.1, "delay": 2, "dropout": 0.3}}
-    senses = ["proprioception", {"name": "detections", "pipeline": late}, {"name": "lidar", "pipeline": late}]
+    senses = [
+        "proprioception",
+        {"name": "detections", "pipeline": late},
+        {"name": "lidar", "pipeline": late},
+    ]
     (config,), cast = prepare("go1gate", TINY, {"senses": senses}, impl="c")
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    whole = tmp_path / "whole"
+    stopped = tmp_path / "stopped"
     train = functools.partial(train_seeds, cast.env, [config], teacher=Pacer())
     train([whole])
     with pytest.raises(Stop):

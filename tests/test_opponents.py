@@ -1,4 +1,6 @@
-"""Matches as environments of one team, against opponents that may change; policies by name; training with opponents."""
+"""Matches as environments of one team, against opponents that may change; policies by name;
+training with opponents.
+"""
 
 import dataclasses
 import functools
@@ -30,7 +32,14 @@ from tests.inputs import refuses
 from tests.training import random_params
 
 KEY = jax.random.PRNGKey(0)
-MATCHES = ("go1revolvingdoor", "go1tug", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
+MATCHES = (
+    "go1revolvingdoor",
+    "go1tug",
+    "go1wrestling",
+    "go1bridge",
+    "go1football-1vs1",
+    "go1football-2vs2",
+)
 SETTINGS: dict[str, Any] = {
     "num_envs": 4,
     "rollout_steps": 4,
@@ -42,15 +51,23 @@ SETTINGS: dict[str, Any] = {
 
 @functools.cache
 def matches(task: str = "go1revolvingdoor", num_envs: int = 4, **params: Any) -> VectorEnv:
-    """Matches with joint targets as actions, of ten steps; `reset` is compiled, also within that of `versus`."""
+    """Matches with joint targets as actions, of ten steps; `reset` is compiled, also within that of
+    `versus`.
+    """
     params = {"control": "position", "episode_length": 0.2, **params}
     env = VectorEnv(make(task, impl="c", num_envs=num_envs, **params), num_envs)
     env.reset = jax.jit(env.reset)  # type: ignore[method-assign]
     return env
 
 
-def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **settings: Any) -> TrainedPolicy:
-    own = {"task": env.name, "env": {"control": env.env.control, **params}, "num_envs": env.num_envs}
+def new_policy(
+    env: Any, seed: int = 0, params: Any = MappingProxyType({}), **settings: Any
+) -> TrainedPolicy:
+    own = {
+        "task": env.name,
+        "env": {"control": env.env.control, **params},
+        "num_envs": env.num_envs,
+    }
     config = build(TrainConfig, {**SETTINGS, **own, **settings})
     needs = needs_of(env, config)
     network = config.network.build(needs.dims)
@@ -61,32 +78,47 @@ def new_policy(env: Any, seed: int = 0, params: Any = MappingProxyType({}), **se
 def test_teams_may_see_different_groups_of_observations() -> None:
     task = matches("go1tug", 2).env
     plain = VectorEnv(task, 2)
-    refuses("group: 'smell' is not allowed; it must be one of go1tug: policy, proprio", plain.with_groups, ["smell"])
+    refuses(
+        "group: 'smell' is not allowed; it must be one of go1tug: policy, proprio",
+        plain.with_groups,
+        ["smell"],
+    )
     env = plain.with_groups(["proprioception"])
-    seeing, blind = (new_policy(versus(env, ["idle"]), group=group) for group in ("policy", "proprioception"))
+    seeing = new_policy(versus(env, ["idle"]), group="policy")
+    blind = new_policy(versus(env, ["idle"]), group="proprioception")
     assert (seeing.dims.observation, blind.dims.observation) == (env.observation_size, 27)
-    state, less = jax.jit(env.reset)(KEY), jax.jit(plain.reset)(KEY)
+    state = jax.jit(env.reset)(KEY)
+    less = jax.jit(plain.reset)(KEY)
     robots = jax.jit(jax.vmap(task.read))(state.data)
-    np.testing.assert_allclose(state.groups["proprioception"][..., :3], robots.projected_gravity, atol=1e-6)
+    np.testing.assert_allclose(
+        state.groups["proprioception"][..., :3], robots.projected_gravity, atol=1e-6
+    )
     assert less.groups == {}
     both = BothTeams(seeing, blind)
     assert {*both.groups} == {"policy", "proprioception"}
-    memory, keys = both.initial_memory(2), jax.random.split(KEY)
+    memory = both.initial_memory(2)
+    keys = jax.random.split(KEY)
     action, _ = both.act(observations(state), memory, KEY)
     own, _ = blind.act(state.groups["proprioception"][:, 1:], memory[1], keys[1])
     np.testing.assert_array_equal(action[:, 1:], own)
-    refuses("group: 'proprioception' is missing in the state", both.act, observations(less), memory, KEY)
+    refuses(
+        "group: 'proprioception' is missing in the state", both.act, observations(less), memory, KEY
+    )
     config = build(TrainConfig, {**SETTINGS, "num_envs": 2, "group": "proprioception"})
     config = override(config, {"network.critic_input": "own"})
     learner = make_learner(Versus(env, [seeing]), config)
     after, _ = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))
     assert after.obs_normalizer.obs.mean.shape == (27,)
-    cast = setup.environments("c", override(config, {"task": "go1gate", "evaluation.every": 1, "seed": 0}), 1)
+    cast = setup.environments(
+        "c", override(config, {"task": "go1gate", "evaluation.every": 1, "seed": 0}), 1
+    )
     assert cast.env.groups == cast.eval_env.groups == ("proprioception",)
 
 
 door = pytest.fixture(scope="module")(lambda: matches())
-policies = pytest.fixture(scope="module")(lambda door: [new_policy(versus(door, ["idle"]), seed) for seed in (0, 1)])
+policies = pytest.fixture(scope="module")(
+    lambda door: [new_policy(versus(door, ["idle"]), seed) for seed in (0, 1)]
+)
 
 
 def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv) -> None:
@@ -94,7 +126,8 @@ def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv)
     both = all_agents(door.env, load_policy("forward", door.env))
     assert isinstance(both, BothTeams) and both.agents == 2
     action, _ = both.act(jnp.zeros((3, 2, 12)), both.initial_memory(3), KEY)
-    np.testing.assert_allclose(action[:, :, 0], jnp.tile(jnp.array([0.25, 0.0]), (3, 1)))  # without opponent: idle
+    # without opponent: idle
+    np.testing.assert_allclose(action[:, :, 0], jnp.tile(jnp.array([0.25, 0.0]), (3, 1)))
 
 
 def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
@@ -105,12 +138,15 @@ def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:
     np.testing.assert_allclose(state.action[:, 1, 0], [0.0, 0.25, 0.0, 0.25])
     np.testing.assert_array_equal(state.obs, state.match.obs[:, :1])
     np.testing.assert_array_equal(state.reward, state.match.reward[:, :1])
-    assert {"team0/win", "team0/loss", "success"} <= set(state.outcome.by_name()) and state.outcome.win.shape == (4, 1)
+    assert {"team0/win", "team0/loss", "success"} <= set(
+        state.outcome.by_name()
+    ) and state.outcome.win.shape == (4, 1)
 
 
 def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:
     env = versus(door, ["random", "random"])
-    step, action = jax.jit(env.step), jnp.zeros((4, 1, 12))
+    step = jax.jit(env.step)
+    action = jnp.zeros((4, 1, 12))
     state = env.reset(KEY)
     assert np.any(state.match.key != door.reset(state.key).key)
 
@@ -120,7 +156,10 @@ def test_opponents_draw_from_a_key_of_their_own(door: VectorEnv) -> None:
     first = drawn(state)
     others = dataclasses.replace(state.match, key=jax.random.split(jax.random.PRNGKey(7), 4))
     np.testing.assert_array_equal(drawn(dataclasses.replace(state, match=others)), first)
-    changed = [drawn(dataclasses.replace(state, key=jax.random.PRNGKey(7))), drawn(step(state, action))]
+    changed = [
+        drawn(dataclasses.replace(state, key=jax.random.PRNGKey(7))),
+        drawn(step(state, action)),
+    ]
     assert all(np.all(np.any(other != first, axis=1)) for other in changed)
     assert np.all(np.any(first[::2] != first[1::2], axis=1))  # one opponent and the other
 
@@ -129,32 +168,45 @@ def test_opponents_change_at_resets(policies: list[TrainedPolicy], door: VectorE
     """Old and new opponent differ by their actions, which are means."""
     old, new = (dataclasses.replace(policy, deterministic=True) for policy in policies)
     env = versus(door, [old, "idle"])
-    step, action = jax.jit(env.step), jnp.zeros((4, 1, 12))
+    step = jax.jit(env.step)
+    action = jnp.zeros((4, 1, 12))
     state = env.reset(KEY)
     # Environment 0 is one step from its time limit.
     state = dataclasses.replace(state, step=state.step.at[0].set(door.max_episode_steps - 1))
     state = env.change(state, 0, new)
     played = []
     for _ in range(3):
-        obs, opponent = state.match.obs[::2, 1:], state.opponents[0]
+        obs = state.match.obs[::2, 1:]
+        opponent = state.opponents[0]
         by = [policy.act(obs, opponent.memory)[0] for policy in (old, new)]
         state = step(state, action)
-        played.append([[bool(jnp.allclose(state.action[2 * i, 1:], x[i], atol=1e-5)) for x in by] for i in range(2)])
+        played.append(
+            [
+                [bool(jnp.allclose(state.action[2 * i, 1:], x[i], atol=1e-5)) for x in by]
+                for i in range(2)
+            ]
+        )
     assert played[0] == [[True, False], [True, False]]
     assert played[1] == played[2] == [[False, True], [True, False]]
     assert state.opponents[0].waiting.tolist() == [False, True]
     np.testing.assert_allclose(state.action[1::2, 1], 0.0)
 
 
-def test_scale_and_statistics_belong_to_the_opponent(policies: list[TrainedPolicy], door: VectorEnv) -> None:
-    quiet = dataclasses.replace(policies[0], config=dataclasses.replace(policies[0].config, action_scale=1e-9))
+def test_scale_and_statistics_belong_to_the_opponent(
+    policies: list[TrainedPolicy], door: VectorEnv
+) -> None:
+    quiet = dataclasses.replace(
+        policies[0], config=dataclasses.replace(policies[0].config, action_scale=1e-9)
+    )
     env = versus(door, [policies[0]])
     state = env.change(env.reset(KEY), 0, quiet, at_once=True)
     state = jax.jit(env.step)(state, jnp.zeros((4, 1, 12)))
     assert float(jnp.abs(state.action[:, 1]).max()) < 1e-6
 
 
-def test_an_opponents_memory_starts_anew_with_its_episode(policies: list[TrainedPolicy], door: VectorEnv) -> None:
+def test_an_opponents_memory_starts_anew_with_its_episode(
+    policies: list[TrainedPolicy], door: VectorEnv
+) -> None:
     env = versus(door, [policies[0]])
     state = env.reset(KEY)
     state = dataclasses.replace(state, step=state.step.at[1].set(door.max_episode_steps - 1))
@@ -165,10 +217,15 @@ def test_an_opponents_memory_starts_anew_with_its_episode(policies: list[Trained
 
 def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: VectorEnv) -> None:
     refuses("opponents: 3 is not allowed", versus, door, ["idle"] * 3)
-    with pytest.raises(InputError, match=r"opponents: 4 is not allowed; it must be a divisor .* of a process, 2"):
+    with pytest.raises(
+        InputError, match=r"opponents: 4 is not allowed; it must be a divisor .* of a process, 2"
+    ):
         versus(door, ["idle"] * 4).share(2)
     refuses("go1plane is not a match", versus, matches("go1plane"), ["idle"])
-    with pytest.raises(InputError, match=r"opponents: .* needs task 'go1revolvingdoor'; the environment has 'go1tug'"):
+    with pytest.raises(
+        InputError,
+        match=r"opponents: .* needs task 'go1revolvingdoor'; the environment has 'go1tug'",
+    ):
         versus(matches("go1tug"), [policies[0]])
     env = versus(door, ["idle", policies[0]])
     refuses("block 0 is fixed", env.change, env.reset(KEY), 0, policies[0])
@@ -180,7 +237,11 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
 def test_the_trainer_sees_one_team(kind: str) -> None:
     inner = matches("go1football-2vs2", 2)
     env = versus(inner, ["random"]) if kind == "versus" else Mirror(inner)
-    settings = {"ppo": {"epochs": 1, "ratio": "joint", "value": "joint"}, "stagger_episodes": True, "rollout_steps": 12}
+    settings = {
+        "ppo": {"epochs": 1, "ratio": "joint", "value": "joint"},
+        "stagger_episodes": True,
+        "rollout_steps": 12,
+    }
     settings |= {"num_envs": env.num_envs, "network": {"recurrent": False, "hidden_sizes": [8]}}
     config = build(TrainConfig, {**SETTINGS, **settings})
     learner = make_learner(env, config)
@@ -203,31 +264,47 @@ def test_both_teams_act_in_a_mirrored_match() -> None:
     assert state.privileged_obs.shape == (6, env.privileged_observation_size)
     action = jax.random.uniform(KEY, (6, 1, 12), minval=-1.0)
     state = jax.jit(env.step)(state, action)
-    np.testing.assert_array_equal(state.action, jnp.stack([action[::2, 0], action[1::2, 0]], axis=1))
+    np.testing.assert_array_equal(
+        state.action, jnp.stack([action[::2, 0], action[1::2, 0]], axis=1)
+    )
     np.testing.assert_allclose(state.reward[::2], -state.reward[1::2], atol=1e-6)
 
 
 def test_both_sides_are_the_same_matches_with_teams_exchanged_in_the_second_half() -> None:
-    """The policy moves as it would as team 1; results and rewards are its own, even where they are not zero-sum."""
+    """The policy moves as it would as team 1; results and rewards are its own, even where they are
+    not zero-sum.
+    """
     inner = matches("go1wrestling", rewards=WrestlingRewards(push=3.0))
-    env, action = BothSides(inner), jax.random.uniform(KEY, (4, 2, 12), minval=-1.0)
+    env = BothSides(inner)
+    action = jax.random.uniform(KEY, (4, 2, 12), minval=-1.0)
     exchanged = action.at[2:].set(action[2:, ::-1])
-    plain, state = inner.reset(KEY), env.reset(KEY)
-    step, plain_step = jax.jit(env.step), jax.jit(inner.step)
-    results = lambda state: (state.outcome.success, state.outcome.result)  # noqa: E731
+    plain = inner.reset(KEY)
+    state = env.reset(KEY)
+    step = jax.jit(env.step)
+    plain_step = jax.jit(inner.step)
+
+    def results(state):
+        return (state.outcome.success, state.outcome.result)
+
     for _ in range(6):
-        plain, state = plain_step(plain, exchanged), step(state, action)
+        plain = plain_step(plain, exchanged)
+        state = step(state, action)
         for name in ("obs", "final_obs", "reward"):
-            own, theirs = getattr(state, name), getattr(plain, name)
+            own = getattr(state, name)
+            theirs = getattr(plain, name)
             np.testing.assert_allclose(own[:2], theirs[:2], atol=1e-6)
             np.testing.assert_allclose(own[2:], theirs[2:, ::-1], atol=1e-6)
         np.testing.assert_array_equal(state.action, exchanged)
         np.testing.assert_array_equal(state.privileged_obs[:, -1], [0, 0, 1, 1])
         np.testing.assert_allclose(state.privileged_obs[:, :-1], plain.privileged_obs, atol=1e-6)
-        np.testing.assert_allclose(state.metrics["average_step_reward"], state.reward[:, 0], atol=1e-7)
+        np.testing.assert_allclose(
+            state.metrics["average_step_reward"], state.reward[:, 0], atol=1e-7
+        )
         terms = [value for name, value in state.metrics.items() if name.startswith("reward/")]
         np.testing.assert_allclose(sum(terms), state.reward[:, 0], atol=1e-6)
-        for own, theirs in zip(jax.tree.leaves(results(state)), jax.tree.leaves(results(plain)), strict=True):
+        for own, theirs in zip(
+            jax.tree.leaves(results(state)), jax.tree.leaves(results(plain)), strict=True
+        ):
             np.testing.assert_array_equal(own[:2], theirs[:2])
             np.testing.assert_array_equal(own[2:], theirs[2:, ::-1])
         assert bool(jnp.any(jnp.abs(jnp.sum(state.reward, axis=1)) > 1e-4))

@@ -28,7 +28,9 @@ IMPLS = ["c", "jax", pytest.param("warp", marks=NEEDS_GPU)]
 
 @pytest.fixture(scope="module")
 def plane() -> CompiledScene:
-    return compile_scene(Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1))
+    return compile_scene(
+        Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1)
+    )
 
 
 def standing(scene: CompiledScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -46,7 +48,9 @@ def standing(scene: CompiledScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_standing_robot_moves_as_in_mujoco(impl: str, plane: CompiledScene) -> None:
     qpos, qvel, ctrl = standing(plane)
     reference = mujoco.MjData(plane.model)
-    reference.qpos[:], reference.qvel[:], reference.ctrl[:] = qpos, qvel, ctrl
+    reference.qpos[:] = qpos
+    reference.qvel[:] = qvel
+    reference.ctrl[:] = ctrl
     engine = engines.make(plane.model, impl=impl, num_envs=1, num_substeps=1)
     data = engine.init(jnp.asarray(qpos), jnp.asarray(qvel), jnp.zeros((0, 3)), jnp.asarray(ctrl))
 
@@ -68,15 +72,19 @@ CONTACTS = """
     <geom name="floor" type="plane" size="9 9 1"/>
     <body><freejoint/><geom name="box" type="box" size="0.5 0.5 0.5" mass="6"/></body>
     <body><freejoint/><geom name="wall" type="box" size="0.04 1 0.3" mass="6"/></body>
-    <body><freejoint/><geom name="trunk" type="capsule" size="0.065 0.185" mass="5" margin="0.003"/></body>
+    <body><freejoint/>
+      <geom name="trunk" type="capsule" size="0.065 0.185" mass="5" margin="0.003"/></body>
   </worldbody>
 </mujoco>
 """
 
 
 def poses(model: mujoco.MjModel) -> np.ndarray:
-    """A tilted box on the floor; a capsule that points at the end of the wall, 1 mm inside or outside: qpos (N, 21)."""
-    data, found = mujoco.MjData(model), []
+    """A tilted box on the floor; a capsule that points at the end of the wall, 1 mm inside or
+    outside: qpos (N, 21).
+    """
+    data = mujoco.MjData(model)
+    found = []
 
     def turned(axis: tuple[float, float, float], angle: float) -> np.ndarray:
         quaternion = np.zeros(4)
@@ -84,22 +92,28 @@ def poses(model: mujoco.MjModel) -> np.ndarray:
         return quaternion
 
     def near(first: str, second: str, position: slice, way_to: np.ndarray, dist: float) -> None:
-        start, (low, high) = data.qpos[position].copy(), (0.0, 1.0)
+        start = data.qpos[position].copy()
+        (low, high) = (0.0, 1.0)
         for _ in range(40):
             way = 0.5 * (low + high)
             data.qpos[position] = start + way * way_to
             mujoco.mj_kinematics(model, data)
-            reached = mujoco.mj_geomDistance(model, data, model.geom(first).id, model.geom(second).id, 5.0, None)
+            reached = mujoco.mj_geomDistance(
+                model, data, model.geom(first).id, model.geom(second).id, 5.0, None
+            )
             low, high = (way, high) if reached > dist else (low, way)
 
     for tilt in (0.0, 2e-3, 4e-3, 0.3):
-        for beyond in (-0.2, -0.02, 0.0, 0.002, 0.005, 0.009, 0.03):  # m; the capsule's tip beyond the wall's end
+        # m; the capsule's tip beyond the wall's end
+        for beyond in (-0.2, -0.02, 0.0, 0.002, 0.005, 0.009, 0.03):
             for yaw, dist in ((0.0, -1e-3), (0.02, 1e-3), (0.3, -1e-3)):
                 data.qpos[:] = 0.0
-                data.qpos[:3], data.qpos[3:7] = [6.0, 0.0, 2.0], turned((0.6, 0.8, 0.0), tilt)
+                data.qpos[:3] = [6.0, 0.0, 2.0]
+                data.qpos[3:7] = turned((0.6, 0.8, 0.0), tilt)
                 data.qpos[7:11] = [0.0, 0.0, 0.5, 1.0]
                 data.qpos[14:17] = [-1.0, 1.0 + beyond - 0.185 * np.sin(yaw), 0.5]
-                across, flat = turned((0.0, 1.0, 0.0), np.pi / 2), turned((0.0, 0.0, 1.0), yaw)
+                across = turned((0.0, 1.0, 0.0), np.pi / 2)
+                flat = turned((0.0, 0.0, 1.0), yaw)
                 mujoco.mju_mulQuat(data.qpos[17:21], flat, across)
                 near("box", "floor", slice(0, 3), np.array([0.0, 0.0, -2.0]), -3e-3)
                 near("trunk", "wall", slice(14, 17), np.array([0.75, 0.0, 0.0]), dist)
@@ -110,11 +124,14 @@ def poses(model: mujoco.MjModel) -> np.ndarray:
 def test_contacts_with_boxes_are_those_of_the_c_engine() -> None:
     """All corners of a tilted box; a capsule near a box's edge, which MJX alone does not detect."""
     model = mujoco.MjModel.from_xml_string(CONTACTS)
-    qpos, step = poses(model).astype(np.float32), MarginStep(model)
+    qpos = poses(model).astype(np.float32)
+    step = MarginStep(model)
     fresh = mjx.make_data(model, impl="jax")
     after = jax.jit(jax.vmap(lambda q: step(step.model, fresh.replace(qpos=q))))(jnp.asarray(qpos))
     contact = jax.tree.map(np.asarray, private.contact(after))
-    reference, floor, wall = mujoco.MjData(model), model.geom("floor").id, model.geom("wall").id
+    reference = mujoco.MjData(model)
+    floor = model.geom("floor").id
+    wall = model.geom("wall").id
     for number, q in enumerate(qpos):
         reference.qpos[:] = q
         mujoco.mj_fwdPosition(model, reference)
@@ -122,11 +139,13 @@ def test_contacts_with_boxes_are_those_of_the_c_engine() -> None:
         for geom in (floor, wall):
             mine = active & (contact.geom[number] == geom).any(axis=1)
             theirs = (reference.contact.geom == geom).any(axis=1)
-            dist, c_dist = contact.dist[number][mine], reference.contact.dist[theirs]
+            dist = contact.dist[number][mine]
+            c_dist = reference.contact.dist[theirs]
             assert len(dist) and len(c_dist), f"{q}: not in contact with {model.geom(geom).name}"
             if geom == floor:
                 np.testing.assert_allclose(np.sort(dist), np.sort(c_dist), atol=2e-6)
-            first, c_first = np.argmin(dist), np.argmin(c_dist)
+            first = np.argmin(dist)
+            c_first = np.argmin(c_dist)
             assert dist[first] == pytest.approx(c_dist[c_first], abs=2e-5)
             if geom == wall:
                 position = reference.contact.pos[theirs][c_first]
@@ -137,7 +156,8 @@ def test_contacts_with_boxes_are_those_of_the_c_engine() -> None:
 
 # On MJX-JAX tests/test_engines.py compares the forces with those of the C engine.
 @pytest.mark.parametrize(
-    "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=NEEDS_GPU)]
+    "impl",
+    ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=NEEDS_GPU)],
 )
 def test_trunk_force_is_read(impl: str) -> None:
     env = make("go1gate", impl=impl, control="position", num_envs=2, spawn_velocity=0.0)
@@ -151,7 +171,9 @@ def test_trunk_force_is_read(impl: str) -> None:
     after = jax.jit(jax.vmap(lambda data: env.physics.step(data, ctrl, num_substeps=1)[0]))(both)
     robot_state = jax.vmap(env.read)(after)
     assert float(robot_state.trunk_force[0].min()) > 1.0
-    assert float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
+    assert (
+        float(robot_state.trunk_force[1, 0]) > 1.0 and float(robot_state.trunk_force[1, 1]) == 0.0
+    )
 
 
 def test_gate_stands_where_each_environment_drew_it() -> None:
@@ -160,7 +182,8 @@ def test_gate_stands_where_each_environment_drew_it() -> None:
     gap = states.anchors[:, 0]
     assert len(np.unique(np.asarray(gap[:, 0]))) == 3
     assert np.all(np.abs(np.asarray(gap) - [3.5, 0.0]) <= 0.5)
-    right, left = states.data.mocap_pos[:, 0], states.data.mocap_pos[:, 1]
+    right = states.data.mocap_pos[:, 0]
+    left = states.data.mocap_pos[:, 1]
     half = np.asarray(env.compiled.model.geom("wall/gate1_left").size)[1]
     np.testing.assert_allclose(left[:, 1] - half - gap[:, 1], 0.3, atol=1e-5)
     np.testing.assert_allclose(gap[:, 1] - right[:, 1] - half, 0.3, atol=1e-5)
@@ -169,7 +192,9 @@ def test_gate_stands_where_each_environment_drew_it() -> None:
 class Frozen(CEngine):
     impl = "frozen"
 
-    def advance(self, data: Any, fields: Any, forced: bool, num_substeps: int) -> tuple[Any, jax.Array]:
+    def advance(
+        self, data: Any, fields: Any, forced: bool, num_substeps: int
+    ) -> tuple[Any, jax.Array]:
         return data, jnp.ones((), bool)
 
 
@@ -195,14 +220,17 @@ STACK = 0.35  # m; each robot starts that much above the one before
 def crowds(env: Any, data: mujoco.MjData) -> dict[str, tuple[np.ndarray, list[np.ndarray]]]:
     """For each object of the task, its geoms and the places (R, 2) at which a crowd starts.
 
-    The robots stand on the object, close around it if it is solid, and at both ends of a supporting surface. Of objects
-    with equal geoms only the first is used; without objects the crowd is at the spawn poses.
+    The robots stand on the object, close around it if it is solid, and at both ends of a supporting
+    surface. Of objects with equal geoms only the first is used; without objects the crowd is at the
+    spawn poses.
     """
-    model, robots = env.compiled.model, env.index.num_robots
+    model = env.compiled.model
+    robots = env.index.num_robots
     start = data.qpos[env.index.base_qpos[:, :2]]
     turn = 2 * np.pi * np.arange(robots) / robots
     ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    found, shapes = {}, set()
+    found = {}
+    shapes = set()
     for name, item in env.objects.items():
         geoms = np.flatnonzero((model.geom_bodyid == item.body) & (model.geom_contype > 0))
         shape = (*model.geom_type[geoms], *model.geom_size[geoms].ravel())
@@ -229,9 +257,11 @@ def crowds(env: Any, data: mujoco.MjData) -> dict[str, tuple[np.ndarray, list[np
 @pytest.mark.parametrize("task", list(TASKS))
 def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     env = made(task)
-    model, index = env.compiled.model, env.index
+    model = env.compiled.model
+    index = env.index
     start = jax.tree.map(np.asarray, initial(env))
-    random, robots = np.random.default_rng(0), index.num_robots
+    random = np.random.default_rng(0)
+    robots = index.num_robots
     data = mujoco.MjData(model)
     data.qpos[:] = start.data.qpos
     if model.nmocap:
@@ -239,24 +269,40 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
     mujoco.mj_forward(model, data)
     qpos = data.qpos.copy()
     for name, (geoms, places) in crowds(env, data).items():
-        touched, contacts, rows = [], [], []
+        touched = []
+        contacts = []
+        rows = []
         for place in places:
-            data.qpos[:], data.qvel[:] = qpos, 0.0
-            data.qpos[index.base_qpos[:, 2]] = 100.0  # out of the way of the rays that find the ground
+            data.qpos[:] = qpos
+            data.qvel[:] = 0.0
+            # out of the way of the rays that find the ground
+            data.qpos[index.base_qpos[:, 2]] = 100.0
             mujoco.mj_forward(model, data)
-            hit, down = np.zeros(1, np.int32), np.array([0.0, 0.0, -1.0])
-            depth = np.array([mujoco.mj_ray(model, data, [*at, 3.0], down, None, 1, -1, hit) for at in place])
+            hit = np.zeros(1, np.int32)
+            down = np.array([0.0, 0.0, -1.0])
+            depth = np.array(
+                [mujoco.mj_ray(model, data, [*at, 3.0], down, None, 1, -1, hit) for at in place]
+            )
             data.qpos[index.base_qpos[:, :2]] = place
-            data.qpos[index.base_qpos[:, 2]] = 3.0 - depth + env.robot.stand_height + STACK * np.arange(robots)
+            data.qpos[index.base_qpos[:, 2]] = (
+                3.0 - depth + env.robot.stand_height + STACK * np.arange(robots)
+            )
             touched.append(0)
             for _ in range(100):
-                data.ctrl[index.actuator] = env.robot.default_joints + 0.2 * random.standard_normal((robots, 12))
+                data.ctrl[index.actuator] = env.robot.default_joints + 0.2 * random.standard_normal(
+                    (robots, 12)
+                )
                 mujoco.mj_step(model, data, 4)
                 contacts.append(data.ncon)
                 rows.append(data.nefc)
                 touched[-1] += bool(np.isin(data.contact.geom, geoms).any())
-        print(f"{task} {name}: {max(contacts)} contacts, {max(rows)} rows at most; touched in {touched} of 100 steps")
+        print(
+            f"{task} {name}: {max(contacts)} contacts, {max(rows)} rows at most; touched in "
+            f"{touched} of 100 steps"
+        )
         assert max(contacts) >= 2 * robots, f"{name}: too few contacts: the scene is not crowded"
-        assert not len(geoms) or max(touched) >= 10, f"{name}: touched in {touched} of 100 steps: no robot is near"
+        assert not len(geoms) or max(touched) >= 10, (
+            f"{name}: touched in {touched} of 100 steps: no robot is near"
+        )
         assert max(contacts) <= env.params.contacts_per_robot * robots
         assert max(rows) <= env.params.constraints_per_robot * robots

@@ -25,8 +25,8 @@ import asyncio, matplotlib.pyplot, multiprocessing, platform, shutil, subprocess
 import jax.numpy, mujoco, PIL.Image
 platform.uname()
 GONE = {
-    os: "chown fork getuid geteuid killpg mkfifo register_at_fork sched_getaffinity set_blocking setsid statvfs "
-        "sysconf uname O_CLOEXEC O_DIRECTORY O_NOFOLLOW O_NONBLOCK",
+    os: "chown fork getuid geteuid killpg mkfifo register_at_fork sched_getaffinity set_blocking "
+        "setsid statvfs sysconf uname O_CLOEXEC O_DIRECTORY O_NOFOLLOW O_NONBLOCK",
     signal: "SIGALRM SIGCHLD SIGHUP SIGKILL SIGPIPE SIGQUIT SIGUSR1",
 }
 for module, names in GONE.items():
@@ -54,7 +54,9 @@ def mqe(*lines: list[str], bad: list[str] = BAD) -> str:
 
 
 def run(code: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, **options)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, **options
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     return done
 
@@ -67,7 +69,11 @@ def test_nothing_needs_posix_or_a_home_folder(tmp_path: Path) -> None:
         ["render", "fake", "--policy", "run", "-o", "clip.gif", "--seconds", "0.1"],
     )
     homes = "HOME", "JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"
-    run(NO_POSIX + code, tmp_path, env={name: value for name, value in os.environ.items() if name not in homes})
+    run(
+        NO_POSIX + code,
+        tmp_path,
+        env={name: value for name, value in os.environ.items() if name not in homes},
+    )
     assert (tmp_path / "clip.gif").stat().st_size and len(
         (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     ) == 3
@@ -75,8 +81,12 @@ def test_nothing_needs_posix_or_a_home_folder(tmp_path: Path) -> None:
 
 def test_only_drawing_needs_a_gl_library(tmp_path: Path) -> None:
     code = mqe(["tasks"], ["eval", "fake", "--policy", "idle", "--episodes", "2"])
-    code += "print('drawn', file=sys.stderr)" + mqe(["render", "fake", "-o", "clip.png", "--seconds", "0.1"])
-    before, after = run(code, tmp_path, env={**os.environ, "MUJOCO_GL": "osmesa"}).stderr.split("drawn\n")
+    code += "print('drawn', file=sys.stderr)" + mqe(
+        ["render", "fake", "-o", "clip.png", "--seconds", "0.1"]
+    )
+    before, after = run(code, tmp_path, env={**os.environ, "MUJOCO_GL": "osmesa"}).stderr.split(
+        "drawn\n"
+    )
     assert "GL" not in before and len([line for line in after.splitlines() if "GL" in line]) == 1
     assert (tmp_path / "clip.png").stat().st_size
 
@@ -94,12 +104,15 @@ for words in (["--help"], ["train", "--help"]):
 
 
 def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    home, work = tmp_path / "home", tmp_path / "work"
+    home = tmp_path / "home"
+    work = tmp_path / "work"
     for folder in (home, work):
         folder.mkdir()
     monkeypatch.chdir(work)
     monkeypatch.setenv("HOME", str(home))
-    (home / "c.yaml").write_text("start: ~/start\nopponents: [idle, ~/other]\nenv: {skill_weights: ~/walk}\n")
+    (home / "c.yaml").write_text(
+        "start: ~/start\nopponents: [idle, ~/other]\nenv: {skill_weights: ~/walk}\n"
+    )
     config = named_config("~/c.yaml", "go1tug")
     assert config.start == f"{home}/start" and config.opponents == ("idle", f"{home}/other")
     assert TASKS["go1tug"].Params(**config.env).skill_weights == f"{home}/walk"
@@ -114,4 +127,8 @@ def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert list(work.iterdir()) == []
     monkeypatch.delenv("HOME")
     monkeypatch.setitem(sys.modules, "pwd", None)
-    refuses("source: '~/policies' is not allowed; it must be a path without ~", load_policy, "~/policies")
+    refuses(
+        "source: '~/policies' is not allowed; it must be a path without ~",
+        load_policy,
+        "~/policies",
+    )

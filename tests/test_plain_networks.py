@@ -47,46 +47,67 @@ def gelu(x: np.ndarray) -> np.ndarray:
     return x * 0.5 * (1 + np.vectorize(math.erf)(x / math.sqrt(2)))
 
 
-def attended(layers: Any, query: np.ndarray, context: np.ndarray, heads: int, causal: bool) -> np.ndarray:
+def attended(
+    layers: Any, query: np.ndarray, context: np.ndarray, heads: int, causal: bool
+) -> np.ndarray:
     """Attention (A, W) of every agent to all, or to those up to itself, head by head."""
-    q, k, v = (dense(layers[name], x) for name, x in (("query", query), ("key", context), ("value", context)))
+    q, k, v = (
+        dense(layers[name], x)
+        for name, x in (("query", query), ("key", context), ("value", context))
+    )
     agents, width = q.shape
-    size, mixed = width // heads, np.zeros((agents, width))
+    size = width // heads
+    mixed = np.zeros((agents, width))
     for head in range(heads):
         part = slice(head * size, (head + 1) * size)
         for agent in range(agents):
             seen = agent + 1 if causal else agents
-            weight = np.exp(np.array([q[agent, part] @ k[other, part] for other in range(seen)]) / math.sqrt(size))
-            mixed[agent, part] = sum(w * v[other, part] for other, w in enumerate(weight / weight.sum()))
+            weight = np.exp(
+                np.array([q[agent, part] @ k[other, part] for other in range(seen)])
+                / math.sqrt(size)
+            )
+            mixed[agent, part] = sum(
+                w * v[other, part] for other, w in enumerate(weight / weight.sum())
+            )
     return dense(layers["projection"], mixed)
 
 
 def test_the_transformer_is_that_of_a_plain_implementation() -> None:
-    settings, agents = Mat(blocks=2, heads=2, width=8), 3
-    network = settings.build(EnvDims(agents=agents, observation=5, privileged=1, action=2, values=agents))
+    settings = Mat(blocks=2, heads=2, width=8)
+    agents = 3
+    network = settings.build(
+        EnvDims(agents=agents, observation=5, privileged=1, action=2, values=agents)
+    )
     random = np.random.default_rng(0)
     params = random_params(network)
-    obs, action = random.normal(size=(4, agents, 5)), random.normal(size=(4, agents, 2))
+    obs = random.normal(size=(4, agents, 5))
+    action = random.normal(size=(4, agents, 2))
     arrays = jnp.zeros(4, bool), jnp.asarray(obs), jnp.zeros((4, 1)), jnp.asarray(action)
     found = jax.jit(network.evaluate)(params, NetworkMemory((), ()), *arrays)
     value, _ = jax.jit(network.value)(params, (), *arrays[:3])
     np.testing.assert_allclose(value, found.value, atol=1e-5)
     deviation = 0.5 / (1 + np.exp(-np.asarray(params["deviation"], float)))
-    encoder, decoder = params["encoder"], params["decoder"]
+    encoder = params["encoder"]
+    decoder = params["decoder"]
     for n in range(4):
         x = norm(encoder["norm"], gelu(dense(encoder["embed"], norm(encoder["norm_in"], obs[n]))))
         for block in encoder["blocks"]:
             x = norm(block["norm0"], x + attended(block["attention0"], x, x, 2, False))
-            x = norm(block["norm1"], x + dense(block["mlp"]["1"], gelu(dense(block["mlp"]["0"], x))))
+            x = norm(
+                block["norm1"], x + dense(block["mlp"]["1"], gelu(dense(block["mlp"]["0"], x)))
+            )
         head = params["value_head"]
         own = dense(head["out"], norm(head["norm"], gelu(dense(head["hidden"], x))))[:, 0]
         np.testing.assert_allclose(found.value[n], own, atol=1e-4)
-        features, tokens = x, np.concatenate([np.zeros((1, 2)), action[n, :-1]])
+        features = x
+        tokens = np.concatenate([np.zeros((1, 2)), action[n, :-1]])
         x = norm(decoder["norm"], gelu(dense(decoder["embed"], tokens)))
         for block in decoder["blocks"]:
             x = norm(block["norm0"], x + attended(block["attention0"], x, x, 2, True))
             x = norm(block["norm1"], features + attended(block["attention1"], features, x, 2, True))
-            x = norm(block["norm2"], x + dense(block["mlp"]["1"], gelu(dense(block["mlp"]["0"], x))))
+            x = norm(
+                block["norm2"], x + dense(block["mlp"]["1"], gelu(dense(block["mlp"]["0"], x)))
+            )
         head = decoder["head"]
         mean = dense(head["out"], norm(head["norm"], gelu(dense(head["hidden"], x))))
         z = (action[n] - mean) / deviation
@@ -100,18 +121,28 @@ def gain(matrix: Any) -> float:
     """The gain of a matrix with orthogonal rows or columns, whichever are fewer."""
     matrix = np.asarray(matrix)
     square = matrix.T @ matrix if matrix.shape[0] >= matrix.shape[1] else matrix @ matrix.T
-    np.testing.assert_allclose(square, square[0, 0] * np.eye(len(square)), atol=1e-4 * square[0, 0] + 1e-7)
+    np.testing.assert_allclose(
+        square, square[0, 0] * np.eye(len(square)), atol=1e-4 * square[0, 0] + 1e-7
+    )
     return float(np.sqrt(square[0, 0]))
 
 
 def test_layers_begin_with_their_gains_and_without_bias() -> None:
     dims = EnvDims(agents=2, observation=9, privileged=7, action=3, values=2)
-    settings = ActorCritic(hidden_sizes=(8, 6), gru_size=5, openrl_layers=True, action_gain=0.05, log_std_init=-0.7)
+    settings = ActorCritic(
+        hidden_sizes=(8, 6), gru_size=5, openrl_layers=True, action_gain=0.05, log_std_init=-0.7
+    )
     for share in (True, False):
         network = dataclasses.replace(settings, share_policy=share).build(dims)
         params = jax.jit(network.init)(KEY)
-        actors = [params["actor"]] if share else [jax.tree.map(lambda x, i=i: x[i], params["actor"]) for i in (0, 1)]
-        assert params["log_std"].shape == ((3,) if share else (2, 3)) and np.allclose(params["log_std"], -0.7)
+        actors = (
+            [params["actor"]]
+            if share
+            else [jax.tree.map(lambda x, i=i: x[i], params["actor"]) for i in (0, 1)]
+        )
+        assert params["log_std"].shape == ((3,) if share else (2, 3)) and np.allclose(
+            params["log_std"], -0.7
+        )
         for part, head in (*((actor, 0.05) for actor in actors), (params["critic"], 1.0)):
             assert gain(part["head"]["weight"]) == pytest.approx(head, rel=1e-3)
             for layer in (part["hidden"]["0"], part["hidden"]["1"], part["linear"]):
@@ -127,7 +158,10 @@ def test_layers_begin_with_their_gains_and_without_bias() -> None:
     blocks = [*params["encoder"]["blocks"], *params["decoder"]["blocks"]]
     for block in blocks:
         assert gain(block["mlp"]["0"]["weight"]) == pytest.approx(math.sqrt(2), rel=1e-3)
-        small = [block["mlp"]["1"], *(x for name in block if "attention" in name for x in block[name].values())]
+        small = [
+            block["mlp"]["1"],
+            *(x for name in block if "attention" in name for x in block[name].values()),
+        ]
         assert len(small) in (5, 9)
         assert all(gain(layer["weight"]) == pytest.approx(0.02, rel=1e-3) for layer in small)
     for head in (params["value_head"], params["decoder"]["head"]):
@@ -139,7 +173,8 @@ def test_layers_begin_with_their_gains_and_without_bias() -> None:
 
 @pytest.mark.parametrize("kind", ["actor_critic", "mat"])
 def test_actions_are_drawn_from_the_distribution_they_are_weighed_by(kind: str) -> None:
-    dims, count = EnvDims(agents=2, observation=4, privileged=1, action=3, values=2), 4096
+    dims = EnvDims(agents=2, observation=4, privileged=1, action=3, values=2)
+    count = 4096
     plain = ActorCritic(recurrent=False, hidden_sizes=(4,), log_std_init=-0.4, log_std_min=-0.5)
     network = plain.build(dims) if kind == "actor_critic" else Mat(width=4).build(dims)
     params = network.policy_params(jax.jit(network.init)(KEY))
@@ -167,28 +202,43 @@ def test_a_policy_normalises_scales_and_clips() -> None:
     policy = TrainedPolicy(params, statistics, Needs(task="probe", dims=dims), config, {})
     obs = 4.0 * jax.random.normal(KEY, (50, 2, 3))
     raw, _, _ = network.act(params, (), (obs - 0.5) / 2.0, None)
-    np.testing.assert_allclose(policy.act(obs, ())[0], np.clip(0.5 * np.asarray(raw), -1, 1), atol=1e-5)
+    np.testing.assert_allclose(
+        policy.act(obs, ())[0], np.clip(0.5 * np.asarray(raw), -1, 1), atol=1e-5
+    )
     assert np.abs(raw).max() > 2.5
-    drawn, same = policy.act(obs, (), KEY)[0], dataclasses.replace(policy, deterministic=True).act(obs, (), KEY)[0]
+    drawn = policy.act(obs, (), KEY)[0]
+    same = dataclasses.replace(policy, deterministic=True).act(obs, (), KEY)[0]
     np.testing.assert_allclose(same, policy.act(obs, ())[0])
     assert np.abs(np.asarray(drawn - same)).max() > 0.1
 
 
 def test_gae_of_integer_rewards_keeps_fractions_of_the_bootstrap() -> None:
     ones = jnp.ones((1, 1), jnp.int32)
-    advantage, _ = gae(ones, jnp.zeros((1, 1)), 2.0 * ones, 0.3 * ones, ones.astype(bool), gamma=1.0, gae_lambda=1.0)
+    advantage, _ = gae(
+        ones,
+        jnp.zeros((1, 1)),
+        2.0 * ones,
+        0.3 * ones,
+        ones.astype(bool),
+        gamma=1.0,
+        gae_lambda=1.0,
+    )
     np.testing.assert_allclose(advantage, [[1.0 + 0.7 * 2.0]], rtol=1e-6)
 
 
 def test_schedules_by_hand() -> None:
-    """Ten updates; the assistance falls to 0 in five, the learning rate in the last two, and so on."""
+    """Ten updates; the assistance falls to 0 in five, the learning rate in the last two, and so
+    on.
+    """
     config = TrainConfig(
         num_envs=1,
         rollout_steps=10,
         total_steps=100,
         ppo=PPO(entropy_coef=0.01, entropy_coef_final=0.0, critic_warmup=0.2),
         optimizer=OptimizerSettings(schedule="linear", anneal=0.2),
-        curriculum=Curriculum(assistance=1.0, assistance_until=0.5, failure_bootstrap=0.8, failure_bootstrap_until=0.4),
+        curriculum=Curriculum(
+            assistance=1.0, assistance_until=0.5, failure_bootstrap=0.8, failure_bootstrap_until=0.4
+        ),
         imitation=Imitation(weight=3.0, until=0.6),
     )
     expected = {
@@ -198,7 +248,9 @@ def test_schedules_by_hand() -> None:
         9: (0.0, 0.0, 0.001, 0.0, 1.0, 0.0, 0.5),
     }
     for updates, values in expected.items():
-        np.testing.assert_allclose(jnp.stack(current_values(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(
+            jnp.stack(current_values(config, jnp.int32(updates))), values, rtol=1e-5, atol=1e-7
+        )
 
 
 def test_running_statistics_merge_as_one_batch() -> None:
@@ -211,7 +263,9 @@ def test_running_statistics_merge_as_one_batch() -> None:
         statistics = jax.jit(running_update)(statistics, both, active)
     np.testing.assert_allclose(statistics.mean, data.mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(statistics.variance, data.var(axis=0), rtol=1e-4)
-    np.testing.assert_array_equal(running_normalize(statistics, jnp.array([1e6, -1e6, 3.0]))[:2], [10.0, -10.0])
+    np.testing.assert_array_equal(
+        running_normalize(statistics, jnp.array([1e6, -1e6, 3.0]))[:2], [10.0, -10.0]
+    )
     constant = running_update(running_init(1), jnp.full((10, 1), 7.0), jnp.ones(10, bool))
     np.testing.assert_allclose(running_normalize(constant, jnp.array([7.0])), [0.0], atol=1e-4)
 
@@ -219,9 +273,13 @@ def test_running_statistics_merge_as_one_batch() -> None:
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_value_statistics_are_debiased_and_invertible_at_any_scale(scale: float) -> None:
     target = scale * jnp.array([1.0, 3.0])
-    statistics = value_update(value_init(), jnp.append(target, 1e9), jnp.array([True, True, False]), 0.99)
+    statistics = value_update(
+        value_init(), jnp.append(target, 1e9), jnp.array([True, True, False]), 0.99
+    )
     np.testing.assert_allclose(value_normalize(statistics, target), [-1.0, 1.0], rtol=1e-3)
-    np.testing.assert_allclose(value_denormalize(statistics, value_normalize(statistics, target)), target, rtol=1e-6)
+    np.testing.assert_allclose(
+        value_denormalize(statistics, value_normalize(statistics, target)), target, rtol=1e-6
+    )
 
 
 def test_value_statistics_at_their_limits() -> None:
@@ -238,11 +296,16 @@ def test_value_statistics_at_their_limits() -> None:
 
 
 def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() -> None:
-    config = build(TrainConfig, {"num_envs": 2, "rollout_steps": 1, "total_steps": 20, "ppo": {"critic_warmup": 0.3}})
+    config = build(
+        TrainConfig,
+        {"num_envs": 2, "rollout_steps": 1, "total_steps": 20, "ppo": {"critic_warmup": 0.3}},
+    )
     begins = [bool(current_values(config, jnp.int32(i)).actor_begins) for i in range(10)]
     assert begins == [i == 3 for i in range(10)]
-    optimizer, params = adam(eps=1e-8), {"a": jnp.zeros(())}
-    state, update = optimizer.init(params), jax.jit(optimizer.update)
+    optimizer = adam(eps=1e-8)
+    params = {"a": jnp.zeros(())}
+    state = optimizer.init(params)
+    update = jax.jit(optimizer.update)
     for _ in range(500):
         params, state, _ = update({"a": jnp.zeros(())}, state, params, 0.1)
     gradient = {"a": jnp.float32(0.5)}
@@ -253,7 +316,8 @@ def test_the_actor_begins_after_the_warm_up_with_steps_of_the_learning_rate() ->
 
 def test_gru_by_hand() -> None:
     params = nn.gru_init(KEY, 2, 3)
-    h, x = jax.random.normal(KEY, (4, 3)), jax.random.normal(KEY, (4, 2))
+    h = jax.random.normal(KEY, (4, 3))
+    x = jax.random.normal(KEY, (4, 2))
 
     def gates(name: str, value: jax.Array) -> list[np.ndarray]:
         return np.split(np.asarray(value @ params[name]["weight"]), 3, axis=-1)
@@ -261,14 +325,17 @@ def test_gru_by_hand() -> None:
     def sigmoid(z: np.ndarray) -> np.ndarray:
         return 1 / (1 + np.exp(-z))
 
-    (rx, ux, cx), (rh, uh, ch) = gates("input", x), gates("hidden", h)
-    reset, update = sigmoid(rx + rh), sigmoid(ux + uh)
+    (rx, ux, cx) = gates("input", x)
+    (rh, uh, ch) = gates("hidden", h)
+    reset = sigmoid(rx + rh)
+    update = sigmoid(ux + uh)
     expected = (1 - update) * np.tanh(cx + reset * ch) + update * np.asarray(h)
     np.testing.assert_allclose(nn.gru(params, h, x), expected, atol=1e-5)
 
 
 def test_weights_are_drawn_without_lapack() -> None:
-    # Its decompositions wait for each other in XLA's threads and can stop a program on two cores for good.
+    # Its decompositions wait for each other in XLA's threads and can stop a program on two cores
+    # for good.
     lowered = jax.jit(lambda key: nn.orthogonal(key, (8, 4), 1.0)).lower(jax.random.PRNGKey(0))
     assert "custom_call" not in lowered.as_text()
 
@@ -280,7 +347,8 @@ def test_a_bounded_parameter_comes_back_from_beyond_its_bounds() -> None:
         return jax.grad(lambda x: jnp.sum(direction * nn.clip_parameter(x, -1.5, 1.5)))(x)
 
     np.testing.assert_allclose(nn.clip_parameter(x, -1.5, 1.5), [-1.5, -1.0, 0.0, 1.0, 1.5])
-    np.testing.assert_allclose(slope(1.0), [0, 1, 1, 1, 1])  # descent lowers x: back from above, never farther down
+    # descent lowers x: back from above, never farther down
+    np.testing.assert_allclose(slope(1.0), [0, 1, 1, 1, 1])
     np.testing.assert_allclose(slope(-1.0), [-1, -1, -1, -1, 0])
 
 
@@ -288,7 +356,12 @@ def test_a_bounded_parameter_comes_back_from_beyond_its_bounds() -> None:
 def test_normalised_layers_by_hand(recurrent: bool) -> None:
     """OpenRL's order: dense, activation, norm; dense, norm; recurrent unit, norm; action layer."""
     settings = ActorCritic(
-        openrl_layers=True, hidden_sizes=(5,), recurrent=recurrent, gru_size=4, critic_input="own", action_gain=1.0
+        openrl_layers=True,
+        hidden_sizes=(5,),
+        recurrent=recurrent,
+        gru_size=4,
+        critic_input="own",
+        action_gain=1.0,
     )
     dims = EnvDims(agents=2, observation=3, privileged=0, action=2, values=2)
     network = settings.build(dims)
@@ -298,11 +371,15 @@ def test_normalised_layers_by_hand(recurrent: bool) -> None:
     mean, _, after = jax.jit(network.act)(params, memory.actor, obs, None)
 
     actor = params["actor"]
-    norm = lambda i, x: nn.layer_norm(actor["norm"][str(i)], x)  # noqa: E731
+
+    def norm(i, x):
+        return nn.layer_norm(actor["norm"][str(i)], x)
+
     x = norm(0, jnp.maximum(nn.dense(actor["hidden"]["0"], obs), 0.0))
     x = norm(1, nn.dense(actor["linear"], x))
     if recurrent:
         state = nn.gru(actor["gru"], memory.actor, x)
-        np.testing.assert_allclose(after, state, atol=1e-5)  # the recurrent state itself is not normalised
+        # the recurrent state itself is not normalised
+        np.testing.assert_allclose(after, state, atol=1e-5)
         x = norm(2, state)
     np.testing.assert_allclose(mean, nn.dense(actor["head"], x), atol=1e-5)

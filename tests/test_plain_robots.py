@@ -28,23 +28,32 @@ KEY = jax.random.PRNGKey(0)
 
 def limited(motors: Motors, force: float, joint: int, speeds: np.ndarray) -> float:
     """The torque of a motor that is asked for a force, N m, at the speeds of all joints."""
-    v, top, most, stall = speeds[joint], *(float(x[joint]) for x in (motors.speed, motors.torque, motors.stall))
+    v, top, most, stall = (
+        speeds[joint],
+        *(float(x[joint]) for x in (motors.speed, motors.torque, motors.stall)),
+    )
     along = 1.0 if v >= 0 else -1.0
     pace = abs(v)
-    bound = min(stall * (1 - pace / top), most) if pace <= top else -most * (pace - top) / (0.15 * top)
+    bound = (
+        min(stall * (1 - pace / top), most) if pace <= top else -most * (pace - top) / (0.15 * top)
+    )
     return along * min(max(along * force, -most), max(bound, -most))
 
 
 def armature(motors: Motors, torque: np.ndarray, joint: int, speeds: np.ndarray) -> float:
     """The armature of a joint, kg m^2, at the speeds of all joints under torques."""
-    leg, own = slice(3 * (joint // 3), 3 * (joint // 3) + 3), joint % 3
+    leg = slice(3 * (joint // 3), 3 * (joint // 3) + 3)
+    own = joint % 3
     top = float(motors.speed[joint])
     full = motors.timestep * float(motors.torque[joint]) / (0.15 * top)
     fast = np.abs(speeds[leg]).max() / motors.speed[leg].min()
     share = min(max((fast - 0.85) / 0.15, 0.0), 1.0)
-    reach = (abs(speeds[joint]) + motors.timestep * motors.response[own] @ np.abs(torque[leg])) / top
+    reach = (
+        abs(speeds[joint]) + motors.timestep * motors.response[own] @ np.abs(torque[leg])
+    ) / top
     needed = min(4.0 / motors.response[own, own] * (reach - 1.0), full) if reach > 1.25 else 0.0
-    inertia, line = 1.0 / motors.response[own, own], float(motors.stall[joint]) / top
+    inertia = 1.0 / motors.response[own, own]
+    line = float(motors.stall[joint]) / top
     if motors.timestep * line > 2.0 * inertia:
         most = line * (top - speeds[joint] * np.sign(torque[joint]))
         needed = max(abs(torque[joint]) / most * (inertia + motors.timestep * line) - inertia, 0.0)
@@ -54,19 +63,35 @@ def armature(motors: Motors, torque: np.ndarray, joint: int, speeds: np.ndarray)
 @pytest.mark.parametrize("name", ["go1", "go2"])
 def test_motors_are_those_of_a_plain_implementation(name: str) -> None:
     robot = robots.get(name)
-    scene = compile_scene(Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1, robot=robot))
+    scene = compile_scene(
+        Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1, robot=robot)
+    )
     motors = scene.motors
-    random, rows = np.random.default_rng(0), 60
-    assert (motor.SLOW, motor.FAST, motor.REACH, motor.GAIN, motor.STEEP) == (0.85, 1.0, 1.25, 4.0, 2.0)
-    velocity = random.uniform(-1.3, 1.3, (rows, 12)) * motors.speed * np.linspace(0, 1, rows)[:, None]
+    random = np.random.default_rng(0)
+    rows = 60
+    assert (motor.SLOW, motor.FAST, motor.REACH, motor.GAIN, motor.STEEP) == (
+        0.85,
+        1.0,
+        1.25,
+        4.0,
+        2.0,
+    )
+    velocity = (
+        random.uniform(-1.3, 1.3, (rows, 12)) * motors.speed * np.linspace(0, 1, rows)[:, None]
+    )
     position, target = random.normal(size=(2, rows, 12))
-    gain, bias = np.full(12, robot.kp), np.tile([0.3, -robot.kp, -robot.kd], (12, 1))
+    gain = np.full(12, robot.kp)
+    bias = np.tile([0.3, -robot.kp, -robot.kd], (12, 1))
     ctrl, added = motors.limit(np, target, position, velocity, gain, bias)
     asked = robot.kp * (target - position) - robot.kd * velocity + 0.3
     given = robot.kp * (ctrl - position) - robot.kd * velocity + 0.3
-    expected = [[limited(motors, asked[row, j], j, velocity[row]) for j in range(12)] for row in range(rows)]
+    expected = [
+        [limited(motors, asked[row, j], j, velocity[row]) for j in range(12)] for row in range(rows)
+    ]
     np.testing.assert_allclose(given, expected, rtol=1e-4, atol=1e-4)
-    expected = [[armature(motors, given[row], j, velocity[row]) for j in range(12)] for row in range(rows)]
+    expected = [
+        [armature(motors, given[row], j, velocity[row]) for j in range(12)] for row in range(rows)
+    ]
     np.testing.assert_allclose(added, expected, rtol=1e-3, atol=1e-6)
     again = motors.limit(jnp, *(jnp.asarray(x) for x in (target, position, velocity, gain, bias)))
     np.testing.assert_allclose(again[0], ctrl, rtol=1e-4, atol=1e-4)
@@ -74,8 +99,13 @@ def test_motors_are_those_of_a_plain_implementation(name: str) -> None:
 
 
 def test_an_environment_step_of_the_c_engine_is_that_of_plain_mujoco() -> None:
-    scene = compile_scene(Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1))
-    model, motors, index, count = scene.model, scene.motors, scene.index, 8
+    scene = compile_scene(
+        Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1)
+    )
+    model = scene.model
+    motors = scene.motors
+    index = scene.index
+    count = 8
     engine = engines.make(model, motors=motors, impl="c", num_envs=count)
     random = np.random.default_rng(0)
     qpos = np.tile(model.qpos0, (count, 1))
@@ -100,23 +130,35 @@ def test_an_environment_step_of_the_c_engine_is_that_of_plain_mujoco() -> None:
         return data
 
     after = run(*arrays)
-    angles, speeds = index.joint_qpos[0], index.joint_qvel[0]
-    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
+    angles = index.joint_qpos[0]
+    speeds = index.joint_qvel[0]
+    gain = model.actuator_gainprm[:, 0]
+    bias = model.actuator_biasprm[:, :3]
     for n in range(count):
-        own, data = model.__copy__(), mujoco.MjData(model)
+        own = model.__copy__()
+        data = mujoco.MjData(model)
         own.body_mass[:] = arrays[4][n]
-        data.qpos[:], data.qvel[:], data.xfrc_applied[:] = arrays[0][n], arrays[1][n], arrays[3][n]
+        data.qpos[:] = arrays[0][n]
+        data.qvel[:] = arrays[1][n]
+        data.xfrc_applied[:] = arrays[3][n]
         for number in range(8):
             if number == 4:  # an environment step ends in single precision
-                data.qpos[:], data.qvel[:] = np.float32(data.qpos), np.float32(data.qvel)
+                data.qpos[:] = np.float32(data.qpos)
+                data.qvel[:] = np.float32(data.qvel)
                 data.qacc_warmstart[:] = np.float32(data.qacc_warmstart)
             joints = ctrl[n], data.qpos[angles], data.qvel[speeds], gain, bias
-            data.ctrl[:], own.dof_armature[speeds] = motors.limit(np, *(np.float32(x) for x in joints))
+            data.ctrl[:], own.dof_armature[speeds] = motors.limit(
+                np, *(np.float32(x) for x in joints)
+            )
             mujoco.mj_step(own, data)
-            data.qpos[angles], data.qvel[speeds] = motors.clamp(data.qpos[angles], data.qvel[speeds])
+            data.qpos[angles], data.qvel[speeds] = motors.clamp(
+                data.qpos[angles], data.qvel[speeds]
+            )
         np.testing.assert_allclose(after.qpos[n], data.qpos, atol=2e-4, err_msg=str(n))
         np.testing.assert_allclose(after.qvel[n], data.qvel, atol=2e-2, err_msg=str(n))
-        np.testing.assert_allclose(after.qacc_warmstart[n], data.qacc_warmstart, rtol=0.02, atol=2.0)
+        np.testing.assert_allclose(
+            after.qacc_warmstart[n], data.qacc_warmstart, rtol=0.02, atol=2.0
+        )
 
 
 def test_a_step_that_the_engine_warns_of_is_made_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,14 +173,20 @@ def test_a_step_that_the_engine_warns_of_is_made_whole(monkeypatch: pytest.Monke
         found += [jax.tree.map(np.asarray, step(start)) for _ in range(2)]
     for other in found[:3]:
         for name in ("qpos", "qvel"):
-            np.testing.assert_array_equal(getattr(other, name), getattr(found[3], name), err_msg=name)
+            np.testing.assert_array_equal(
+                getattr(other, name), getattr(found[3], name), err_msg=name
+            )
 
 
 def test_blocks_follow_each_other_along_the_track() -> None:
     blocks = (SpawnArea(3.0), Gate(2.0, width=0.8, random=(0.1, 0.3), depth=0.2), Plane(1.5))
-    track = Track((*blocks, Gate(4.0, width=1.0), EndWall()), width=4.0, num_robots=3, wall_height=0.6)
+    track = Track(
+        (*blocks, Gate(4.0, width=1.0), EndWall()), width=4.0, num_robots=3, wall_height=0.6
+    )
     layout = track.layout()
-    np.testing.assert_allclose(np.array(layout.spawn), [[1.5, -4 / 3, 0], [1.5, 0, 0], [1.5, 4 / 3, 0]], atol=1e-9)
+    np.testing.assert_allclose(
+        np.array(layout.spawn), [[1.5, -4 / 3, 0], [1.5, 0, 0], [1.5, 4 / 3, 0]], atol=1e-9
+    )
     assert [(a.name, a.position, a.spread) for a in layout.anchors] == [
         ("gate1", (pytest.approx(4.0), 0.0), (0.1, 0.3)),
         ("gate3", (pytest.approx(8.5), 0.0), (0.0, 0.0)),
@@ -162,17 +210,23 @@ def test_a_compiled_robot_has_the_constants_of_its_data(name: str) -> None:
     robot = robots.get(name)
     track = Track(blocks=(Plane(4.0),), walled=False, num_robots=2)
     scene = compile_scene(Scene(track, num_robots=2, robot=robot, friction=0.7, torque_robots=1))
-    model, kp, kd = scene.model, robot.kp, robot.kd
+    model = scene.model
+    kp = robot.kp
+    kd = robot.kd
     assert model.opt.timestep == 0.005 and model.nu == 24
     for number in range(2):
         for index, joint in enumerate(JOINT_NAMES):
             actuator, hinge = (of(f"robot{number}/{joint}") for of in (model.actuator, model.joint))
             torques = number == 0
             assert actuator.gainprm[0] == (1.0 if torques else kp) and actuator.trnid[0] == hinge.id
-            np.testing.assert_allclose(actuator.biasprm[:3], [0, 0, 0] if torques else [0, -kp, -kd])
+            np.testing.assert_allclose(
+                actuator.biasprm[:3], [0, 0, 0] if torques else [0, -kp, -kd]
+            )
             limit = robot.torque_limit[index]
             np.testing.assert_allclose(actuator.forcerange, [-limit, limit])
-            np.testing.assert_allclose(hinge.range, [robot.joint_lower[index], robot.joint_upper[index]])
+            np.testing.assert_allclose(
+                hinge.range, [robot.joint_lower[index], robot.joint_upper[index]]
+            )
             np.testing.assert_allclose(hinge.axis, [1, 0, 0] if index % 3 == 0 else [0, 1, 0])
             assert model.jnt_margin[hinge.id] == robot.joint_margin
             np.testing.assert_allclose(model.jnt_solref[hinge.id], [0.01, 1.0])
@@ -186,16 +240,28 @@ def test_a_compiled_robot_has_the_constants_of_its_data(name: str) -> None:
 
 
 def test_the_flock_is_that_of_a_plain_implementation() -> None:
-    """Five sheep and three robots; one of each, near (at the top speed) and about as far as a sheep sees."""
+    """Five sheep and three robots; one of each, near (at the top speed) and about as far as a sheep
+    sees.
+    """
     random = np.random.default_rng(0)
-    several = random.normal(size=(5, 2)), random.normal(size=(5, 2)), 1.5 * random.normal(size=(3, 2))
-    pairs = [(np.zeros((1, 2)), np.zeros((1, 2)), np.array([[-apart, 0.0]])) for apart in (0.1, 0.5, 2.9, 3.1)]
+    several = (
+        random.normal(size=(5, 2)),
+        random.normal(size=(5, 2)),
+        1.5 * random.normal(size=(3, 2)),
+    )
+    pairs = [
+        (np.zeros((1, 2)), np.zeros((1, 2)), np.array([[-apart, 0.0]]))
+        for apart in (0.1, 0.5, 2.9, 3.1)
+    ]
 
     def slowed(v: np.ndarray, friction: float) -> np.ndarray:
         return v * max(1 - friction * GRAVITY * 0.1 / 2 / max(np.linalg.norm(v), 1e-9), 0.0)
 
-    def plain(sheep: np.ndarray, speed: np.ndarray, dogs: np.ndarray, s: float, friction: float) -> np.ndarray:
-        result, noise = np.zeros_like(sheep), np.asarray(jax.random.normal(KEY, sheep.shape))
+    def plain(
+        sheep: np.ndarray, speed: np.ndarray, dogs: np.ndarray, s: float, friction: float
+    ) -> np.ndarray:
+        result = np.zeros_like(sheep)
+        noise = np.asarray(jax.random.normal(KEY, sheep.shape))
         for i in range(len(sheep)):
             v = slowed(speed[i], friction) + 2 * s * noise[i]
             inward = sheep.mean(0) - sheep[i]
@@ -207,7 +273,11 @@ def test_the_flock_is_that_of_a_plain_implementation() -> None:
             result[i] = slowed(np.clip(v, -2, 2), friction)
         return result
 
-    for numbers, s, friction in ((several, 0.0, 0.8), (several, 0.3, 0.8), *((pair, 0.0, 0.0) for pair in pairs)):
+    for numbers, s, friction in (
+        (several, 0.0, 0.8),
+        (several, 0.3, 0.8),
+        *((pair, 0.0, 0.0) for pair in pairs),
+    ):
         arrays = [jnp.asarray(x, jnp.float32) for x in numbers]
         found = flock(KEY, *arrays, restlessness=s, step=0.1, friction=friction)
         np.testing.assert_allclose(found, plain(*numbers, s, friction), atol=1e-4)
@@ -223,19 +293,29 @@ def test_objects_have_the_masses_and_inertias_of_their_shapes() -> None:
         "door": Door(inertia=1.4, damping=0.7, size=(0.1, 1.6, 0.9)),
         "block": Platform(center=(20.0, 1.0, 1.2), size=(2.0, 1.0, 0.4)),
     }
-    scene = compile_scene(Scene(Track((SpawnArea(2.0),), walled=False), num_robots=1, objects=items))
-    model, index = scene.model, scene.objects
+    scene = compile_scene(
+        Scene(Track((SpawnArea(2.0),), walled=False), num_robots=1, objects=items)
+    )
+    model = scene.model
+    index = scene.objects
     mass = {name: model.body_mass[index[name].body] for name in ("box", "ball", "can", "sheep")}
     assert mass == {"box": 6.0, "ball": 0.5, "can": 2.0, "sheep": 4.0}
     inertia = {name: sorted(model.body_inertia[index[name].body]) for name in items}
-    np.testing.assert_allclose(inertia["box"], 0.5 * np.array([0.6**2 + 0.8**2, 0.6**2 + 1, 0.8**2 + 1]))
+    np.testing.assert_allclose(
+        inertia["box"], 0.5 * np.array([0.6**2 + 0.8**2, 0.6**2 + 1, 0.8**2 + 1])
+    )
     np.testing.assert_allclose(inertia["ball"], [2 / 3 * 0.5 * 0.04] * 3)
     np.testing.assert_allclose(inertia["door"], [0.5, 1.0, 1.4])
     np.testing.assert_allclose(model.dof_damping[index["ball"].qvel], [0.2] * 3 + [0.01] * 3)
-    assert model.dof_damping[index["plank"].qvel[0]] == 800.0 and model.dof_damping[index["door"].qvel[0]] == 0.7
+    assert (
+        model.dof_damping[index["plank"].qvel[0]] == 800.0
+        and model.dof_damping[index["door"].qvel[0]] == 0.7
+    )
     assert model.dof_frictionloss[index["can"].qvel[0]] == pytest.approx(0.5 * 2.0 * GRAVITY)
     for name, limit in (("can", 1.5), ("plank", 0.2)):
-        np.testing.assert_allclose(model.jnt_range[model.body_jntadr[index[name].body]], [-limit, limit])
+        np.testing.assert_allclose(
+            model.jnt_range[model.body_jntadr[index[name].body]], [-limit, limit]
+        )
     sizes = {name: model.geom_size[index[name].geom] for name in items}
     np.testing.assert_allclose(sizes["box"], [0.3, 0.4, 0.5])
     np.testing.assert_allclose(sizes["sheep"][:2], [0.3, 0.2])
@@ -253,7 +333,9 @@ def test_sheep_follow_the_law_with_the_parameters_of_their_task() -> None:
     columns = np.stack([env.objects[f"sheep{number}"].qvel for number in range(2)])
     data = state.data.replace(qvel=state.data.qvel.at[columns].set(speed))
     robots_xy = env.read(data).position_w[:, :2]
-    expected = flock(KEY, env.sheep(data), speed, robots_xy, restlessness=0.2, step=0.02, friction=0.3)
+    expected = flock(
+        KEY, env.sheep(data), speed, robots_xy, restlessness=0.2, step=0.02, friction=0.3
+    )
     after = env.step_npcs(data, env.read(data), KEY)
     np.testing.assert_allclose(after.qvel[columns], expected, rtol=1e-5)
     assert not np.delete(np.asarray(after.qvel - data.qvel), columns.ravel()).any()

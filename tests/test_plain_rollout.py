@@ -1,4 +1,6 @@
-"""Rollouts, evaluations, leagues and opponents against plain implementations: loops over steps, episodes and games."""
+"""Rollouts, evaluations, leagues and opponents against plain implementations: loops over steps,
+episodes and games.
+"""
 
 import dataclasses
 from types import SimpleNamespace
@@ -28,7 +30,9 @@ N = 4
 
 
 class Rich(Probe):
-    """A probe with more outcomes, a term of the reward and divergences; it starts alike with every key."""
+    """A probe with more outcomes, a term of the reward and divergences; it starts alike with every
+    key.
+    """
 
     def reset(self, key: jax.Array) -> probes.ProbeState:
         return self._more(super().reset(jax.random.PRNGKey(7)))
@@ -37,7 +41,8 @@ class Rich(Probe):
         return self._more(super().step(state, action))
 
     def _more(self, state: probes.ProbeState) -> probes.ProbeState:
-        number, step = jnp.arange(self.num_envs), state.step
+        number = jnp.arange(self.num_envs)
+        step = state.step
         teams = {"draw": (step + number) % 3 == 0, "loss": number == 1}
         outcome = Outcome(
             state.outcome.success,
@@ -46,7 +51,11 @@ class Rich(Probe):
             further={"way": (state.hidden + number)[:, None]},
             ending={"fall": ((step + number) % 2 == 0).astype(jnp.float32)},
         )
-        more = {"pace": state.reward[:, 1], "diverged": (number + 2 * step) % 3 == 1, "reward/way": state.reward[:, 0]}
+        more = {
+            "pace": state.reward[:, 1],
+            "diverged": (number + 2 * step) % 3 == 1,
+            "reward/way": state.reward[:, 0],
+        }
         metrics = {**state.metrics, **{name: x.astype(jnp.float32) for name, x in more.items()}}
         return dataclasses.replace(state, outcome=outcome, metrics=metrics)
 
@@ -56,8 +65,12 @@ def pay_differently(hidden: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def rich(**values: Any) -> Rich:
-    show = lambda hidden, step: jnp.stack([hidden, 0.5 * step], axis=-1)  # noqa: E731
-    return Rich(show, pay_differently, N, features=2, max_episode_steps=2, odd_episode_steps=3, **values)
+    def show(hidden, step):
+        return jnp.stack([hidden, 0.5 * step], axis=-1)
+
+    return Rich(
+        show, pay_differently, N, features=2, max_episode_steps=2, odd_episode_steps=3, **values
+    )
 
 
 class Episode(NamedTuple):
@@ -70,53 +83,77 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
         action = params["gain"] * obs[..., 2:3] + 0.1 * memory[:, None, None]
         return action, -action, memory + 1.0
 
-    def value(params: Any, memory: Any, first: Any, obs: Any, privileged: Any, active: Any) -> tuple[Any, Any]:
+    def value(
+        params: Any, memory: Any, first: Any, obs: Any, privileged: Any, active: Any
+    ) -> tuple[Any, Any]:
         assert first.shape[0] == obs.shape[0] == privileged.shape[0] == 1
-        return None, memory + params["all"] * (jnp.sum(obs[0], axis=(1, 2)) + jnp.sum(privileged[0], axis=1))
+        return None, memory + params["all"] * (
+            jnp.sum(obs[0], axis=(1, 2)) + jnp.sum(privileged[0], axis=1)
+        )
 
     nothing: Any = None
-    zero = lambda count: NetworkMemory(jnp.zeros(count), jnp.zeros(count))  # noqa: E731
-    network = Network(nothing, lambda params: {"gain": params["gain"]}, zero, act, value, nothing, chunk_length=2)
-    env, params = rich(even_truncate=True), {"gain": jnp.float32(0.7), "all": jnp.float32(0.3)}
-    statistics = [RunningStatistics(jnp.full(n, 0.2), jnp.full(n, 4.0), jnp.float32(9.0)) for n in (4, 2)]
-    start = RolloutState(env.reset(KEY), zero(N), jnp.ones(N, bool), jnp.zeros(N, jnp.int32), jnp.zeros(N))
+
+    def zero(count):
+        return NetworkMemory(jnp.zeros(count), jnp.zeros(count))
+
+    network = Network(
+        nothing, lambda params: {"gain": params["gain"]}, zero, act, value, nothing, chunk_length=2
+    )
+    env = rich(even_truncate=True)
+    params = {"gain": jnp.float32(0.7), "all": jnp.float32(0.3)}
+    statistics = [
+        RunningStatistics(jnp.full(n, 0.2), jnp.full(n, 4.0), jnp.float32(9.0)) for n in (4, 2)
+    ]
+    start = RolloutState(
+        env.reset(KEY), zero(N), jnp.ones(N, bool), jnp.zeros(N, jnp.int32), jnp.zeros(N)
+    )
 
     @jax.jit
     def both(state: RolloutState) -> Any:
         options = {"normalize": True, "action_scale": 0.25}
         found = []
         for _ in range(2):
-            state, *rest = rollout(env, network, params, ObservationNormalizer(*statistics), state, KEY, 4, **options)
+            state, *rest = rollout(
+                env, network, params, ObservationNormalizer(*statistics), state, KEY, 4, **options
+            )
             found.append(rest)
         return state, found
 
     state, found = both(start)
-    step, now = jax.jit(env.step), env.reset(KEY)
-    actor, critic, first = np.zeros(N), np.zeros(N), np.ones(N, bool)
+    step = jax.jit(env.step)
+    now = env.reset(KEY)
+    actor = np.zeros(N)
+    critic = np.zeros(N)
+    first = np.ones(N, bool)
     episodes = [Episode()] * N
     for transitions, metrics in found:
         rows: dict[str, list[float]] = {}
         ends: dict[str, list[float]] = {}
         for t in range(4):
-            actor, critic = (np.where(first, 0.0, x) for x in (actor, critic))
+            actor = np.where(first, 0.0, actor)
+            critic = np.where(first, 0.0, critic)
             got = jax.tree.map(lambda x: np.asarray(x[t]), transitions)  # noqa: B023
             np.testing.assert_allclose(got.memory.critic, critic, rtol=1e-5)
             np.testing.assert_allclose(got.memory.actor, actor, rtol=1e-5)
             np.testing.assert_array_equal(got.is_first, first)
-            obs, privileged = (np.asarray(now.obs) - 0.2) / 2, (np.asarray(now.privileged_obs) - 0.2) / 2
+            obs = (np.asarray(now.obs) - 0.2) / 2
+            privileged = (np.asarray(now.privileged_obs) - 0.2) / 2
             action = 0.7 * obs[..., 2:3] + 0.1 * actor[:, None, None]
             np.testing.assert_allclose(got.action, action, rtol=1e-5)
             np.testing.assert_allclose(got.log_prob, -action, rtol=1e-5)
             for name in ("obs", "privileged_obs"):
                 np.testing.assert_allclose(getattr(got, name), getattr(now, name))
-            actor, critic = actor + 1.0, critic + 0.3 * (obs.sum((1, 2)) + privileged.sum(1))
+            actor = actor + 1.0
+            critic = critic + 0.3 * (obs.sum((1, 2)) + privileged.sum(1))
             now = step(now, jnp.asarray(0.25 * action, jnp.float32))
             for name in ("final_obs", "final_privileged_obs", "reward", "terminated"):
                 np.testing.assert_allclose(getattr(got, name), getattr(now, name), rtol=1e-5)
             first = np.asarray(now.terminated | now.truncated)
             np.testing.assert_array_equal(got.done, first)
             for n in range(N):
-                episodes[n] = Episode(episodes[n].steps + 1, episodes[n].total + float(now.reward[n].mean()))
+                episodes[n] = Episode(
+                    episodes[n].steps + 1, episodes[n].total + float(now.reward[n].mean())
+                )
                 for name, x in now.metrics.items():
                     rows.setdefault(name, []).append(float(x[n]))
                 if first[n]:
@@ -130,14 +167,18 @@ def test_a_rollout_is_that_of_a_plain_implementation() -> None:
         outcomes = {"success", "ending/fall", *(f"team0/{name}" for name in (*RESULTS, "way"))}
         assert set(ends) == {*outcomes, "episode_length", "episode_return"}
         metrics |= metrics.pop("ended")
-        expected |= {name: np.mean(values) for name, values in ends.items()} | {"episodes": len(ends["success"])}
+        expected |= {name: np.mean(values) for name, values in ends.items()} | {
+            "episodes": len(ends["success"])
+        }
         assert set(metrics) == set(expected)
         for name, x in expected.items():
             np.testing.assert_allclose(metrics[name], x, rtol=1e-5, atol=1e-6, err_msg=name)
     np.testing.assert_allclose(state.memory.actor, actor)
     np.testing.assert_allclose(state.memory.critic, critic, rtol=1e-5)
     np.testing.assert_array_equal(state.episode_steps, [episode.steps for episode in episodes])
-    np.testing.assert_allclose(state.episode_return, [episode.total for episode in episodes], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        state.episode_return, [episode.total for episode in episodes], rtol=1e-5, atol=1e-6
+    )
 
 
 def test_evaluations_are_those_of_a_plain_implementation() -> None:
@@ -150,31 +191,58 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
     found = Evaluator(env, act, jnp.full(N, 0.1), block=4)(both, 9, jax.random.split(KEY, 2))
     step = jax.jit(env.step)
     for gain, result in zip((0.3, -0.8), found, strict=True):
-        now, memory, left = env.reset(KEY), np.full(N, 0.1), np.array([3, 2, 2, 2])
-        rows, ends, rewards = [], [], []
+        now = env.reset(KEY)
+        memory = np.full(N, 0.1)
+        left = np.array([3, 2, 2, 2])
+        rows = []
+        ends = []
+        rewards = []
         while left.any():
             action = gain * np.asarray(now.obs)[..., 2:3] + memory[:, None, None]
-            now, memory = step(now, jnp.asarray(action, jnp.float32)), memory + 0.5
+            now = step(now, jnp.asarray(action, jnp.float32))
+            memory = memory + 0.5
             done = np.asarray(now.terminated | now.truncated)
             for n in np.flatnonzero(left):
-                rows.append({name: float(x[n]) for name, x in (now.metrics | now.outcome.by_name()).items()})
+                rows.append(
+                    {name: float(x[n]) for name, x in (now.metrics | now.outcome.by_name()).items()}
+                )
                 rewards.append(float(now.reward[n, 1]))
                 if done[n]:
                     ends.append(rows[-1])
             memory[done] = 0.1
             left = left - (done & (left > 0))
-        mean = lambda name, of: np.mean([row[name] for row in of])  # noqa: E731
-        expected = {"success_rate": mean("success", ends), "average_step_reward": mean("average_step_reward", rows)}
+
+        def mean(name, of):
+            return np.mean([row[name] for row in of])
+
+        expected = {
+            "success_rate": mean("success", ends),
+            "average_step_reward": mean("average_step_reward", rows),
+        }
         expected |= {"episode_return": np.sum(rewards) / 9, "episode_length": len(rows) / 9}
-        expected |= {"overflow": sum(row["overflow"] for row in rows), "diverged": sum(row["diverged"] for row in ends)}
-        expected |= {"success/way": mean("team0/way", ends), "ending/fall": mean("ending/fall", ends)}
-        expected |= {f"{name}_rate": mean(f"team0/{name}", ends) for name in ("win", "draw", "loss")}
+        expected |= {
+            "overflow": sum(row["overflow"] for row in rows),
+            "diverged": sum(row["diverged"] for row in ends),
+        }
+        expected |= {
+            "success/way": mean("team0/way", ends),
+            "ending/fall": mean("ending/fall", ends),
+        }
+        expected |= {
+            f"{name}_rate": mean(f"team0/{name}", ends) for name in ("win", "draw", "loss")
+        }
         values = result.to_dict()
-        terms, intervals = values.pop("terms"), values.pop("intervals")
-        assert intervals["win_rate"] == [*result.win[1:]] and intervals["ending/fall"][0] <= values["ending/fall"]
+        terms = values.pop("terms")
+        intervals = values.pop("intervals")
+        assert (
+            intervals["win_rate"] == [*result.win[1:]]
+            and intervals["ending/fall"][0] <= values["ending/fall"]
+        )
         assert (values.pop("task"), values.pop("episodes")) == ("probe", 9)
         assert values == pytest.approx(expected, rel=1e-5)
-        assert terms == pytest.approx({name: mean(f"reward/{name}", rows) for name in ("pay", "way")}, rel=1e-5)
+        assert terms == pytest.approx(
+            {name: mean(f"reward/{name}", rows) for name in ("pay", "way")}, rel=1e-5
+        )
 
 
 class Half(Rich):
@@ -184,43 +252,73 @@ class Half(Rich):
 
 
 def test_results_are_those_of_the_agents_that_take_part() -> None:
-    values: dict[str, Any] = {"num_envs": N, "features": 2, "max_episode_steps": 2, "odd_episode_steps": 2}
-    env = Half(lambda hidden, step: jnp.stack([hidden, 0.5 * step], axis=-1), pay_differently, **values)
-    act = lambda params, seen, memory, key: (seen.obs[..., 2:3], memory)  # noqa: E731
+    values: dict[str, Any] = {
+        "num_envs": N,
+        "features": 2,
+        "max_episode_steps": 2,
+        "odd_episode_steps": 2,
+    }
+    env = Half(
+        lambda hidden, step: jnp.stack([hidden, 0.5 * step], axis=-1), pay_differently, **values
+    )
+
+    def act(params, seen, memory, key):
+        return (seen.obs[..., 2:3], memory)
+
     (result,) = Evaluator(env, act, block=2)(None, N, KEY[None])
     hidden = np.asarray(env.reset(KEY).hidden)
     assert result.episode_return == pytest.approx(4 * hidden.mean())
     nothing: Any = None
-    copy = lambda params, memory, obs, key, active: (obs[..., 2:3], obs[..., 2:3], memory)  # noqa: E731
+
+    def copy(params, memory, obs, key, active):
+        return (obs[..., 2:3], obs[..., 2:3], memory)
+
     value: Any = lambda *_: (None, ())  # noqa: E731
     network = Network(nothing, lambda p: p, nothing, copy, value, nothing)
     zero = jnp.zeros(N)
-    start = RolloutState(env.reset(KEY), NetworkMemory((), ()), zero == 0, zero.astype(jnp.int32), zero)
-    _, transitions, metrics = rollout(env, network, {}, nothing, start, KEY, 2, normalize=False, action_scale=1.0)
+    start = RolloutState(
+        env.reset(KEY), NetworkMemory((), ()), zero == 0, zero.astype(jnp.int32), zero
+    )
+    _, transitions, metrics = rollout(
+        env, network, {}, nothing, start, KEY, 2, normalize=False, action_scale=1.0
+    )
     assert float(metrics["ended"]["episode_return"]) == pytest.approx(4 * hidden.mean())
     assert transitions.active.tolist() == [[[True, False]] * N] * 2
 
 
 def test_a_league_counts_as_a_plain_implementation() -> None:
-    sources, members = ("newest", "older", "scripted", "uniform", "idle"), 4
-    moving, scripted = np.isin(sources, ("older", "uniform")), np.isin(sources, ("scripted",))
+    sources = ("newest", "older", "scripted", "uniform", "idle")
+    members = 4
+    moving = np.isin(sources, ("older", "uniform"))
+    scripted = np.isin(sources, ("scripted",))
     env: Any = object.__new__(league.League)
-    env._roster, env._members = league.Roster(sources), members
+    env._roster = league.Roster(sources)
+    env._members = members
     random = np.random.default_rng(0)
     ratings = random.normal(0, 200, members).astype(np.float32)
     fields = {"born": jnp.array([0, 3, 5, -1]), "rating": jnp.asarray(ratings)}
     start = pool.new_pool({"x": jnp.zeros(1)}, members)._replace(**fields)
     zeros = jnp.zeros(5, jnp.int32)
-    state = league.LeagueState(start, zeros, zeros, jnp.zeros(()), jnp.int32(0), jnp.zeros((5, 3)), KEY)
-    score, games, rating, played, recent = np.zeros(members), np.zeros(members), 0.0, np.zeros(5), np.zeros((5, 3))
+    state = league.LeagueState(
+        start, zeros, zeros, jnp.zeros(()), jnp.int32(0), jnp.zeros((5, 3)), KEY
+    )
+    score = np.zeros(members)
+    games = np.zeros(members)
+    rating = 0.0
+    played = np.zeros(5)
+    recent = np.zeros((5, 3))
     for number in range(30):
         member = random.integers(0, 3, 5)
-        outcomes = random.integers(0, 400 if number % 7 == 0 else 4, (5, 3)) * (random.random((5, 1)) < 0.7)
+        outcomes = random.integers(0, 400 if number % 7 == 0 else 4, (5, 3)) * (
+            random.random((5, 1)) < 0.7
+        )
         state = state._replace(member=jnp.asarray(member, jnp.int32))
         state = env._record(state, [SimpleNamespace(outcomes=jnp.asarray(row)) for row in outcomes])
-        gained, met = 0.0, set()
+        gained = 0.0
+        met = set()
         for i, (wins, draws, losses) in enumerate(outcomes):
-            count, points = wins + draws + losses, wins + 0.5 * draws
+            count = wins + draws + losses
+            points = wins + 0.5 * draws
             played[i] += count
             if moving[i] or scripted[i]:
                 theirs = 0.0 if scripted[i] else ratings[member[i]]
@@ -246,8 +344,11 @@ def test_a_league_counts_as_a_plain_implementation() -> None:
     for i, source in enumerate(sources):
         for name, share in zip(("win", "draw", "loss"), recent[i] / recent[i].sum(), strict=True):
             expected[f"league/{name}/{source}"] = share
-    assert {name: float(value) for name, value in metrics.items()} == pytest.approx(expected, rel=1e-3)
-    older, any_ = (np.asarray(jax.nn.softmax(pool.chances(state.pool, uniform))) for uniform in (False, True))
+    assert {name: float(value) for name, value in metrics.items()} == pytest.approx(
+        expected, rel=1e-3
+    )
+    older = np.asarray(jax.nn.softmax(pool.chances(state.pool, False)))
+    any_ = np.asarray(jax.nn.softmax(pool.chances(state.pool, True)))
     weight = (1 - rates[:3]) ** 2 + 1e-4
     np.testing.assert_allclose(older, [*(weight / weight.sum()), 0.0], rtol=1e-3)
     np.testing.assert_allclose(any_, [1 / 3, 1 / 3, 1 / 3, 0.0], rtol=1e-5)
@@ -258,13 +359,18 @@ def test_blocks_draw_the_members_that_their_source_says() -> None:
     env: Any = object.__new__(league.League)
     env._roster = league.Roster(("older", "uniform", "older", "idle", "older"))
     env._config = SimpleNamespace(league=SimpleNamespace(episodes=5))
-    now = pool.new_pool({"x": jnp.zeros(1)}, 3)._replace(born=jnp.array([0, 3, -1]), games=jnp.full(3, 1e6))
-    now, none = now._replace(score=jnp.array([1e6, 0.0, 0.0])), jnp.zeros(5, jnp.int32)
+    now = pool.new_pool({"x": jnp.zeros(1)}, 3)._replace(
+        born=jnp.array([0, 3, -1]), games=jnp.full(3, 1e6)
+    )
+    now = now._replace(score=jnp.array([1e6, 0.0, 0.0]))
+    none = jnp.zeros(5, jnp.int32)
     opponents = [SimpleNamespace(waiting=jnp.array([False, block == 4])) for block in range(5)]
 
     def drawn(key: jax.Array) -> Any:
         played = jnp.array([5, 6, 4, 9, 9], jnp.int32)
-        state = league.LeagueState(now, none, played, jnp.zeros(()), jnp.int32(0), jnp.zeros((5, 3)), key)
+        state = league.LeagueState(
+            now, none, played, jnp.zeros(()), jnp.int32(0), jnp.zeros((5, 3)), key
+        )
         after, redrawn = env._draw(state, opponents)
         return after.member, after.played, redrawn
 
@@ -281,9 +387,17 @@ def test_a_second_change_replaces_only_the_opponent_that_is_waited_for() -> None
     two = exchange(one, jnp.float32(2.0))
     assert (float(two.arrays), float(two.before), two.waiting.tolist()) == (2.0, 0.0, [True, False])
     free = exchange(dataclasses.replace(two, waiting=~jnp.ones(2, bool)), jnp.float32(3.0))
-    assert (float(free.arrays), float(free.before), free.waiting.tolist()) == (3.0, 2.0, [True, True])
+    assert (float(free.arrays), float(free.before), free.waiting.tolist()) == (
+        3.0,
+        2.0,
+        [True, True],
+    )
     now = exchange(two, jnp.float32(4.0), at_once=True)
-    assert (float(now.arrays), float(now.before), now.waiting.tolist()) == (4.0, 4.0, [False, False])
+    assert (float(now.arrays), float(now.before), now.waiting.tolist()) == (
+        4.0,
+        4.0,
+        [False, False],
+    )
 
 
 def test_both_teams_of_a_mirrored_match_get_what_is_theirs() -> None:
@@ -291,17 +405,31 @@ def test_both_teams_of_a_mirrored_match_get_what_is_theirs() -> None:
     state = env.reset(KEY).match
     numbers = jnp.arange(3.0)
     metrics = {name: numbers + 1 for name in state.metrics}
-    rows = {"obs": state.obs + 1, "final_obs": state.final_obs + 2, "reward": jnp.arange(6.0).reshape(3, 2)}
-    rows |= {"privileged_obs": state.privileged_obs + 3, "final_privileged_obs": state.final_privileged_obs + 4}
-    flags = {"terminated": jnp.array([True, False, False]), "truncated": jnp.array([False, True, False])}
+    rows = {
+        "obs": state.obs + 1,
+        "final_obs": state.final_obs + 2,
+        "reward": jnp.arange(6.0).reshape(3, 2),
+    }
+    rows |= {
+        "privileged_obs": state.privileged_obs + 3,
+        "final_privileged_obs": state.final_privileged_obs + 4,
+    }
+    flags = {
+        "terminated": jnp.array([True, False, False]),
+        "truncated": jnp.array([False, True, False]),
+    }
     more = {"step": jnp.array([3, 1, 2], jnp.int32), "assistance": numbers / 4, "metrics": metrics}
-    seen = env._team_state(dataclasses.replace(state, **rows, **flags, **more), jnp.zeros((3, 2, 12)))
+    seen = env._team_state(
+        dataclasses.replace(state, **rows, **flags, **more), jnp.zeros((3, 2, 12))
+    )
     for i in range(6):
         match, team = divmod(i, 2)
         for name in ("obs", "final_obs", "reward"):
             np.testing.assert_array_equal(getattr(seen, name)[i, 0], rows[name][match, team])
         for name in ("privileged_obs", "final_privileged_obs"):
-            np.testing.assert_array_equal(getattr(seen, name)[i], [*np.asarray(rows[name][match]), team])
+            np.testing.assert_array_equal(
+                getattr(seen, name)[i], [*np.asarray(rows[name][match]), team]
+            )
         for name in ("terminated", "truncated"):
             assert bool(getattr(seen, name)[i]) == bool(flags[name][match])
         for name in ("step", "assistance"):
@@ -315,7 +443,9 @@ def test_both_teams_of_a_mirrored_match_get_what_is_theirs() -> None:
 def test_policies_without_files_act_as_named() -> None:
     env = made("go1football-2vs2")
     obs = jnp.zeros((2000, 2, env.observation_size))
-    random, idle, forward = (load_policy(name, env) for name in ("random", "idle", "forward"))
+    random = load_policy("random", env)
+    idle = load_policy("idle", env)
+    forward = load_policy("forward", env)
     columns = np.asarray(random.act(obs, (), KEY)[0]).reshape(2000, -1)
     assert columns.shape[1] == 24 and columns.min() < -0.99 and columns.max() > 0.99
     assert np.abs(columns.mean(0)).max() < 0.08 and np.abs(columns.std(0) - 3**-0.5).max() < 0.03

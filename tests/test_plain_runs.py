@@ -1,4 +1,6 @@
-"""What a run begins with and keeps; edges: values exactly at a bound, floors of divisions, and nothing to divide by."""
+"""What a run begins with and keeps; edges: values exactly at a bound, floors of divisions, and
+nothing to divide by.
+"""
 
 import dataclasses
 import json
@@ -62,8 +64,12 @@ class Fields(EnvironmentState):
 class Help:
     """One agent in four environments; its reward is its assistance; every step is an episode."""
 
-    name, num_envs, num_agents, action_size = "help", N, 1, 1
-    observation_size, privileged_observation_size = 1, 1
+    name = "help"
+    num_envs = N
+    num_agents = 1
+    action_size = 1
+    observation_size = 1
+    privileged_observation_size = 1
 
     def reset(self, key: jax.Array) -> Fields:
         return self._state(jnp.zeros(N))
@@ -72,34 +78,52 @@ class Help:
         return self._state(state.assistance)
 
     def _state(self, assistance: jax.Array) -> Fields:
-        obs, done = jnp.zeros((N, 1, 1)), jnp.ones(N, bool)
+        obs = jnp.zeros((N, 1, 1))
+        done = jnp.ones(N, bool)
         rest = Outcome(), {"pay": assistance}, jnp.zeros(N, jnp.int32), assistance, KEY
         return Fields(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, *rest)
 
 
 def test_environments_get_the_assistance_of_the_schedule() -> None:
-    values: dict[str, Any] = {"num_envs": N, "rollout_steps": 2, "total_steps": 80, "ppo": {"epochs": 1}}
+    values: dict[str, Any] = {
+        "num_envs": N,
+        "rollout_steps": 2,
+        "total_steps": 80,
+        "ppo": {"epochs": 1},
+    }
     values |= {"curriculum": {"assistance": 0.8, "assistance_until": 0.5}}
     config = build(TrainConfig, {**values, "network": {"recurrent": False}})
     rows = updated(Help(), config, 6)[1]
-    for row, assistance in zip(rows, (0.8, 0.64, 0.48, 0.32, 0.16, 0.0), strict=True):  # to 0 in 5 of 10 updates
+    # to 0 in 5 of 10 updates
+    for row, assistance in zip(rows, (0.8, 0.64, 0.48, 0.32, 0.16, 0.0), strict=True):
         assert float(row["pay"]) == pytest.approx(assistance, abs=1e-6) == float(row["assistance"])
 
 
-def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(tmp_path: Path) -> None:
+def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(
+    tmp_path: Path,
+) -> None:
     env = Probe(probes.show_hidden, probes.pay_one, N)
     config = settings(checkpoint__environments=False, network__recurrent=False)
     learner, processes = own_learner(env, config)
     shared = SeedBatch(learner.init, 1).shared
     start, _ = first_state(env, learner, processes, config, None, shared)
     keys = [start.rollout.env_state.key.tolist()]
-    metadata = {"task": "probe", "config": to_mapping(config), "seconds": 1.0, "environments": False}
+    metadata = {
+        "task": "probe",
+        "config": to_mapping(config),
+        "seconds": 1.0,
+        "environments": False,
+    }
     for updates in (1, 2):
         later = without_environments(start) | {"updates": jnp.int32(updates)}
         path = save_checkpoint(tmp_path, later, 16 * updates, metadata, keep=2)
         state, seconds = first_state(env, learner, processes, config, path, shared)
         keys.append(state.rollout.env_state.key.tolist())
-        assert seconds == 1.0 and int(state.updates) == updates and state.key.tolist() == start.key.tolist()
+        assert (
+            seconds == 1.0
+            and int(state.updates) == updates
+            and state.key.tolist() == start.key.tolist()
+        )
     assert len({tuple(key) for key in keys}) == 3
 
 
@@ -107,7 +131,9 @@ def test_all_policies_are_evaluated_with_the_random_numbers_of_the_seed() -> Non
     env = Probe(probes.show_hidden, probes.pay_near_hidden, N)
     results = []
     for seed in (0, 1):
-        config = settings(seed=seed, evaluation={"every": 1, "episodes": N}, network__recurrent=False)
+        config = settings(
+            seed=seed, evaluation={"every": 1, "episodes": N}, network__recurrent=False
+        )
         state = jax.jit(make_learner(env, config).init)(KEY)
         policy = policy_of(state, env, config)
         one, two = Monitor(env, config).evaluate([policy, policy], [3, 5], N)
@@ -125,9 +151,19 @@ def test_each_policy_is_evaluated_twice_in_a_row() -> None:
 
 def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> None:
     whole = [{"env_steps": steps, "sampled": {}, "deterministic": {}} for steps in (5, 10)]
-    text = {"evaluations": whole, "absolute": {"env_steps": 5, "sampled": {}, "deterministic": {}}, "ended_at": 10}
+    text = {
+        "evaluations": whole,
+        "absolute": {"env_steps": 5, "sampled": {}, "deterministic": {}},
+        "ended_at": 10,
+    }
     (tmp_path / "evaluations.json").write_text(json.dumps(text))
-    for steps, count, absolute in ((4, 0, False), (5, 1, False), (9, 1, False), (10, 2, True), (15, 2, False)):
+    for steps, count, absolute in (
+        (4, 0, False),
+        (5, 1, False),
+        (9, 1, False),
+        (10, 2, True),
+        (15, 2, False),
+    ):
         log = EvaluationLog(tmp_path, steps)
         assert log.evaluations == whole[:count] and (log.absolute is not None) == absolute
         assert log.last_steps() == ([None, 5, 10][count])
@@ -136,30 +172,56 @@ def test_a_resumed_run_keeps_the_evaluations_up_to_its_step(tmp_path: Path) -> N
 def test_a_member_joins_in_a_free_place_or_that_of_the_member_beaten_most() -> None:
     """Every fourth update, or the next one at a win rate; with the learner's rating and weights."""
     env: Any = object.__new__(league.League)
-    env._roster, env._members = league.Roster(("older", "idle")), 3
+    env._roster = league.Roster(("older", "idle"))
+    env._members = 3
     full = pool.new_pool({"x": jnp.zeros(1)}, 3)._replace(score=jnp.array([9.0, 5.0, 1.0]))
     full = full._replace(games=jnp.full(3, 9.0), rating=jnp.array([1.0, 2.0, 3.0]))
-    for born, member, place in (([0, 1, 2], [1, 0], 0), ([0, 1, 2], [0, 1], 1), ([0, 1, -1], [1, 0], 2)):
-        full, blocks = full._replace(born=jnp.array(born)), jnp.array(member, jnp.int32)
-        state = league.LeagueState(full, blocks, blocks, jnp.float32(55.0), jnp.int32(2), jnp.zeros((2, 3)), KEY)
+    for born, member, place in (
+        ([0, 1, 2], [1, 0], 0),
+        ([0, 1, 2], [0, 1], 1),
+        ([0, 1, -1], [1, 0], 2),
+    ):
+        full = full._replace(born=jnp.array(born))
+        blocks = jnp.array(member, jnp.int32)
+        state = league.LeagueState(
+            full, blocks, blocks, jnp.float32(55.0), jnp.int32(2), jnp.zeros((2, 3)), KEY
+        )
         for win_rate, due in ((1.0, 6), (0.4, 3)):
             rules = SimpleNamespace(snapshot_steps=13, snapshot_win_rate=win_rate)
             env._config = SimpleNamespace(league=rules, steps_per_update=4)
-            before, after = (env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(now)) for now in (due - 1, due))
+            before = env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(due - 1))
+            after = env._snapshot(state, {"x": jnp.ones(1)}, jnp.int32(due))
             assert before.pool.born.tolist() == born and int(before.snapshot) == 2
             assert int(after.snapshot) == int(after.pool.born[place]) == due
-            assert float(after.pool.rating[place]) == 55.0 and float(after.pool.arrays["x"][place, 0]) == 1.0
+            assert (
+                float(after.pool.rating[place]) == 55.0
+                and float(after.pool.arrays["x"][place, 0]) == 1.0
+            )
             assert float(after.pool.games[place]) == float(after.pool.score[place]) == 0.0
             for other in {0, 1, 2} - {place}:
-                found = [float(x[other]) for x in (after.pool.rating, after.pool.games, after.pool.arrays["x"][:, 0])]
-                assert found == [1.0 + other, 9.0, 0.0] and int(after.pool.born[other]) == born[other]
+                found = [
+                    float(x[other])
+                    for x in (after.pool.rating, after.pool.games, after.pool.arrays["x"][:, 0])
+                ]
+                assert (
+                    found == [1.0 + other, 9.0, 0.0] and int(after.pool.born[other]) == born[other]
+                )
 
 
 class Matches:
-    """Twelve matches of episodes of two steps; match i ends its first in win, draw or loss by i modulo 3, then wins."""
+    """Twelve matches of episodes of two steps; match i ends its first in win, draw or loss by i
+    modulo 3, then wins.
+    """
 
-    name, num_envs, num_agents, action_size, teams, max_episode_steps = "match", 12, 2, 1, ((0,), (1,)), 8
-    observation_size, privileged_observation_size, env = 1, 1, None
+    name = "match"
+    num_envs = 12
+    num_agents = 2
+    action_size = 1
+    teams = ((0,), (1,))
+    max_episode_steps = 8
+    observation_size = 1
+    privileged_observation_size = 1
+    env = None
 
     def reset(self, key: jax.Array) -> Fields:
         return self._state(jnp.zeros(12, jnp.int32))
@@ -168,17 +230,25 @@ class Matches:
         return self._state(state.step + 1)
 
     def _state(self, step: jax.Array) -> Fields:
-        done, result = step % 2 == 0, jnp.where(step <= 2, jnp.arange(12) % 3, 0)
-        win, draw, loss = (jnp.stack([(result == i) * 1.0, jnp.zeros(12)], axis=-1) for i in range(3))
+        done = step % 2 == 0
+        result = jnp.where(step <= 2, jnp.arange(12) % 3, 0)
+        win, draw, loss = (
+            jnp.stack([(result == i) * 1.0, jnp.zeros(12)], axis=-1) for i in range(3)
+        )
         outcome = Outcome(win=win, draw=draw, loss=loss)
-        obs, none = jnp.zeros((12, 2, 1)), jnp.zeros((12, 1))
+        obs = jnp.zeros((12, 2, 1))
+        none = jnp.zeros((12, 1))
         rest = jnp.zeros((12, 2)), done, jnp.zeros(12, bool), outcome, {}, step, none[:, 0], KEY
         return Fields(obs, none, obs, none, *rest)
 
 
 def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
     idle = SimplePolicy("match", 1, lambda obs, key: jnp.zeros((len(obs), 1, 1)))
-    for count, expected in ((1, [[4, 4, 4]]), (2, [[2, 2, 2]] * 2), (3, [[4, 0, 0], [0, 4, 0], [0, 0, 4]])):
+    for count, expected in (
+        (1, [[4, 4, 4]]),
+        (2, [[2, 2, 2]] * 2),
+        (3, [[4, 0, 0], [0, 4, 0], [0, 0, 4]]),
+    ):
         matches: Any = Matches()
         assert tournament.play(matches, idle, [idle] * count, KEY).tolist() == expected
 
@@ -216,20 +286,29 @@ def test_bounds_of_tracks_payloads_and_settings() -> None:
         refuses("gate: width", Track((Gate(width=width),)).layout)
     plane = made("go1plane")
     mass = float(plane.compiled.model.body_mass[plane.index.trunk_body].min())
-    random = lambda low: Randomizer(Randomization(payload=(low, 1.0)), plane.compiled.model, plane.index, 1.0)  # noqa: E731
+
+    def random(low):
+        return Randomizer(Randomization(payload=(low, 1.0)), plane.compiled.model, plane.index, 1.0)
+
     refuses("payload", random, -mass)
     random(-mass + 1e-3)
-    base: dict[str, Any] = {"network": {"log_std_init": -1.0, "log_std_max": -1.0, "log_std_min": -1.0}}
+    base: dict[str, Any] = {
+        "network": {"log_std_init": -1.0, "log_std_max": -1.0, "log_std_min": -1.0}
+    }
     config = build(TrainConfig, {**base, "num_envs": 4, "rollout_steps": 5, "total_steps": 40})
     assert config.steps_per_update == 20 and config.num_updates == 2
-    longer = [build(TrainConfig, {"num_envs": 4, "rollout_steps": 5, "total_steps": steps}) for steps in (41, 60)]
+    longer = [
+        build(TrainConfig, {"num_envs": 4, "rollout_steps": 5, "total_steps": steps})
+        for steps in (41, 60)
+    ]
     assert [config.num_updates for config in longer] == [3, 3]
 
 
 def test_one_agent_of_four_is_frozen() -> None:
     env = made("go1football-2vs2")
     draw = jax.jit(jax.vmap(env._sample_frozen_steps, (0, None, None)))
-    keys, active = jax.random.split(KEY, 400), jnp.ones(4, bool)
+    keys = jax.random.split(KEY, 400)
+    active = jnp.ones(4, bool)
     assert not np.asarray(draw(keys, jnp.float32(0.0), active)).any()
     frozen = np.asarray(draw(keys, jnp.float32(1.0), active)) > 0
     assert frozen.sum(axis=1).max() == 1 and np.all(np.abs(frozen.mean(axis=0) - 0.25) < 0.08)
@@ -239,11 +318,15 @@ def test_one_agent_of_four_is_frozen() -> None:
 
 def test_constant_observations_are_divided_by_a_hundredth() -> None:
     statistics = RunningStatistics(jnp.full(2, 3.0), jnp.array([0.0, 1e-5]), jnp.float32(9.0))
-    np.testing.assert_allclose(running_normalize(statistics, jnp.array([3.05, 2.98])), [5.0, -2.0], rtol=1e-3)
+    np.testing.assert_allclose(
+        running_normalize(statistics, jnp.array([3.05, 2.98])), [5.0, -2.0], rtol=1e-3
+    )
 
 
 def test_metrics_of_episodes_are_missing_without_any() -> None:
-    """Zero in compiled code, where `jax_debug_nans` looks for NaN, and NaN in the row of metrics.csv."""
+    """Zero in compiled code, where `jax_debug_nans` looks for NaN, and NaN in the row of
+    metrics.csv.
+    """
     none = jnp.zeros(3, bool)
     ended = _sums({"success": jnp.zeros(3), "episodes": none})
     found = _means(_sums({"pace": jnp.arange(3.0), "diverged": jnp.ones(3)}), ended, 3)
@@ -257,32 +340,62 @@ def test_metrics_of_episodes_are_missing_without_any() -> None:
 def test_a_league_without_games_has_metrics_and_no_change() -> None:
     env: Any = object.__new__(league.League)
     env._roster = league.Roster(("older", "scripted"))
-    start, none = pool.new_pool({"x": jnp.zeros(1)}, 2), jnp.zeros(2, jnp.int32)
-    state = league.LeagueState(start, none, none, jnp.float32(100.0), jnp.int32(0), jnp.zeros((2, 3)), KEY)
+    start = pool.new_pool({"x": jnp.zeros(1)}, 2)
+    none = jnp.zeros(2, jnp.int32)
+    state = league.LeagueState(
+        start, none, none, jnp.float32(100.0), jnp.int32(0), jnp.zeros((2, 3)), KEY
+    )
     after = env._record(state, [SimpleNamespace(outcomes=jnp.zeros(3, jnp.int32))] * 2)
     jax.tree.map(np.testing.assert_array_equal, after, state)
     assert {float(x) for name, x in env._metrics(after).items() if name.count("/") == 2} == {0.0}
 
 
 def test_points_that_coincide_give_finite_numbers() -> None:
-    place, still = jnp.array([[1.0, 1.0], [1.0, 1.0]]), jnp.zeros((2, 2))
-    law = lambda robots: flock(KEY, place, still, robots, restlessness=0.1, step=0.02)  # noqa: E731
+    place = jnp.array([[1.0, 1.0], [1.0, 1.0]])
+    still = jnp.zeros((2, 2))
+
+    def law(robots):
+        return flock(KEY, place, still, robots, restlessness=0.1, step=0.02)
+
     assert np.all(np.isfinite(law(jnp.ones((1, 2))))) and np.all(np.isfinite(slow_down(still, 0.1)))
     # Nearer than 0.032 m a robot repels as there.
-    push = flock(KEY, place[:1], still[:1], jnp.array([[0.99, 1.0]]), restlessness=0.0, step=0.02, friction=0.0)
+    push = flock(
+        KEY,
+        place[:1],
+        still[:1],
+        jnp.array([[0.99, 1.0]]),
+        restlessness=0.0,
+        step=0.02,
+        friction=0.0,
+    )
     np.testing.assert_allclose(push, [[2.0, 0.0]])
-    close = flock(KEY, place[:1], still[:1], jnp.array([[0.9999, 1.0]]), restlessness=0.0, step=0.02, friction=0.0)
+    close = flock(
+        KEY,
+        place[:1],
+        still[:1],
+        jnp.array([[0.9999, 1.0]]),
+        restlessness=0.0,
+        step=0.02,
+        friction=0.0,
+    )
     np.testing.assert_allclose(close, [[0.2 * 1e-4 / 1e-3**1.4, 0.0]], rtol=1e-2)
     goal = jnp.array([12.0, 0.0])
     assert np.all(np.isfinite(defend(goal, jnp.float32(0.0), goal, goal)))
     assert float(crowding(jnp.zeros((2, 2)), jnp.ones(2, bool))) == pytest.approx(200.0)
     optimizer = adam(max_grad_norm=1.0)
-    params, _, norm = optimizer.update({"x": jnp.zeros(2)}, optimizer.init({"x": jnp.ones(2)}), {"x": jnp.ones(2)}, 0.1)
+    params, _, norm = optimizer.update(
+        {"x": jnp.zeros(2)}, optimizer.init({"x": jnp.ones(2)}), {"x": jnp.ones(2)}, 0.1
+    )
     assert float(norm) == 0.0 and params["x"].tolist() == [1.0, 1.0]
 
 
 def test_rewards_that_are_always_zero_leave_everything_finite() -> None:
     config = settings(ppo={"epochs": 1, "minibatches": 2}, network__recurrent=False)
-    (_, state), (metrics,) = updated(Probe(probes.show_hidden, lambda hidden, action: 0.0 * hidden, 4), config, 1)
-    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state.params)) and float(metrics["value_mean"]) == 0.0
+    (_, state), (metrics,) = updated(
+        Probe(probes.show_hidden, lambda hidden, action: 0.0 * hidden, 4), config, 1
+    )
+    assert (
+        all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state.params))
+        and float(metrics["value_mean"]) == 0.0
+    )
     assert np.isfinite(float(metrics["explained_variance"]))

@@ -1,4 +1,6 @@
-"""One update of the learner against a plain implementation: loops over steps, agents and samples."""
+"""One update of the learner against a plain implementation: loops over steps, agents and
+samples.
+"""
 
 import dataclasses
 import math
@@ -21,7 +23,11 @@ from mqe_jax.train.rollout import ObservationNormalizer
 from tests import training as probes
 from tests.training import Probe
 
-T, N, A, F, D = 6, 4, 2, 3, 2
+T = 6
+N = 4
+A = 2
+F = 3
+D = 2
 """Steps, environments, agents, features and action size."""
 
 
@@ -29,9 +35,21 @@ COMMON: dict[str, Any] = {
     "num_envs": N,
     "rollout_steps": T,
     "total_steps": 10 * T * N,
-    "ppo": {"epochs": 2, "minibatches": 2, "gamma": 0.9, "gae_lambda": 0.8, "clip": 0.1, "value_coef": 0.7},
+    "ppo": {
+        "epochs": 2,
+        "minibatches": 2,
+        "gamma": 0.9,
+        "gae_lambda": 0.8,
+        "clip": 0.1,
+        "value_coef": 0.7,
+    },
     "optimizer": {"learning_rate": 0.004, "max_grad_norm": 0.5, "eps": 1e-3},
-    "network": {"hidden_sizes": (5,), "activation": "tanh", "recurrent": False, "log_std_init": -0.5},
+    "network": {
+        "hidden_sizes": (5,),
+        "activation": "tanh",
+        "recurrent": False,
+        "log_std_init": -0.5,
+    },
 }
 
 
@@ -44,10 +62,21 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
     "joint": {
         "ppo": {
-            **{"ratio": "joint", "value": "joint", "dual_clip": 1.2, "value_clip": None, "huber_delta": None},
+            **{
+                "ratio": "joint",
+                "value": "joint",
+                "dual_clip": 1.2,
+                "value_clip": None,
+                "huber_delta": None,
+            },
             **{"entropy_coef": 0.1, "entropy_coef_final": 0.02},
         },
-        "network": {"critic_input": "observations", "recurrent": True, "gru_size": 4, "chunk_length": 2},
+        "network": {
+            "critic_input": "observations",
+            "recurrent": True,
+            "gru_size": 4,
+            "chunk_length": 2,
+        },
         "optimizer": {"schedule": "linear", "target_kl": 100.0},
         "normalization": {"observations": True, "advantages": False},
         "curriculum": {"failure_bootstrap": 0.6},
@@ -76,18 +105,24 @@ def config_of(name: str) -> TrainConfig:
 
 
 def learner_of(env: Any, config: TrainConfig) -> learning.Learner:
-    return learning.make_learner(env, config, teacher=Teacher() if config.imitation.teacher else None)
+    return learning.make_learner(
+        env, config, teacher=Teacher() if config.imitation.teacher else None
+    )
 
 
 def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tuple[Any, Transition]:
-    """A state after some updates, whose statistics are not trivial, and a rollout of random numbers."""
+    """A state after some updates, whose statistics are not trivial, and a rollout of random
+    numbers.
+    """
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
     env = dataclasses.replace(env, show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
     normal: Any = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
     shapes = jax.eval_shape(learner_of(env, config).init, jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     size = env.observation_size, env.privileged_observation_size
-    statistics = [RunningStatistics(0.3 * normal(n), normal(n) ** 2, jnp.float32(30.0)) for n in size]
+    statistics = [
+        RunningStatistics(0.3 * normal(n), normal(n) ** 2, jnp.float32(30.0)) for n in size
+    ]
     state = dataclasses.replace(
         state,
         params=jax.tree.map(lambda x: 0.5 * normal(*x.shape), state.params),
@@ -105,7 +140,8 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
     )
     done: Any = random.random((T, N)) < 0.4
     network = config.network.build(needs_of(env, config).dims)
-    memory, length = network.initial_memory(N), network.chunk_length
+    memory = network.initial_memory(N)
+    length = network.chunk_length
     first: Any = random.random((T, N)) < 0.3
     first[::length] = False  # the state of memory before a first step is zero in a rollout
     transitions = Transition(
@@ -124,7 +160,9 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         done=done,
     )
     if config.imitation.teacher:
-        transitions = transitions._replace(teacher_action=Teacher().act(transitions.obs, (), None)[0])
+        transitions = transitions._replace(
+            teacher_action=Teacher().act(transitions.obs, (), None)[0]
+        )
     state, transitions = jax.tree.map(jnp.asarray, (state, transitions))
     return (env, state), transitions
 
@@ -133,7 +171,9 @@ class Plain:
     """The update of `mqe_jax.train.learner` for one hidden layer, sample by sample."""
 
     def __init__(self, config: TrainConfig, state: Any, data: Transition) -> None:
-        self.config, self.state, self.data = config, state, data
+        self.config = config
+        self.state = state
+        self.data = data
         self.network: Any = config.network
         self.progress = float(state.updates) / config.num_updates
 
@@ -159,11 +199,15 @@ class Plain:
         return mean, params["log_std"] if share else params["log_std"][agent], memory
 
     def value(self, params: Any, memory: Any, obs: Any, privileged: Any) -> tuple[Any, Any]:
-        """Values (V,) from the observations (A, O) of one environment, and the next recurrent states."""
+        """Values (V,) from the observations (A, O) of one environment, and the next recurrent
+        states.
+        """
         if self.network.critic_input == "own":
             return jnp.stack([self.trunk(params["critic"], None, one)[0][0] for one in obs]), None
         x = privileged if self.network.critic_input == "privileged" else obs.ravel()
-        value, memory = self.trunk(params["critic"], memory[0] if self.network.recurrent else None, x)
+        value, memory = self.trunk(
+            params["critic"], memory[0] if self.network.recurrent else None, x
+        )
         return value, None if memory is None else memory[None]
 
     def value_scale(self, statistics: ValueStatistics) -> tuple[float, float]:
@@ -174,11 +218,13 @@ class Plain:
 
     def prepare(self) -> None:
         """Observations as seen, old values, advantages, targets and the new statistics."""
-        config, state, data = self.config, self.state, self.data
-        self.obs, self.final = (self.view(state.obs_normalizer.obs, x) for x in (data.obs, data.final_obs))
-        own, last = (
-            self.view(state.obs_normalizer.privileged, x) for x in (data.privileged_obs, data.final_privileged_obs)
-        )
+        config = self.config
+        state = self.state
+        data = self.data
+        self.obs = self.view(state.obs_normalizer.obs, data.obs)
+        self.final = self.view(state.obs_normalizer.obs, data.final_obs)
+        own = self.view(state.obs_normalizer.privileged, data.privileged_obs)
+        last = self.view(state.obs_normalizer.privileged, data.final_privileged_obs)
         self.privileged = own
         joint = config.ppo.value == "joint"
         width = 1 if joint else A
@@ -190,7 +236,8 @@ class Plain:
                 self.old[t, n], memory = value_of(state.params, memory, self.obs[t, n], own[t, n])
                 after[t, n], _ = value_of(state.params, memory, self.final[t, n], last[t, n])
         mean, deviation = self.value_scale(state.value_normalizer)
-        value, after = mean + deviation * self.old, mean + deviation * after
+        value = mean + deviation * self.old
+        after = mean + deviation * after
         reward = np.asarray(data.reward, float)
         reward = reward.mean(-1, keepdims=True) if joint else reward
         kept = config.curriculum.failure_bootstrap * max(1.0 - self.progress / 0.5, 0.0)
@@ -200,25 +247,34 @@ class Plain:
             for t in reversed(range(T)):
                 bootstrap = kept if data.terminated[t, n] else 1.0
                 delta = reward[t, n] + config.ppo.gamma * bootstrap * after[t, n] - value[t, n]
-                trace = delta + (0.0 if data.done[t, n] else config.ppo.gamma * config.ppo.gae_lambda * trace)
+                trace = delta + (
+                    0.0 if data.done[t, n] else config.ppo.gamma * config.ppo.gae_lambda * trace
+                )
                 advantage[t, n] = trace
         target = advantage + value
-        self.metrics = {"value_mean": value.mean(), "explained_variance": 1 - (target - value).var() / target.var()}
+        self.metrics = {
+            "value_mean": value.mean(),
+            "explained_variance": 1 - (target - value).var() / target.var(),
+        }
         self.statistics = state.value_normalizer
         if config.normalization.values:
             decay = config.normalization.value_decay
             new = (target.mean(), (target**2).mean(), 1.0)
             pairs = zip(state.value_normalizer, new, strict=True)
-            self.statistics = ValueStatistics(*(jnp.float32(decay * x + (1 - decay) * y) for x, y in pairs))
+            self.statistics = ValueStatistics(
+                *(jnp.float32(decay * x + (1 - decay) * y) for x, y in pairs)
+            )
         if config.normalization.advantages:
             advantage = (advantage - advantage.mean()) / advantage.std()
         mean, deviation = self.value_scale(self.statistics)
-        self.advantage, self.target = advantage, (target - mean) / deviation
+        self.advantage = advantage
+        self.target = (target - mean) / deviation
 
     def loss(self, params: Any, chunks: np.ndarray) -> tuple[Any, dict[str, Any]]:
         """The loss of chunks, rows of (first step, environment), and its parts."""
         parts = jax.vmap(lambda chunk: self.parts(params, *chunk))(jnp.asarray(chunks))
-        mean, ppo = {name: jnp.mean(values) for name, values in parts.items()}, self.config.ppo
+        mean = {name: jnp.mean(values) for name, values in parts.items()}
+        ppo = self.config.ppo
         actor = 0.0 if self.progress < ppo.critic_warmup else 1.0
         taught = self.config.imitation.weight * (1.0 - self.progress / self.config.imitation.until)
         coefficient = ppo.entropy_coef
@@ -229,24 +285,37 @@ class Plain:
 
     def parts(self, params: Any, start: Any, n: Any) -> dict[str, Any]:
         """The parts of the loss of one chunk, each in a list over its steps and agents."""
-        ppo, data = self.config.ppo, self.data
-        rows: dict[str, list[Any]] = {name: [] for name in ("policy", "value", "entropy", "kl", "clipped")}
+        ppo = self.config.ppo
+        data = self.data
+        rows: dict[str, list[Any]] = {
+            name: [] for name in ("policy", "value", "entropy", "kl", "clipped")
+        }
         length = self.network.chunk_length if self.network.recurrent else 1
         actors: Any = jax.tree.map(lambda x: x[start, n], data.memory.actor)
         critics: Any = jax.tree.map(lambda x: x[start, n], data.memory.critic)
-        advantage, targets, olds = (jnp.asarray(x, jnp.float32) for x in (self.advantage, self.target, self.old))
+        advantage = jnp.asarray(self.advantage, jnp.float32)
+        targets = jnp.asarray(self.target, jnp.float32)
+        olds = jnp.asarray(self.old, jnp.float32)
         for t in [start + step for step in range(length)]:
             if self.network.recurrent:
-                actors, critics = (jnp.where(data.is_first[t, n], 0.0, x) for x in (actors, critics))
-            change, next_actors = [], []
+                actors = jnp.where(data.is_first[t, n], 0.0, actors)
+                critics = jnp.where(data.is_first[t, n], 0.0, critics)
+            change = []
+            next_actors = []
             for agent in range(A):
                 memory = actors[agent] if self.network.recurrent else None
                 mean, log_std, memory = self.mean(params, agent, memory, self.obs[t, n, agent])
                 next_actors.append(memory)
-                density = -0.5 * ((data.action[t, n, agent] - mean) / jnp.exp(log_std)) ** 2 - log_std
+                density = (
+                    -0.5 * ((data.action[t, n, agent] - mean) / jnp.exp(log_std)) ** 2 - log_std
+                )
                 if self.config.imitation.teacher:
                     apart = jnp.sin(data.obs[t, n, agent, -2:]) / self.config.action_scale - mean
-                    density_there = -0.5 * (apart / jnp.exp(log_std)) ** 2 - log_std - 0.5 * math.log(2 * math.pi)
+                    density_there = (
+                        -0.5 * (apart / jnp.exp(log_std)) ** 2
+                        - log_std
+                        - 0.5 * math.log(2 * math.pi)
+                    )
                     rows.setdefault("imitation", []).append(-jnp.sum(density_there))
                 change.append(density - 0.5 * math.log(2 * math.pi) - data.log_prob[t, n, agent])
                 rows["entropy"].append(jnp.sum(log_std) + D * 0.5 * math.log(2 * math.pi * math.e))
@@ -259,19 +328,26 @@ class Plain:
             elif ppo.ratio == "joint":
                 logs = [[jnp.sum(jnp.stack(change))]]
             for agent, row in enumerate(logs):
-                weight, losses = advantage[t, n, min(agent, len(value) - 1)], []
+                weight = advantage[t, n, min(agent, len(value) - 1)]
+                losses = []
                 for log in row:
                     ratio = jnp.exp(log)
-                    gain = jnp.minimum(ratio * weight, jnp.clip(ratio, 1 - ppo.clip, 1 + ppo.clip) * weight)
+                    gain = jnp.minimum(
+                        ratio * weight, jnp.clip(ratio, 1 - ppo.clip, 1 + ppo.clip) * weight
+                    )
                     if ppo.dual_clip:
-                        gain = jnp.where(weight < 0, jnp.maximum(gain, ppo.dual_clip * weight), gain)
+                        gain = jnp.where(
+                            weight < 0, jnp.maximum(gain, ppo.dual_clip * weight), gain
+                        )
                     losses.append(-gain)
                     rows["clipped"].append(jnp.abs(ratio - 1) > ppo.clip)
                 rows["policy"].append(sum(losses))
             for v in range(len(value)):
                 loss = self.error(value[v] - targets[t, n, v])
                 if ppo.value_clip is not None:
-                    near = jnp.clip(value[v], olds[t, n, v] - ppo.value_clip, olds[t, n, v] + ppo.value_clip)
+                    near = jnp.clip(
+                        value[v], olds[t, n, v] - ppo.value_clip, olds[t, n, v] + ppo.value_clip
+                    )
                     loss = jnp.maximum(loss, self.error(near - targets[t, n, v]))
                 rows["value"].append(loss)
         return {name: jnp.stack(values) for name, values in rows.items()}
@@ -283,13 +359,17 @@ class Plain:
         return jnp.where(jnp.abs(x) < delta, 0.5 * x**2, delta * jnp.abs(x) - 0.5 * delta**2)
 
     def learn(self, minibatches: np.ndarray) -> tuple[Any, float, list[Any], float]:
-        optimizer, state = self.config.optimizer, self.state
-        params, moments, count = state.params, [state.optimizer.mean, state.optimizer.square], 3
+        optimizer = self.config.optimizer
+        state = self.state
+        params = state.params
+        moments = [state.optimizer.mean, state.optimizer.square]
+        count = 3
         factor = 1.0
         if optimizer.schedule == "linear":
             factor = min((1.0 - self.progress) / optimizer.anneal, 1.0)
         warm = self.progress < self.config.ppo.critic_warmup
-        rate, seen = float(state.learning_rate), []
+        rate = float(state.learning_rate)
+        seen = []
         gradient_of = jax.jit(jax.grad(self.loss, has_aux=True))
         for _ in range(self.config.ppo.epochs):
             for minibatch in minibatches:
@@ -298,7 +378,8 @@ class Plain:
                 if optimizer.max_grad_norm is not None and norm > optimizer.max_grad_norm:
                     gradient = jax.tree.map(lambda x: x * optimizer.max_grad_norm / norm, gradient)  # noqa: B023
                 if optimizer.target_kl is not None:
-                    kl, change = float(parts["kl"]), 1.0
+                    kl = float(parts["kl"])
+                    change = 1.0
                     if kl > 2 * optimizer.target_kl:
                         change = 1 / 1.5
                     elif kl < optimizer.target_kl / 2 and factor == 1.0 and not warm:
@@ -306,22 +387,33 @@ class Plain:
                     rate = min(max(rate * change, 1e-5), 1e-2)
                 count += 1
                 moments[0] = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, moments[0], gradient)
-                moments[1] = jax.tree.map(lambda s, g: 0.999 * s + 0.001 * g**2, moments[1], gradient)
+                moments[1] = jax.tree.map(
+                    lambda s, g: 0.999 * s + 0.001 * g**2, moments[1], gradient
+                )
                 mean = jax.tree.map(lambda m: m / (1 - 0.9**count), moments[0])  # noqa: B023
                 square = jax.tree.map(lambda s: s / (1 - 0.999**count), moments[1])  # noqa: B023
-                move = lambda p, m, s: p - rate * factor * m / (np.sqrt(s) + optimizer.eps)  # noqa: B023, E731
+
+                def move(p, m, s, rate=rate):
+                    return p - rate * factor * m / (np.sqrt(s) + optimizer.eps)
+
                 params = jax.tree.map(move, params, mean, square)
                 seen.append({**parts, "norm": norm})
         self.metrics |= {name: float(np.mean([row[name] for row in seen])) for name in seen[0]}
         return params, rate, moments, factor
 
 
-@pytest.mark.parametrize(("name", "updates"), [(name, 3 if name == "joint" else 1) for name in SETTINGS])
-def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "updates"), [(name, 3 if name == "joint" else 1) for name in SETTINGS]
+)
+def test_an_update_is_that_of_a_plain_implementation(
+    name: str, updates: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = config_of(name)
     random = np.random.default_rng(5)
     (env, state), data = drawn(random, config, updates)
-    monkeypatch.setattr(learning, "rollout", lambda *_, **__: (state.rollout, data, {"ended": {"episodes": 0.0}}))
+    monkeypatch.setattr(
+        learning, "rollout", lambda *_, **__: (state.rollout, data, {"ended": {"episodes": 0.0}})
+    )
     length = config.network.build(needs_of(env, config).dims).chunk_length
     order = random.permutation(T // length * N).reshape(2, -1)
     monkeypatch.setattr(stages, "minibatches", lambda *_: jnp.asarray(order))
@@ -329,26 +421,43 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
 
     plain = Plain(config, state, data)
     plain.prepare()
-    params, rate, moments, factor = plain.learn(np.stack([length * (order // N), order % N], axis=-1))
-    names = {"policy": "loss/policy", "value": "loss/value", "kl": "approx_kl", "clipped": "clip_fraction"}
+    params, rate, moments, factor = plain.learn(
+        np.stack([length * (order // N), order % N], axis=-1)
+    )
+    names = {
+        "policy": "loss/policy",
+        "value": "loss/value",
+        "kl": "approx_kl",
+        "clipped": "clip_fraction",
+    }
     names |= {"norm": "grad_norm", "imitation": "loss/imitation"}
     for key, value in plain.metrics.items():
-        np.testing.assert_allclose(metrics[names.get(key, key)], value, rtol=2e-3, atol=1e-4, err_msg=key)
-    close = lambda x, y: np.testing.assert_allclose(x, y, rtol=2e-3, atol=2e-4)  # noqa: E731
+        np.testing.assert_allclose(
+            metrics[names.get(key, key)], value, rtol=2e-3, atol=1e-4, err_msg=key
+        )
+
+    def close(x, y):
+        return np.testing.assert_allclose(x, y, rtol=2e-3, atol=2e-4)
+
     jax.tree.map(close, (after.optimizer.mean, after.optimizer.square), tuple(moments))
     jax.tree.map(close, after.params, params)
     assert float(after.learning_rate) == pytest.approx(rate, rel=1e-4)
     assert float(metrics["learning_rate"]) == pytest.approx(rate * factor, rel=1e-4)
     jax.tree.map(close, after.value_normalizer, plain.statistics)
     for part in ("obs", "privileged"):
-        old, new = getattr(state.obs_normalizer, part), getattr(after.obs_normalizer, part)
+        old = getattr(state.obs_normalizer, part)
+        new = getattr(after.obs_normalizer, part)
         if not config.normalization.observations:
             jax.tree.map(np.testing.assert_array_equal, old, new)
             continue
-        rows = np.asarray(data.obs if part == "obs" else data.privileged_obs).reshape(-1, len(old.mean))
+        rows = np.asarray(data.obs if part == "obs" else data.privileged_obs).reshape(
+            -1, len(old.mean)
+        )
         weight = 30 / (30 + len(rows))
         mean = weight * np.asarray(old.mean) + (1 - weight) * rows.mean(0)
-        square = weight * (np.asarray(old.variance) + np.asarray(old.mean) ** 2) + (1 - weight) * (rows**2).mean(0)
+        square = weight * (np.asarray(old.variance) + np.asarray(old.mean) ** 2) + (1 - weight) * (
+            rows**2
+        ).mean(0)
         close(new.mean, mean)
         close(new.variance, square - mean**2)
         assert float(new.samples) == 30 + len(rows)
@@ -356,7 +465,12 @@ def test_an_update_is_that_of_a_plain_implementation(name: str, updates: int, mo
 
 
 def test_the_learning_rate_follows_the_kl_divergence_within_its_bounds() -> None:
-    rows = ((0.0201, 1e-3, 1e-3 / 1.5), (0.0199, 1e-3, 1e-3), (0.0051, 1e-3, 1e-3), (0.0049, 1e-3, 1.5e-3))
+    rows = (
+        (0.0201, 1e-3, 1e-3 / 1.5),
+        (0.0199, 1e-3, 1e-3),
+        (0.0051, 1e-3, 1e-3),
+        (0.0049, 1e-3, 1.5e-3),
+    )
     for kl, before, after in (*rows, (1.0, 1.2e-5, 1e-5), (0.0, 9e-3, 1e-2)):
         rate = stages._adapt(jnp.float32(before), jnp.float32(kl), 0.01)
         assert float(rate) == pytest.approx(after), (kl, before)

@@ -1,4 +1,6 @@
-"""Pages of `mqe play-site`: graphs of tasks in onnxruntime, the page's code in Node, and the page in a browser."""
+"""Pages of `mqe play-site`: graphs of tasks in onnxruntime, the page's code in Node, and the page
+in a browser.
+"""
 
 import contextlib
 import dataclasses
@@ -60,34 +62,55 @@ def built(tmp_path_factory: Any) -> SimpleNamespace:
 
 
 def fall_at_the_end(env: Any, steps: int, state: Any, step: int) -> Any:
-    """Sets the clock so that the time limit is reached 5 steps before the end, and turns a robot over for the last."""
+    """Sets the clock so that the time limit is reached 5 steps before the end, and turns a robot
+    over for the last.
+    """
     if step == 0:
         return dataclasses.replace(state, step=jnp.int32(env.max_steps - steps + 5))
     if step == steps - 1:
-        upside_down = state.data.qpos.at[env.index.base_qpos[0, 3:]].set(jnp.array([0.0, 1.0, 0.0, 0.0]))
+        upside_down = state.data.qpos.at[env.index.base_qpos[0, 3:]].set(
+            jnp.array([0.0, 1.0, 0.0, 0.0])
+        )
         return dataclasses.replace(state, data=state.data.replace(qpos=upside_down))
     return state
 
 
 def check_graphs(built: SimpleNamespace, steps: int) -> set[str]:
-    """Compares the written graphs with an episode of the environment; returns what was seen of how it ended."""
-    env, settings = built.env, built.settings
-    seen = play_agreement.record(built.entry, steps, change=functools.partial(fall_at_the_end, env, steps))
-    rows = [{name: np.asarray(x) for name, x in state_arrays(state).items()} for state in seen["states"]]
-    batch = lambda rows: {name: np.stack([row[name] for row in rows]) for name in rows[0]}  # noqa: E731
-    now, after = batch(rows[:-1]), batch(rows[1:])
+    """Compares the written graphs with an episode of the environment; returns what was seen of how
+    it ended.
+    """
+    env = built.env
+    settings = built.settings
+    seen = play_agreement.record(
+        built.entry, steps, change=functools.partial(fall_at_the_end, env, steps)
+    )
+    rows = [
+        {name: np.asarray(x) for name, x in state_arrays(state).items()} for state in seen["states"]
+    ]
+
+    def batch(rows):
+        return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+    now = batch(rows[:-1])
+    after = batch(rows[1:])
 
     load = functools.cache(lambda file: onnxruntime.InferenceSession(file.read_bytes()))
 
     def run(file: Path, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         session = load(file)
         names = [output.name for output in session.get_outputs()]
-        given = {entry.name: inputs[entry.name].astype(np.float32) for entry in session.get_inputs()}
+        given = {
+            entry.name: inputs[entry.name].astype(np.float32) for entry in session.get_inputs()
+        }
         return dict(zip(names, session.run(names, given), strict=True))
 
-    actions, agents = np.stack(seen["actions"]), env.num_agents
+    actions = np.stack(seen["actions"])
+    agents = env.num_agents
     idle = {"drive": np.full_like(actions, 0.7), "driven": np.zeros((steps, agents))}
-    asked = run(built.own / "control.onnx", {**now, "action": actions, "noise": np.stack(seen["noise"]), **idle})
+    asked = run(
+        built.own / "control.onnx",
+        {**now, "action": actions, "noise": np.stack(seen["noise"]), **idle},
+    )
     shapes = settings["skill"]["inputs"]
     memory = {name: np.zeros((env.index.num_robots, *shape[1:])) for name, shape in shapes.items()}
     for step in range(steps - 1):  # then a robot is turned over
@@ -96,8 +119,11 @@ def check_graphs(built: SimpleNamespace, steps: int) -> set[str]:
         memory = {name: skilled.get(f"next_{name}", memory[name]) for name in memory}
         target = np.asarray(seen["states"][step + 1].data.ctrl)[env.index.actuator]
         np.testing.assert_allclose(skilled["joint_target"], target, atol=2e-4)
-    verdict = run(built.own / "judge.onnx", {**after, **{f"before_{name}": now[name] for name in PHYSICS}})
-    kept = np.delete(np.arange(steps), steps - 2)  # without the state in which the robot is turned over
+    verdict = run(
+        built.own / "judge.onnx", {**after, **{f"before_{name}": now[name] for name in PHYSICS}}
+    )
+    # without the state in which the robot is turned over
+    kept = np.delete(np.arange(steps), steps - 2)
     wanted = [seen["states"][1 + row] for row in kept]
     verdict = {name: x[kept] for name, x in verdict.items()}
     metrics = [[state.outcome.by_name()[name] for name in settings["outcomes"]] for state in wanted]
@@ -126,8 +152,14 @@ def test_graphs_of_every_task_agree_in_a_long_episode(task: str, tmp_path: Path)
 def test_a_driven_robot_gets_the_readers_action_in_its_own_frame(built: SimpleNamespace) -> None:
     functions = TaskFunctions(built.env)
     state = state_arrays(jax.jit(built.env.reset)(jax.random.PRNGKey(1)))
-    drive, action = jnp.array([[0.5, 0.5, 0.5, 1.0], [0.1, 0.2, 0.3, 1.0]]), -jnp.ones((2, 4))
-    given = {"action": action, "drive": drive, "driven": jnp.array([0.0, 1.0]), "noise": jnp.zeros(2)}
+    drive = jnp.array([[0.5, 0.5, 0.5, 1.0], [0.1, 0.2, 0.3, 1.0]])
+    action = -jnp.ones((2, 4))
+    given = {
+        "action": action,
+        "drive": drive,
+        "driven": jnp.array([0.0, 1.0]),
+        "noise": jnp.zeros(2),
+    }
     command = jax.jit(functions.control)({**state, **given})["command"]
     expected = built.env.controller.skill_commands(jnp.stack([action[0], drive[1]]))
     np.testing.assert_allclose(command, expected)
@@ -136,7 +168,8 @@ def test_a_driven_robot_gets_the_readers_action_in_its_own_frame(built: SimpleNa
 
 
 def test_initial_states_are_restored_from_the_columns_that_vary(built: SimpleNamespace) -> None:
-    layout, states = built.settings["starts"], start_states(built.env)
+    layout = built.settings["starts"]
+    states = start_states(built.env)
     columns = np.fromfile(built.own / "starts.bin", np.float32).reshape(STARTS, -1)
     rows = np.tile(np.array(layout["constant"], np.float32), (STARTS, 1))
     assert columns.size < 0.6 * rows.size
@@ -150,15 +183,24 @@ def test_initial_states_are_restored_from_the_columns_that_vary(built: SimpleNam
 def test_the_written_scene_is_the_tasks_physics(built: SimpleNamespace) -> None:
     import mujoco
 
-    env, ours = built.env, built.env.compiled.model
+    env = built.env
+    ours = built.env.compiled.model
     model = mujoco.MjModel.from_xml_string(scene_xml(env))
-    assert (model.nq, model.nv, model.nu, model.nsensordata) == (ours.nq, ours.nv, ours.nu, ours.nsensordata)
+    assert (model.nq, model.nv, model.nu, model.nsensordata) == (
+        ours.nq,
+        ours.nv,
+        ours.nu,
+        ours.nsensordata,
+    )
     assert model.ngeom > ours.ngeom  # with visual geoms
     for number, robot in enumerate(built.settings["robots"]):
         assert model.joint(f"robot{number}/base").qposadr[0] == robot["base_qpos"][0]
         assert model.actuator(f"robot{number}/RR_calf").id == robot["actuator"][11]
-    state, data = jax.jit(env.reset)(jax.random.PRNGKey(0)), mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.ctrl[:] = state.data.qpos, state.data.qvel, state.data.ctrl
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    data = mujoco.MjData(model)
+    data.qpos[:] = state.data.qpos
+    data.qvel[:] = state.data.qvel
+    data.ctrl[:] = state.data.ctrl
     data.mocap_pos[:] = state.data.mocap_pos
     after = state.data
     for _ in range(10):
@@ -175,8 +217,11 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     shutil.copy(zoo.file_of("go1wrestling"), run)
     (entry,) = entries(["go1wrestling", str(run)])
     assert (entry.name, list(entry.policies)) == ("go1wrestling", ["shipped", "mine", "scripted"])
-    (entry,) = entries(["go1wrestling", str(population.resolve("population/1/late", "go1wrestling"))])
-    assert list(entry.policies) == ["shipped", "1-go1wrestling-late", "scripted"]  # they meet, each with its own skill
+    (entry,) = entries(
+        ["go1wrestling", str(population.resolve("population/1/late", "go1wrestling"))]
+    )
+    # they meet, each with its own skill
+    assert list(entry.policies) == ["shipped", "1-go1wrestling-late", "scripted"]
     policy = zoo.heaviest("go1wrestling")
     env = {"ring_radius": 1.5, "randomization.push": 1.0, "randomization.friction": [0.5, 1.0]}
     config = dataclasses.replace(policy.config, env=env)
@@ -193,14 +238,23 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
 
 def test_tasks_of_other_sizes_are_played_by_their_scripted_policies() -> None:
     found = entries(["go1football-1vs1", *LARGER])
-    assert [entry.name for entry in found] == ["go1football-1vs1", "go1football-1vs1-2", "go1sheep-hard"]
+    assert [entry.name for entry in found] == [
+        "go1football-1vs1",
+        "go1football-1vs1-2",
+        "go1sheep-hard",
+    ]
     assert [list(entry.policies) for entry in found[1:]] == [["scripted"]] * 2
     assert titles([*found, found[1]]) == [
-        "Football (1 vs 1)", "Football (5 vs 5)", "Sheep Dog (Hard), 4 robots, 30 sheep", "Football (5 vs 5) 2",
-    ]  # fmt: skip
+        "Football (1 vs 1)",
+        "Football (5 vs 5)",
+        "Sheep Dog (Hard), 4 robots, 30 sheep",
+        "Football (5 vs 5) 2",
+    ]
 
 
-def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
+def test_libraries_of_other_content_are_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     folder = tmp_path / "mqe_jax" / "play"
     folder.mkdir(parents=True)
@@ -208,7 +262,10 @@ def test_libraries_of_other_content_are_refused(monkeypatch: pytest.MonkeyPatch,
     refuses(r"@mujoco/mujoco@3.14.0.*SHA-256", libraries.add_libraries, tmp_path / "lib")
     monkeypatch.setenv("PATH", str(tmp_path))
     refuses("npm is not installed", libraries.add_libraries, tmp_path / "lib")
-    assert cli.main(["play-site", "go1gate", "-o", str(tmp_path / "o"), "--libraries", str(tmp_path)]) == 2
+    assert (
+        cli.main(["play-site", "go1gate", "-o", str(tmp_path / "o"), "--libraries", str(tmp_path)])
+        == 2
+    )
     assert "has no mujoco.js" in capsys.readouterr().err
 
 
@@ -226,7 +283,9 @@ def page(built: SimpleNamespace) -> Path:
     return built.folder
 
 
-def test_the_page_in_webassembly_agrees_with_the_environment(page: Path, built: SimpleNamespace) -> None:
+def test_the_page_in_webassembly_agrees_with_the_environment(
+    page: Path, built: SimpleNamespace
+) -> None:
     if shutil.which("node") is None:
         pytest.skip("no Node here (tools/install.sh npm installs Debian's)")
     report = play_agreement.measure(page, built.entry, count=1, episodes=0)
@@ -237,18 +296,28 @@ def test_the_page_in_webassembly_agrees_with_the_environment(page: Path, built: 
 
 
 @contextlib.contextmanager
-def opened(folder: Path, query: str, width: int = 1280, height: int = 800, *, touch: bool = False) -> Iterator[Any]:
-    """Serves a folder and opens its page in Chromium; asserts that nothing was reported to its console as an error."""
+def opened(
+    folder: Path, query: str, width: int = 1280, height: int = 800, *, touch: bool = False
+) -> Iterator[Any]:
+    """Serves a folder and opens its page in Chromium; asserts that nothing was reported to its
+    console as an error.
+    """
     quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(quiet, directory=str(folder)))
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(quiet, directory=str(folder))
+    )
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         with open_page(width, height, touch=touch) as tab:
             errors: list[str] = []
             tab.on("pageerror", lambda error: errors.append(str(error)))
-            tab.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+            tab.on(
+                "console", lambda said: errors.append(said.text) if said.type == "error" else None
+            )
             tab.goto(f"http://127.0.0.1:{server.server_port}/index.html?{query}")
-            tab.wait_for_function("document.body.dataset.rate || /Not loaded/.test(document.body.innerText)")
+            tab.wait_for_function(
+                "document.body.dataset.rate || /Not loaded/.test(document.body.innerText)"
+            )
             yield tab
             assert errors == []
     finally:
@@ -280,7 +349,10 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         tab.keyboard.down("w")
         tab.wait_for_function("document.querySelector('#drive').value === '0'")
         assert "drive=0" in tab.url and "seed=3" in tab.url and "team0=shipped" in tab.url
-        values = "import('./controls.js').then((own) => new own.Controls([], () => {}).values(['vx', 'skill']))"
+        values = (
+            "import('./controls.js').then((own) => new own.Controls([], () => "
+            "{}).values(['vx', 'skill']))"
+        )
         assert tab.evaluate(values) == [0, 1]  # of several skills, keys choose the last one
         photograph(tab, "driven")
         shown = tab.evaluate(f"Promise.all([-5, 0].map({SHOW_SCENE}))")
@@ -296,8 +368,13 @@ def test_a_phone_shows_what_to_do_and_its_button_and_pads_drive(page: Path) -> N
         assert tab.locator("#aim").inner_text() == "Drive the sheep through the gate."
         assert tab.locator(".who").all_inner_texts() == ["robot 1", "robot 2"]
         boxes = [tab.locator(name).bounding_box() for name in ("#bar", "#guide", "#walk")]
-        assert all(one["y"] + one["height"] <= other["y"] for one, other in itertools.pairwise(boxes))
-        assert tab.locator("#turn").is_visible() and tab.evaluate("document.documentElement.scrollWidth") == 390
+        assert all(
+            one["y"] + one["height"] <= other["y"] for one, other in itertools.pairwise(boxes)
+        )
+        assert (
+            tab.locator("#turn").is_visible()
+            and tab.evaluate("document.documentElement.scrollWidth") == 390
+        )
         for control in ("#take", "#walk"):
             tab.locator(control).tap()
             tab.wait_for_function("document.querySelector('.who').innerText === 'robot 1 (you)'")
@@ -306,7 +383,12 @@ def test_a_phone_shows_what_to_do_and_its_button_and_pads_drive(page: Path) -> N
             tab.locator("#take").tap()
             tab.wait_for_function("document.querySelector('#drive').value === ''")
         lost = "teams: [[0], [1]]}, outcome: {'team1/win': 1}, result: 'fall'"
-        step = f"Episode.prototype.step = function() {{ Object.assign(this, {{settings: {{...this.settings, {lost}}})}}"
+        step = (
+            f"Episode.prototype.step = function() {{ Object.assign(this, {{settings: "
+            f"{{...this.settings, {lost}}})}}"
+        )
         tab.locator("#take").tap()
         tab.evaluate(f"import('./episode.js').then(({{ Episode }}) => {{ {step} }})")
-        tab.wait_for_function("document.querySelector('#result').innerText === 'You lose (a robot fell)'")
+        tab.wait_for_function(
+            "document.querySelector('#result').innerText === 'You lose (a robot fell)'"
+        )

@@ -1,4 +1,6 @@
-"""Shipped and scripted policies, and skills: a new one is one class, for agents and NPC robots alike."""
+"""Shipped and scripted policies, and skills: a new one is one class, for agents and NPC robots
+alike.
+"""
 
 import dataclasses
 import json
@@ -33,7 +35,11 @@ from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 from tests.inputs import refuses
 
-MATCHES = [name for name in zoo.names() if TASKS[name]().num_agents > 1 and hasattr(TASKS[name], "symmetry")]
+MATCHES = [
+    name
+    for name in zoo.names()
+    if TASKS[name]().num_agents > 1 and hasattr(TASKS[name], "symmetry")
+]
 AGILE = [*MATCHES, "go1football-defender"]
 RANGES = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
 POSITION = {"control": "position", "position_scale": 2.0}
@@ -47,24 +53,34 @@ def test_every_task_but_the_plane_has_a_shipped_policy() -> None:
 @pytest.mark.parametrize("task", zoo.names())
 def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> None:
     env = make(task, impl="c", num_envs=1, **parameters_for(task, task))
-    policy, card = load_policy(task, env), zoo.card(task)
+    policy = load_policy(task, env)
+    card = zoo.card(task)
     assert isinstance(policy, TrainedPolicy) and policy.task == task
     assert policy.deterministic == (card.mode == "deterministic")
     assert zoo.file_of(task).stat().st_size <= 126_000
-    assert card.command.startswith((f"mqe train {task} ", "mqe sweep configs/zoo.yaml ")) and task in card.command
+    assert (
+        card.command.startswith((f"mqe train {task} ", "mqe sweep configs/zoo.yaml "))
+        and task in card.command
+    )
     wins = {"win/scripted", "loss/scripted", "win/idle", "win/random"}
     assert set(card.results) == (wins if task in MATCHES else {"success"})
     for found in card.results.values():
         assert found.episodes >= 512 and found.sides == ("both" if task in MATCHES else None)
         assert 0.0 <= found.rate.low <= found.value == found.rate.value <= found.rate.high <= 1.0
-    assert all(0.0 <= share <= 1.0 for share in card.endings.values()) and {*card.endings} == {*ENDINGS}
+    assert all(0.0 <= share <= 1.0 for share in card.endings.values()) and {*card.endings} == {
+        *ENDINGS
+    }
     assert sum(card.endings.values()) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_readme_and_the_list_have_the_rates_of_the_cards(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_readme_and_the_list_have_the_rates_of_the_cards(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\|.* `(go1[\w-]+)` \| ([^|]+) \|", readme, re.MULTILINE)
-    assert [row[0] for row in rows] == [task for task in TASKS if task in zoo.names()] and cli.main(["zoo"]) == 0
+    assert [row[0] for row in rows] == [task for task in TASKS if task in zoo.names()] and cli.main(
+        ["zoo"]
+    ) == 0
     lines = capfd.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     listed = {line.split()[0]: line for line in lines if line.startswith("go1")}
@@ -76,7 +92,9 @@ def test_the_readme_and_the_list_have_the_rates_of_the_cards(capfd: pytest.Captu
         assert cli.main(["zoo", *words]) == 0
         cards = capfd.readouterr().out
         ends = re.search(r"^ends by task +98\.6% \(97\.2 to 99\.3%\)$", cards, re.MULTILINE)
-        assert max(map(len, cards.splitlines())) <= 80 and (ends is not None) == (words == ["--long"])
+        assert max(map(len, cards.splitlines())) <= 80 and (ends is not None) == (
+            words == ["--long"]
+        )
     assert len(re.findall("^task .*go1", cards, re.MULTILINE)) == 1
     assert cli.main(["zoo", "go1tug", "--json"]) == 0
     found = json.loads(capfd.readouterr().out)["policies"]["go1tug"]["results"]["win/scripted"]
@@ -104,7 +122,11 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
     joints = policy_of("go1gate", control="position")
     assert joints.act(jnp.zeros((1, 2, 16)), (), jax.random.PRNGKey(0))[0].shape == (1, 2, 12)
     both = policy_of("go1tug")
-    assert isinstance(both, BothTeams) and both.first is both.second and isinstance(both.first, TrainedPolicy)
+    assert (
+        isinstance(both, BothTeams)
+        and both.first is both.second
+        and isinstance(both.first, TrainedPolicy)
+    )
     alone = policy_of("go1tug", opponent="idle")
     assert isinstance(alone, BothTeams) and isinstance(alone.second, SimplePolicy)
 
@@ -126,26 +148,38 @@ def test_a_shipped_policy_brings_the_skill_that_it_needs(task: str) -> None:
         ("go1seesaw", [{"robot": "go2"}, {"robot": "go2"}], {"robot": "go2"}),
     ],
 )
-def test_parameters_are_those_that_policies_need_beyond_the_defaults(task: str, changes: Any, expected: Any) -> None:
+def test_parameters_are_those_that_policies_need_beyond_the_defaults(
+    task: str, changes: Any, expected: Any
+) -> None:
     policy = load_policy("go1seesaw")
-    policies = [dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **change)) for change in changes]
+    policies = [
+        dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **change))
+        for change in changes
+    ]
     assert parameters_for(task, "forward", "nobody", *policies) == expected
 
 
 def test_a_batch_evaluates_only_policies_that_fit() -> None:
     batch = VectorEnv(make("go1gate", impl="c", num_envs=1, skill="agile"), 1)
-    with pytest.raises(InputError, match="policy: policy needs skill 'walk'; the environment has 'agile'"):
+    with pytest.raises(
+        InputError, match="policy: policy needs skill 'walk'; the environment has 'agile'"
+    ):
         evaluate_batch(batch, zoo.load("go1gate"), 1, jax.random.PRNGKey(0))
 
 
 def test_commands_apply_what_a_shipped_policy_needs(capfd: Any) -> None:
     for chosen in ((), ("go1tug",), ("scripted", "go1tug")):
-        env = players("go1tug", *chosen, impl="c", env={"episode_length": 5.0} if chosen else {}).env
+        env = players(
+            "go1tug", *chosen, impl="c", env={"episode_length": 5.0} if chosen else {}
+        ).env
         assert (env.params.skill, env.params.action_ranges()["vx"]) == ("agile", (-1.5, 2.5))
     words = ["--impl", "c", "--set", "skill=walk"]
     for command in (["eval", "go1tug", "--policy", "go1tug"], ["tournament", "go1tug", "go1tug"]):
         assert cli.main([*command, *words]) == 2
-        assert "policy: go1tug needs skill 'agile'; the environment has 'walk'" in capfd.readouterr().err
+        assert (
+            "policy: go1tug needs skill 'agile'; the environment has 'walk'"
+            in capfd.readouterr().err
+        )
     assert cli.main(["zoo", "go1tug"]) == 0
     assert "agile: vx -1.5 to 2.5" in capfd.readouterr().out
 
@@ -153,22 +187,33 @@ def test_commands_apply_what_a_shipped_policy_needs(capfd: Any) -> None:
 def test_policy_files_hold_their_mode_and_card(tmp_path: Path) -> None:
     policy = load_policy("go1gate")
     file = zoo.ship(policy, override(zoo.card("go1gate"), {"mode": "deterministic"}), tmp_path)
-    assert file == tmp_path / "go1gate.safetensors" and load_policy(file).metadata["card"]["mode"] == "deterministic"
+    assert (
+        file == tmp_path / "go1gate.safetensors"
+        and load_policy(file).metadata["card"]["mode"] == "deterministic"
+    )
     assert load_policy(file).deterministic
     for deterministic in (False, True):
-        file = save_policy(tmp_path / "new" / "folder", dataclasses.replace(policy, deterministic=deterministic))
-        assert load_policy(file).deterministic is deterministic and load_policy(file, deterministic=True).deterministic
+        file = save_policy(
+            tmp_path / "new" / "folder", dataclasses.replace(policy, deterministic=deterministic)
+        )
+        assert (
+            load_policy(file).deterministic is deterministic
+            and load_policy(file, deterministic=True).deterministic
+        )
 
 
 def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:
     policy = load_policy("go1gate")
-    policy = dataclasses.replace(policy, params=jax.tree.map(lambda x: jnp.asarray(x) * 1.0001, policy.params))
+    policy = dataclasses.replace(
+        policy, params=jax.tree.map(lambda x: jnp.asarray(x) * 1.0001, policy.params)
+    )
     full, half = (save_policy(tmp_path, policy, f"{half}", half=half) for half in (False, True))
     assert half.stat().st_size < 0.62 * full.stat().st_size
     loaded = load_policy(half)
     assert {x.dtype for x in jax.tree.leaves(loaded.params)} == {jnp.dtype("float32")}
     obs = jax.random.normal(jax.random.PRNGKey(1), (64, 2, policy.needs.dims.observation))
-    one, other = (each.act(obs, each.initial_memory(64))[0] for each in (policy, loaded))
+    one = policy.act(obs, policy.initial_memory(64))[0]
+    other = loaded.act(obs, loaded.initial_memory(64))[0]
     np.testing.assert_allclose(one, other, atol=5e-3)
     with pytest.raises(NonFiniteError, match="holds NaN or infinite"):
         huge = jax.tree.map(lambda x: 1e6 * jnp.ones_like(x), policy.params)
@@ -181,7 +226,9 @@ SPEED = COMMANDS[0].gain  # m/s per unit of forward action
 def push(speed: float, x: float = 1.6) -> np.ndarray:
     """Actions (2, 3) of robots in contact with a cylinder of the given speed, m/s."""
     base = jnp.tile(jnp.array([x, -0.7, 0.3, 0.0, 0.0, jnp.pi / 2]), (2, 1))
-    return np.asarray(plan_tug({"base": base, "cylinder": jnp.tile(jnp.array([0.8, speed]), (2, 1))}))
+    return np.asarray(
+        plan_tug({"base": base, "cylinder": jnp.tile(jnp.array([0.8, speed]), (2, 1))})
+    )
 
 
 def climb(x: float, y: float) -> np.ndarray:
@@ -195,7 +242,8 @@ def test_the_tug_robot_pushes_a_little_faster_than_the_cylinder_along_its_axis()
         assert push(speed)[:, 0] * SPEED == pytest.approx(expected, abs=1e-5)
     assert push(0.3)[:, 1:] == pytest.approx(0.0, abs=1e-5)
     action = push(0.0, x=1.2)
-    assert np.all(action[:, 0] < 0) and np.all(action[:, 1] < 0)  # back, and to the right, towards x = 1.6
+    # back, and to the right, towards x = 1.6
+    assert np.all(action[:, 0] < 0) and np.all(action[:, 1] < 0)
 
 
 def test_the_climber_enters_the_plank_centred_and_leaves_its_low_end_at_its_edge() -> None:
@@ -214,7 +262,9 @@ def test_every_line_of_the_registry_names_a_scripted_policy_that_exists() -> Non
     refuses(r"go1plane has no scripted policy; allowed for: go1gate, ", find_scripted, "go1plane")
 
 
-def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def ahead(obs: dict[str, jax.Array]) -> jax.Array:
         return jnp.zeros((len(obs["base"]), 3)).at[:, 0].set(0.7)
 
@@ -223,20 +273,36 @@ def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(monkeyp
     env = make("go1wrestling", impl="c", num_envs=1)
     action, _ = load_policy("ahead", env).act(jnp.zeros((2, 1, 12)), (), jax.random.PRNGKey(0))
     np.testing.assert_allclose(action[:, 0], [[0.7, 0, 0]] * 2, atol=1e-6)
-    with pytest.raises(InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge"):
+    with pytest.raises(
+        InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge"
+    ):
         load_policy("ahead", make("go1tug", impl="c", num_envs=1))
-    refuses("already registered for go1wrestling", register_scripted, "go1wrestling", "ahead", lambda obs: obs["base"])
-    refuses("^task: unknown 'go1sumo'.*; allowed: go1plane, go1gate", register_scripted, "go1sumo", "ahead", ahead)
+    refuses(
+        "already registered for go1wrestling",
+        register_scripted,
+        "go1wrestling",
+        "ahead",
+        lambda obs: obs["base"],
+    )
+    refuses(
+        "^task: unknown 'go1sumo'.*; allowed: go1plane, go1gate",
+        register_scripted,
+        "go1sumo",
+        "ahead",
+        ahead,
+    )
 
 
-# -- skills ------------------------------------------------------------------------------------------------------------
+# -- skills
 
 
 LEAN: dict[str, Any] = {"impl": "c", "skill": "lean", "commands": ("roll", "pitch")}
 
 
 class StandAndLean(Skill):
-    """Stands and leans by shortening legs, in proportion to the commands; filtered over about 0.2 s."""
+    """Stands and leans by shortening legs, in proportion to the commands; filtered over about 0.2
+    s.
+    """
 
     name = "lean"
     commands = (
@@ -248,10 +314,16 @@ class StandAndLean(Skill):
         return {"lean": jnp.zeros(2)}
 
     def targets(
-        self, params: Any, memory: dict[str, jax.Array], command: jax.Array, proprioception: Proprioception
+        self,
+        params: Any,
+        memory: dict[str, jax.Array],
+        command: jax.Array,
+        proprioception: Proprioception,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         lean = memory["lean"] + 0.1 * (command - memory["lean"])
-        side, front = jnp.array([-1.0, 1.0, -1.0, 1.0]), jnp.array([1.0, 1.0, -1.0, -1.0])  # FL FR RL RR
+        # FL FR RL RR
+        side = jnp.array([-1.0, 1.0, -1.0, 1.0])
+        front = jnp.array([1.0, 1.0, -1.0, -1.0])
         bent = 0.5 * (lean[0] * side + lean[1] * front)
         legs = bent[:, None] * jnp.array([0.0, 1.0, -2.0])  # hip, thigh, calf
         return jnp.asarray(self.robot.default_joints) + legs.ravel(), {"lean": lean}
@@ -265,7 +337,9 @@ class Stand(StandAndLean):
     def init_memory(self) -> Any:
         return ()
 
-    def targets(self, params: Any, memory: Any, command: jax.Array, proprioception: Proprioception) -> Any:
+    def targets(
+        self, params: Any, memory: Any, command: jax.Array, proprioception: Proprioception
+    ) -> Any:
         return super().targets(params, {"lean": command}, command, proprioception)[0], ()
 
 
@@ -278,8 +352,11 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_agents_lean_as_they_are_commanded() -> None:
     still = {"spawn_joint_scale": (1.0, 1.001), "spawn_velocity": 0.0, "spawn_height": 0.34}
     env: Any = make("go1plane", num_agents=2, **LEAN, **still)
-    assert env.action_size == 2 and "gait_phase" not in [block.name for block in env.privileged_layout.blocks]
-    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
+    assert env.action_size == 2 and "gait_phase" not in [
+        block.name for block in env.privileged_layout.blocks
+    ]
+    step = jax.jit(env.step)
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     for _ in range(75):
         state = step(state, jnp.array([[0.5, 0.0], [0.0, 0.5]]))
     roll, pitch, _ = np.asarray(env.read(state.data).euler).T
@@ -289,7 +366,9 @@ def test_agents_lean_as_they_are_commanded() -> None:
 
 def test_a_skill_needs_no_recurrent_state() -> None:
     env: Any = make("go1plane", **{**LEAN, "skill": "stand"})
-    state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.PRNGKey(0)), jnp.zeros((env.num_agents, 2)))
+    state = jax.jit(env.step)(
+        jax.jit(env.reset)(jax.random.PRNGKey(0)), jnp.zeros((env.num_agents, 2))
+    )
     np.testing.assert_allclose(state.data.ctrl, env.controller.neutral.ravel())
 
 
@@ -300,7 +379,9 @@ def test_npc_robots_follow_the_skill_in_every_action_mode() -> None:
         def npc_commands(self, state: Any, robot_state: Any) -> jax.Array:
             return jnp.array([[0.3, 0.0]])
 
-    env: Any = Watched(Watched.Params(skill="lean", commands=("roll", "pitch")), impl="c", control="position")
+    env: Any = Watched(
+        Watched.Params(skill="lean", commands=("roll", "pitch")), impl="c", control="position"
+    )
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     commands = env.npc_commands(state, env.read(state.data))
     sensed = env.read(state.data).proprioception
@@ -313,9 +394,13 @@ def test_npc_robots_follow_the_skill_in_every_action_mode() -> None:
 def test_actions_change_commands_around_the_defaults_within_limits_and_are_mirrored() -> None:
     controller: Any = make("go1plane", num_agents=2, **LEAN).controller
     action = jnp.array([[1.0, -0.5], [-1.0, 0.25]])
-    np.testing.assert_allclose(controller.skill_commands(action), [[0.3, -0.2], [-0.3, 0.1]], atol=1e-6)
+    np.testing.assert_allclose(
+        controller.skill_commands(action), [[0.3, -0.2], [-0.3, 0.1]], atol=1e-6
+    )
     match: Any = make("go1revolvingdoor", **LEAN)
-    np.testing.assert_array_equal(match.unmirror_action(action), action * np.array([[1, 1], [-1, 1]]))
+    np.testing.assert_array_equal(
+        match.unmirror_action(action), action * np.array([[1, 1], [-1, 1]])
+    )
 
 
 @pytest.mark.parametrize(
@@ -327,11 +412,15 @@ def test_actions_change_commands_around_the_defaults_within_limits_and_are_mirro
         ({"skill": "wolk"}, r"skill: unknown name 'wolk' .did you mean 'walk'"),
     ],
 )
-def test_parameters_that_the_skill_does_not_know_are_named(params: dict[str, Any], message: str) -> None:
+def test_parameters_that_the_skill_does_not_know_are_named(
+    params: dict[str, Any], message: str
+) -> None:
     refuses(message, make, "go1plane", **{"impl": "c", **params})
 
 
-def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_comes_before_a_folder_of_that_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "go1gate").mkdir()
     monkeypatch.chdir(tmp_path)
     env, _, policy, _ = players(**Eval(target="go1gate", impl="c").playing)
@@ -341,11 +430,16 @@ def test_a_name_comes_before_a_folder_of_that_name(tmp_path: Path, monkeypatch: 
 
 def test_what_a_user_makes_says_what_it_is() -> None:
     env = make("go1tug", impl="c", num_envs=4, episode_length=3.0, rewards={"push": 4})
-    start, end = "<go1tug: 1 vs 1 agents, observation 10, action ", "engine c, episode_length=3.0, rewards.push=4.0>"
-    batch, scripted = VectorEnv(env, 4), load_policy("scripted", env)
+    start = "<go1tug: 1 vs 1 agents, observation 10, action "
+    end = "engine c, episode_length=3.0, rewards.push=4.0>"
+    batch = VectorEnv(env, 4)
+    scripted = load_policy("scripted", env)
     assert repr(env).startswith(start) and repr(env).endswith(end)
     policy = "SimplePolicy(task='go1tug', agents=1, name='scripted')"
-    assert repr(versus(batch, [scripted])) == f"<Versus of 4 against [{policy}]: <VectorEnv of 4: {env!r}>>"
+    assert (
+        repr(versus(batch, [scripted]))
+        == f"<Versus of 4 against [{policy}]: <VectorEnv of 4: {env!r}>>"
+    )
     assert {*mqe_jax.__all__} <= {*dir(mqe_jax)} and "annotations" not in dir(mqe_jax)
 
 
@@ -355,8 +449,15 @@ def test_who_acts_is_named() -> None:
 
     match = {"policy": "population/1/middle", "actions": "sampled", "opponent": "idle"}
     assert about(target="go1wrestling", policy="population/1/middle") == match
-    assert about(target="go1wrestling", policy="population/1/middle", deterministic=True)["actions"] == "mean"
-    assert about(target="go1bridge") == {"policy": "go1bridge", "actions": "sampled", "opponent": "go1bridge"}
+    assert (
+        about(target="go1wrestling", policy="population/1/middle", deterministic=True)["actions"]
+        == "mean"
+    )
+    assert about(target="go1bridge") == {
+        "policy": "go1bridge",
+        "actions": "sampled",
+        "opponent": "go1bridge",
+    }
     assert about(target="go1tug", policy="scripted") == {"policy": "scripted", "opponent": "idle"}
 
 
@@ -370,10 +471,15 @@ def test_a_name_is_registered_once() -> None:
 
 @pytest.mark.parametrize("name", ["walk", "lean", "stand"])
 def test_contract(name: str) -> None:
-    """Joint targets near standing, the recurrent state's shapes kept, a complete vector of commands."""
+    """Joint targets near standing, the recurrent state's shapes kept, a complete vector of
+    commands.
+    """
     skill = skills.make(name, GO1)
-    memory, command = skill.init_memory(), jnp.asarray(skill.default_commands())
-    still = Proprioception(jnp.array([0.0, 0.0, -1.0]), jnp.asarray(GO1.default_joints), jnp.zeros(12))
+    memory = skill.init_memory()
+    command = jnp.asarray(skill.default_commands())
+    still = Proprioception(
+        jnp.array([0.0, 0.0, -1.0]), jnp.asarray(GO1.default_joints), jnp.zeros(12)
+    )
     target, after = jax.jit(skill.targets)(skill.load_params(), memory, command, still)
     assert target.shape == (12,) and np.abs(target - GO1.default_joints).max() < 1.0
     assert command.shape == (len(skill.commands),) and np.isfinite(command).all()

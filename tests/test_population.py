@@ -23,7 +23,9 @@ TASK = "go1revolvingdoor"
 
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A population of a team that stands and an early policy, which needs joint targets as actions."""
+    """A population of a team that stands and an early policy, which needs joint targets as
+    actions.
+    """
     monkeypatch.setattr(population, "FOLDER", tmp_path)
     population.add("1", TASK, "idle")
     population.add("1", TASK, "early", new_policy(versus(matches(), ["idle"])))
@@ -31,7 +33,9 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def check(name: str, task: str, *others: str) -> None:
-    """Checks that a match's members are few and small, and meet each other and further policies in one environment."""
+    """Checks that a match's members are few and small, and meet each other and further policies in
+    one environment.
+    """
     members = population.members(name, task)
     assert 1 <= len(members) <= population.MEMBERS
     env = make(task, impl="c", num_envs=1, **parameters_for(task, *members, *others))
@@ -50,15 +54,27 @@ def test_the_shipped_members_meet_the_shipped_policy(task: str) -> None:
 
 def test_every_file_belongs_to_a_shipped_population() -> None:
     manifests = (json.loads(file.read_text()) for file in population.FOLDER.glob("*.json"))
-    digests = [digest for manifest in manifests for task in manifest.values() for digest in task.values() if digest]
-    files = [hashlib.sha256(file.read_bytes()).hexdigest() for file in population.FOLDER.glob("*.safetensors")]
+    digests = [
+        digest
+        for manifest in manifests
+        for task in manifest.values()
+        for digest in task.values()
+        if digest
+    ]
+    files = [
+        hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in population.FOLDER.glob("*.safetensors")
+    ]
     assert sorted(files) == sorted(digests)
 
 
 def test_the_scripted_member_walks_against_every_policy(fake: Path) -> None:
     population.add("1", "go1bridge", "scripted")
     assert parameters_for("go1bridge", "go1bridge", "scripted")["skill"] == "agile"
-    assert parameters_for("go1bridge", "go1bridge", "population/1/scripted")["skill"] == ("walk", "agile")
+    assert parameters_for("go1bridge", "go1bridge", "population/1/scripted")["skill"] == (
+        "walk",
+        "agile",
+    )
     assert parameters_for(TASK, "population/1/scripted") == {}
 
 
@@ -66,7 +82,11 @@ def test_a_population_has_named_and_trained_members(fake: Path) -> None:
     check("population/1", TASK)
     assert population.names() == ["population/1"]
     assert population.members("population/1", TASK) == ["population/1/idle", "population/1/early"]
-    assert population.expand(["a", "population/1"], TASK) == ["a", "population/1/idle", "population/1/early"]
+    assert population.expand(["a", "population/1"], TASK) == [
+        "a",
+        "population/1/idle",
+        "population/1/early",
+    ]
     assert parameters_for(TASK, "population/1/early") == {"control": "position"}
     for name in ("a", "population/1/early", "population"):
         assert not population.is_named(name)
@@ -74,7 +94,9 @@ def test_a_population_has_named_and_trained_members(fake: Path) -> None:
 
 def test_a_published_version_does_not_change(fake: Path) -> None:
     policy = new_policy(versus(matches(), ["idle"]), 1)
-    with pytest.raises(InputError, match=r"member: 'early' .* a new one, of at most 5: idle, early"):
+    with pytest.raises(
+        InputError, match=r"member: 'early' .* a new one, of at most 5: idle, early"
+    ):
         population.add("1", TASK, "early", policy)
     for name in ("scripted", "random", "forward"):
         population.add("1", TASK, name)
@@ -82,14 +104,18 @@ def test_a_published_version_does_not_change(fake: Path) -> None:
         population.add("1", TASK, "sixth", policy)
     (file,) = fake.glob("*.safetensors")
     file.write_bytes(file.read_bytes() + b" ")
-    with pytest.raises(InputError, match=r"early\.safetensors: is missing, or not the file of population/1"):
+    with pytest.raises(
+        InputError, match=r"early\.safetensors: is missing, or not the file of population/1"
+    ):
         population.resolve("population/1/early", TASK)
 
 
 def test_a_member_that_is_too_large_is_refused(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(population, "BYTES", 1000)
     before = sorted(fake.iterdir())
-    with pytest.raises(InputError, match=r"policy: '[0-9]+ bytes' is not allowed; it must be at most 1000"):
+    with pytest.raises(
+        InputError, match=r"policy: '[0-9]+ bytes' is not allowed; it must be at most 1000"
+    ):
         population.add("1", TASK, "late", new_policy(versus(matches(), ["idle"]), 2))
     assert sorted(fake.iterdir()) == before
 
@@ -97,12 +123,19 @@ def test_a_member_that_is_too_large_is_refused(fake: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("population/2/early", "population: 'population/2' is not allowed; it must be one of population/1"),
+        (
+            "population/2/early",
+            "population: 'population/2' is not allowed; it must be one of population/1",
+        ),
         (
             "population/1",
-            "policy: 'population/1' is not allowed; it must be one of population/1/idle, population/1/early",
+            "policy: 'population/1' is not allowed; it must be one of population/1/idle, "
+            "population/1/early",
         ),
-        ("population/1/late", "policy: 'population/1/late' is not allowed; it must be one of population/1/idle"),
+        (
+            "population/1/late",
+            "policy: 'population/1/late' is not allowed; it must be one of population/1/idle",
+        ),
     ],
 )
 def test_an_unknown_member_is_named(name: str, said: str, fake: Path) -> None:
@@ -113,7 +146,9 @@ def test_an_unknown_member_is_named(name: str, said: str, fake: Path) -> None:
         load_policy("population/1/early", matches("go1tug").env)
 
 
-def test_an_evaluation_has_the_mean_and_the_worst_case(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_evaluation_has_the_mean_and_the_worst_case(
+    fake: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rates = iter((0.5, 0.75))
 
     def play(env: Any, policy: Any, episodes: int, key: Any) -> Result:
@@ -127,8 +162,13 @@ def test_an_evaluation_has_the_mean_and_the_worst_case(fake: Path, monkeypatch: 
     assert (result.episodes, result.diverged, result.about["opponent"]) == (8, 2, "population/1")
     assert result.about["sides"] == "both" and result.terms == {"win": 1.25}
     assert [*result.match] == ["win_rate", "draw_rate", "loss_rate"]
-    shown, rows = result.to_dict(), result.rows()
-    assert {name: shown[name] for name in shown if name.split("/")[0].endswith(("win_rate", "loss_rate"))} == {
+    shown = result.to_dict()
+    rows = result.rows()
+    assert {
+        name: shown[name]
+        for name in shown
+        if name.split("/")[0].endswith(("win_rate", "loss_rate"))
+    } == {
         "win_rate": 0.625,
         "loss_rate": 0.0,
         "worst_win_rate": 0.5,
@@ -137,8 +177,13 @@ def test_an_evaluation_has_the_mean_and_the_worst_case(fake: Path, monkeypatch: 
         "loss_rate/population/1/idle": 0.0,
         "loss_rate/population/1/early": 0.0,
     }
-    assert (rows["win_rate"], rows["worst_win_rate"]) == (repr(Rate.of(0.625, 8)), repr(Rate.of(0.5, 4)))
+    assert (rows["win_rate"], rows["worst_win_rate"]) == (
+        repr(Rate.of(0.625, 8)),
+        repr(Rate.of(0.5, 4)),
+    )
     assert json.dumps(shown)
-    monkeypatch.setattr(playing.league, "round_robin", lambda matches, teams, key: np.ones((len(teams),) * 2 + (3,)))
+    monkeypatch.setattr(
+        playing.league, "round_robin", lambda matches, teams, key: np.ones((len(teams),) * 2 + (3,))
+    )
     standings = mqe_jax.tournament(TASK, ["population/1"], **options)
     assert standings.policies == ("population/1/idle", "population/1/early", "idle", "random")

@@ -1,4 +1,6 @@
-"""Pictures: frames, files, rendering models and cameras of clips; the viewer's simulation, choices and arguments."""
+"""Pictures: frames, files, rendering models and cameras of clips; the viewer's simulation, choices
+and arguments.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -34,16 +36,22 @@ def episode(env: Any) -> recording.Episode:
     return recording.record_episodes(env, policy, jax.random.PRNGKey(0), episodes=2, seconds=1.0)[1]
 
 
-def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(env: Any, episode: recording.Episode) -> None:
+def test_an_episode_starts_at_the_reset_and_stops_where_it_ends(
+    env: Any, episode: recording.Episode
+) -> None:
     assert len(episode) == 11  # the reset and ten steps
     np.testing.assert_allclose(episode.qpos[:, 0], 1.0 + 0.025 * np.arange(11), rtol=1e-5)
     assert episode.success == 1.0
     assert episode.reward == pytest.approx(0.05)
 
 
-def test_the_typical_episode_is_the_median_of_the_successful_ones(episode: recording.Episode) -> None:
+def test_the_typical_episode_is_the_median_of_the_successful_ones(
+    episode: recording.Episode,
+) -> None:
     rated = [(1.0, 0.3), (0.0, 0.9), (1.0, 0.1), (0.5, 0.7), (1.0, 0.2)]
-    episodes = [dataclasses.replace(episode, success=success, reward=reward) for success, reward in rated]
+    episodes = [
+        dataclasses.replace(episode, success=success, reward=reward) for success, reward in rated
+    ]
     assert recording.typical(episodes) is episodes[4]  # of 0.5, then 0.1, 0.2 and 0.3
     assert recording.typical(episodes[1:2]) is episodes[1]
 
@@ -54,8 +62,13 @@ def test_success_is_settled_from_its_last_change_on(env: Any, episode: recording
     assert episode.cut(slice(2, None)).settled == episode.settled
 
 
-def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: Any, episode: recording.Episode) -> None:
-    assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == ["a", "b"]
+def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(
+    env: Any, episode: recording.Episode
+) -> None:
+    assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == [
+        "a",
+        "b",
+    ]
     drawn = geometry.rendering_model(env.mj_model, episode)
     low, high = geometry.extent(drawn, episode)
     assert high[1] == pytest.approx(1.5) and low[1] == pytest.approx(-1.5)
@@ -64,15 +77,20 @@ def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(env: Any, ep
 
 
 def test_the_side_view_follows_the_first_robot(env: Any, episode: recording.Episode) -> None:
-    model, data = env.mj_model, mujoco.MjData(env.mj_model)
+    model = env.mj_model
+    data = mujoco.MjData(env.mj_model)
     camera = cameras.cameras(model, episode, "side", 1.5)[-1]
     geometry.pose(model, data, episode, len(episode) - 1)
-    assert camera.lookat[:2] == pytest.approx(data.xpos[geometry.robot_bases(model)[0]][:2], abs=0.1)
+    assert camera.lookat[:2] == pytest.approx(
+        data.xpos[geometry.robot_bases(model)[0]][:2], abs=0.1
+    )
     refuses(r"view: unknown name .*side", cameras.cameras, model, episode, "sid", 1.5)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4"])
-def test_clips_land_whole_without_gl(env: Any, episode: Episode, tmp_path: Path, capsys: Any, suffix: str) -> None:
+def test_clips_land_whole_without_gl(
+    env: Any, episode: Episode, tmp_path: Path, capsys: Any, suffix: str
+) -> None:
     if suffix == ".mp4":
         pytest.importorskip("imageio_ffmpeg")
     file = tmp_path / f"clip{suffix}"
@@ -99,7 +117,9 @@ def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -
 
 
 @pytest.mark.parametrize("backend", ["auto", None])
-def test_what_the_first_robot_senses_is_drawn_and_explained(env: Any, episode: Episode, backend: str | None) -> None:
+def test_what_the_first_robot_senses_is_drawn_and_explained(
+    env: Any, episode: Episode, backend: str | None
+) -> None:
     """Lines, points and an area in magenta, and the legend; the other robot's are not."""
     if backend and render.gl_backend() is None:
         pytest.skip("no GL library here (libegl1 libgl1-mesa-dri)")
@@ -107,10 +127,16 @@ def test_what_the_first_robot_senses_is_drawn_and_explained(env: Any, episode: E
 
     def pink(agent: int, **corners: jax.Array) -> int:
         every = {name: jnp.zeros((2, *x.shape)).at[agent].set(x) for name, x in corners.items()}
-        shown = {f"{name[:-1]}_opacity": (jnp.arange(2.0) == agent)[:, None] for name in corners if name != "area"}
+        shown = {
+            f"{name[:-1]}_opacity": (jnp.arange(2.0) == agent)[:, None]
+            for name in corners
+            if name != "area"
+        }
         options: Any = {**every, **shown}
         mark = sensed.marks("lidar", (1.0, 0.0, 1.0), jnp.full(2, 0.6), **options)
-        marked = dataclasses.replace(still, marks=(jax.tree.map(lambda x: np.asarray(x)[None], mark),))
+        marked = dataclasses.replace(
+            still, marks=(jax.tree.map(lambda x: np.asarray(x)[None], mark),)
+        )
         (frame,) = render.render_frames(env, marked, size=(320, 180), backend=backend)
         red, green, blue = np.moveaxis(frame.astype(int), -1, 0)
         return int(np.count_nonzero((red > green + 40) & (blue > green + 40)))
@@ -121,7 +147,8 @@ def test_what_the_first_robot_senses_is_drawn_and_explained(env: Any, episode: E
     assert pink(1, lines=corners["lines"], points=corners["points"]) == 0
     mark = sensed.marks("lidar", (1.0, 0.0, 1.0), jnp.full(2, 0.6))
     blank = np.zeros((360, 640, 3), np.uint8)
-    plain, told = (framing.legend(env, (640, 360), marks)(blank).any(axis=(0, 2)).sum() for marks in ((), (mark,)))
+    plain = framing.legend(env, (640, 360), ())(blank).any(axis=(0, 2)).sum()
+    told = framing.legend(env, (640, 360), (mark,))(blank).any(axis=(0, 2)).sum()
     assert told > plain + 40
 
 
@@ -131,7 +158,19 @@ BODIES = (
     *(f"dof_{name}" for name in ("armature", "damping", "frictionloss")),
     *(f"actuator_{name}" for name in ("gainprm", "biasprm", "forcerange")),
 )
-GEOM = ("type", "size", "pos", "quat", "contype", "conaffinity", "condim", "friction", "solref", "solimp", "margin")
+GEOM = (
+    "type",
+    "size",
+    "pos",
+    "quat",
+    "contype",
+    "conaffinity",
+    "condim",
+    "friction",
+    "solref",
+    "solimp",
+    "margin",
+)
 ASPECT = 16 / 9
 TWELVE = [task for task in TASKS if task != "go1plane"]
 
@@ -139,31 +178,46 @@ TWELVE = [task for task in TASKS if task != "go1plane"]
 @pytest.mark.parametrize("task", TASKS)
 def test_rendering_models_have_the_physics_models_bodies_and_contacts(task: str) -> None:
     env = made(task)
-    physics, drawn = env.compiled.model, env.mj_model
+    physics = env.compiled.model
+    drawn = env.mj_model
     assert drawn.ngeom > physics.ngeom and physics.nsite == physics.ntex == physics.nlight == 0
     for name in ("nq", "nv", "nu", "nbody", "nmocap", "qpos0", *BODIES):
         np.testing.assert_array_equal(getattr(physics, name), getattr(drawn, name), err_msg=name)
     solid = np.flatnonzero((drawn.geom_contype | drawn.geom_conaffinity) != 0)
-    assert [drawn.geom(i).name for i in solid] == [physics.geom(i).name for i in range(physics.ngeom)]
+    assert [drawn.geom(i).name for i in solid] == [
+        physics.geom(i).name for i in range(physics.ngeom)
+    ]
     for name in GEOM:
-        ours, theirs = getattr(physics, f"geom_{name}"), getattr(drawn, f"geom_{name}")[solid]
+        ours = getattr(physics, f"geom_{name}")
+        theirs = getattr(drawn, f"geom_{name}")[solid]
         np.testing.assert_array_equal(ours, theirs, err_msg=name)
 
 
 @pytest.mark.parametrize("task", TWELVE)
 def test_team_colours_are_those_of_the_agents(task: str) -> None:
     env = made(task)
-    shown = [geometry.robot_color(env.mj_model, body)[:3] for body in geometry.robot_bases(env.mj_model)]
+    shown = [
+        geometry.robot_color(env.mj_model, body)[:3] for body in geometry.robot_bases(env.mj_model)
+    ]
     warm = [red > blue for red, _, blue in shown]
     robots = range(len(shown))
-    expected = [i in env.teams[1] for i in robots] if len(env.teams) > 1 else [i >= env.num_agents for i in robots]
+    expected = (
+        [i in env.teams[1] for i in robots]
+        if len(env.teams) > 1
+        else [i >= env.num_agents for i in robots]
+    )
     assert warm == expected and len(set(shown)) == len(shown)
 
 
 def in_frame(model: mujoco.MjModel, episode: Episode, views: list[Camera]) -> np.ndarray:
-    """Which targets' centres, then which goal points, are in the image of each frame (T, targets + P) bool."""
-    data, bodies, rows = mujoco.MjData(model), framing.targets(model, episode), []
-    boxes, goals = geometry.body_boxes(model, bodies), framing.goal_points(model, episode)
+    """Which targets' centres, then which goal points, are in the image of each frame (T, targets +
+    P) bool.
+    """
+    data = mujoco.MjData(model)
+    bodies = framing.targets(model, episode)
+    rows = []
+    boxes = geometry.body_boxes(model, bodies)
+    goals = framing.goal_points(model, episode)
     tangent = np.tan(np.radians(model.vis.global_.fovy) / 2)
     for index, camera in enumerate(views):
         geometry.pose(model, data, episode, index)
@@ -187,15 +241,25 @@ def check(env: Any, episode: Episode, view: str = "follow") -> None:
     assert in_frame(model, episode, views).all(axis=1).mean() >= 0.95
     assert longest(framing.hidden(model, episode, views) == 1.0) * episode.dt <= 1.0
     eyes = np.array([view.position for view in views])
-    assert np.linalg.norm(np.diff(eyes, axis=0), axis=1).max(initial=0.0) < 4.0 * episode.dt  # m, at most 4 m/s
+    # m, at most 4 m/s
+    assert np.linalg.norm(np.diff(eyes, axis=0), axis=1).max(initial=0.0) < 4.0 * episode.dt
 
 
-def walking(task: str, path: Any, objects: Any = None, frames: int = 21, dt: float = 0.2) -> Episode:
-    """An episode in which the robots have the positions `path(t)` (R, 3), t from 0 to 1, and objects `objects(t)`."""
-    states = [placed(made(task), path(t), objects=objects and objects(t)) for t in np.linspace(0, 1, frames)]
+def walking(
+    task: str, path: Any, objects: Any = None, frames: int = 21, dt: float = 0.2
+) -> Episode:
+    """An episode in which the robots have the positions `path(t)` (R, 3), t from 0 to 1, and
+    objects `objects(t)`.
+    """
+    states = [
+        placed(made(task), path(t), objects=objects and objects(t))
+        for t in np.linspace(0, 1, frames)
+    ]
     data = [state.data for state in states]
     fields = ("qpos", "mocap_pos", "mocap_quat")
-    return Episode(*(np.stack([np.asarray(getattr(one, name)) for one in data]) for name in fields), dt=dt)
+    return Episode(
+        *(np.stack([np.asarray(getattr(one, name)) for one in data]) for name in fields), dt=dt
+    )
 
 
 @pytest.mark.parametrize("task", TWELVE)
@@ -211,14 +275,16 @@ def test_a_robot_behind_a_wall_is_hidden_and_one_beside_another_is_not() -> None
     env = made("go1gate")
     episode = walking("go1gate", lambda t: [[3.9, 1.2, 0.3], [1.0, 1.2, 0.3]], frames=2)
     model = geometry.rendering_model(env.mj_model, episode)
-    low = Camera((3.0, 1.2, 0.3), 5.0, azimuth=0.0, elevation=-2.0)  # from the start, along the track
+    # from the start, along the track
+    low = Camera((3.0, 1.2, 0.3), 5.0, azimuth=0.0, elevation=-2.0)
     assert framing.hidden(model, episode, [low] * 2)[:, 0].tolist() == [1.0, 1.0]
     assert framing.hidden(model, episode, [low] * 2)[:, 1].tolist() == [0.0, 0.0]
     above = Camera((3.0, 1.2, 0.3), 5.0, azimuth=0.0, elevation=-80.0)
     assert framing.hidden(model, episode, [above] * 2).max() == 0.0
     near = Camera((1.0, 1.2, 0.3), 1.5, azimuth=90.0, elevation=-80.0)
     inside = in_frame(model, episode, [near] * 2)
-    assert inside[:, 1].all() and not inside[:, 0].any()  # the other robot is beyond the image's edge
+    # the other robot is beyond the image's edge
+    assert inside[:, 1].all() and not inside[:, 0].any()
 
 
 LIMIT = np.array([1.0, 0.5, 0.5])
@@ -226,7 +292,8 @@ LIMIT = np.array([1.0, 0.5, 0.5])
 
 def test_a_driven_robot_obeys_the_hand_and_the_others_their_policy() -> None:
     run = session(Driven(), name="forward")
-    run.drive.env, run.drive.robot = 1, 1
+    run.drive.env = 1
+    run.drive.robot = 1
     run.drive.change((-1.0, 0.5, 1.0))
     run.advance()
     moved = run.moment().frame.qpos[:, FakeEnv.robot_x] - np.array([1.0, 1.0])
@@ -276,7 +343,12 @@ def test_episodes_start_over_and_the_record_keeps_the_last_seconds() -> None:
 
 
 def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Path) -> None:
-    settings = {"b": "task: go1gate", "a": "task: go1tug", "no task": "task: null", "unreadable": ": ["}
+    settings = {
+        "b": "task: go1gate",
+        "a": "task: go1tug",
+        "no task": "task: null",
+        "unreadable": ": [",
+    }
     for name, text in settings.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "policy.safetensors").touch()
@@ -286,8 +358,17 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
     assert {Path(run).name: task for run, task in runs.items()} == {"a": "go1tug", "b": "go1gate"}
     menu = Menu(lambda choice: session(FakeEnv()), Entry("go1gate", "given.safetensors"), runs)
     common = ("random", "idle", "forward")
-    gate, tug = (next(run for run, its in runs.items() if its == task) for task in ("go1gate", "go1tug"))
-    assert menu.policies("go1gate") == ("default", "go1gate", "scripted", *common, gate, "given.safetensors")
+    gate, tug = (
+        next(run for run, its in runs.items() if its == task) for task in ("go1gate", "go1tug")
+    )
+    assert menu.policies("go1gate") == (
+        "default",
+        "go1gate",
+        "scripted",
+        *common,
+        gate,
+        "given.safetensors",
+    )
     assert menu.policies("go1tug") == ("default", "go1tug", "scripted", *common, tug)
     assert menu.policies("go1plane") == ("default", *common)
     assert (menu.is_match("go1tug"), menu.is_match("go1gate")) == (True, False)
@@ -295,7 +376,8 @@ def test_the_page_offers_policies_of_the_package_and_of_run_folders(tmp_path: Pa
 
 def test_matches_are_counted_by_outcome() -> None:
     run = session(FakeEnv())
-    run.outcomes, run.counts = ("win", "draw", "loss"), np.zeros(3, int)
+    run.outcomes = ("win", "draw", "loss")
+    run.counts = np.zeros(3, int)
     run._count(np.array([True, False]), np.array([[False, False, True], [True, False, False]]))
     run._count(np.array([True, True]), np.array([[True, False, False], [False, True, False]]))
     assert run.counts.tolist() == [1, 1, 1] and run.last == ["win", "draw"]
@@ -309,7 +391,9 @@ def test_matches_are_counted_by_outcome() -> None:
         (["--policy", "scriptd"], ("policy", "scriptd", "scripted")),
     ],
 )
-def test_bad_arguments_are_refused_in_a_line(arguments: list[str], words: tuple[str, ...], capsys: Any) -> None:
+def test_bad_arguments_are_refused_in_a_line(
+    arguments: list[str], words: tuple[str, ...], capsys: Any
+) -> None:
     assert cli.main(["view", "go1gate", *arguments]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and all(word in said for word in words)

@@ -39,7 +39,12 @@ SENSES = {"control": "position", "senses": ["proprioception", "messages"], "epis
 def policy() -> TrainedPolicy:
     """A recurrent policy with random weights that sees the group `onboard`."""
     env = make("go1gate", impl="c", num_envs=1, **SENSES)
-    settings = {"task": env.name, "env": SENSES, "group": "onboard", "network": {"recurrent": True, "gru_size": 8}}
+    settings = {
+        "task": env.name,
+        "env": SENSES,
+        "group": "onboard",
+        "network": {"recurrent": True, "gru_size": 8},
+    }
     config = build(TrainConfig, settings)
     needs = needs_of(env, config)
     network = config.network.build(needs.dims)
@@ -49,33 +54,46 @@ def policy() -> TrainedPolicy:
 
 @pytest.fixture(scope="module")
 def files(policy: TrainedPolicy, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The policy's file, the graph of one robot that `mqe export` writes, and that of one that samples."""
+    """The policy's file, the graph of one robot that `mqe export` writes, and that of one that
+    samples.
+    """
     folder = tmp_path_factory.mktemp("robots")
-    run, sampled, mean = save_policy(folder, policy), folder / "sampled.onnx", folder / "mean.onnx"
+    run = save_policy(folder, policy)
+    sampled = folder / "sampled.onnx"
+    mean = folder / "mean.onnx"
     assert cli.main(["export", str(run), "--per-robot", "--onnx", str(mean)]) == 0
-    sampled.write_bytes(robot_onnx(policy, make("go1gate", impl="c", num_envs=1, **SENSES)).SerializeToString())
+    sampled.write_bytes(
+        robot_onnx(policy, make("go1gate", impl="c", num_envs=1, **SENSES)).SerializeToString()
+    )
     return {"run": run, "sampled": sampled, "mean": mean}
 
 
 @pytest.mark.parametrize("actions", ["mean", "sampled"])
-def test_a_team_of_processes_acts_as_the_policy(policy: TrainedPolicy, files: Any, actions: str) -> None:
+def test_a_team_of_processes_acts_as_the_policy(
+    policy: TrainedPolicy, files: Any, actions: str
+) -> None:
     rng = np.random.default_rng(0)
     seeds = np.random.SeedSequence(5).generate_state(2)
     own = [np.random.default_rng(int(seed)) for seed in seeds]
     key = jax.random.PRNGKey(0)
     expected = policy.acting(actions == "mean")
     with open_team(files[actions], 5) as team:
-        started, memory = team.initial_memory(3), expected.initial_memory(3)
+        started = team.initial_memory(3)
+        memory = expected.initial_memory(3)
         for _ in range(3):
             obs = jnp.asarray(rng.normal(size=(3, 2, policy.dims.observation)), jnp.float32)
             seen = Observations(jnp.zeros((3, 2, 1)), groups={"onboard": obs})
-            noise = np.stack([each.standard_normal((3, policy.dims.action), np.float32) for each in own], axis=1)
+            noise = np.stack(
+                [each.standard_normal((3, policy.dims.action), np.float32) for each in own], axis=1
+            )
             found, started = team.act(seen, started, key)
             with normal_numbers(jnp.ravel(noise)):
                 action, memory = expected.act(seen, memory, key)
             np.testing.assert_allclose(found, action, atol=1e-5)
             assert 0.1 < np.abs(action).mean() < 0.9
-            started, memory = started.at[1].set(0.0), memory.at[1].set(0.0)  # an episode ends
+            # an episode ends
+            started = started.at[1].set(0.0)
+            memory = memory.at[1].set(0.0)
 
 
 def test_an_evaluation_with_processes_gives_what_the_policy_reaches(files: Any, capfd: Any) -> None:
@@ -85,14 +103,18 @@ def test_an_evaluation_with_processes_gives_what_the_policy_reaches(files: Any, 
     assert cli.main(["eval", *words, "--export", str(files["mean"])]) == 0
     found = json.loads(capfd.readouterr().out)
     assert (found["policy"], found["actions"]) == (str(files["mean"]), "mean")
-    assert found["terms"] == pytest.approx(expected["terms"], rel=1e-4) and expected["terms"]["approach"] != 0.0
+    assert (
+        found["terms"] == pytest.approx(expected["terms"], rel=1e-4)
+        and expected["terms"]["approach"] != 0.0
+    )
 
 
 def test_a_robot_imports_nothing_of_the_simulation(policy: TrainedPolicy, files: Any) -> None:
     code = (
         "import sys, numpy; from mqe_jax.export.robot import Robot; robot = Robot(sys.argv[1]);"
         "print(robot.act(numpy.zeros((1, int(sys.argv[2])), 'f4'), numpy.ones(1, 'f4')).shape);"
-        "print(*(name for name in sys.modules if name.split('.')[0] in ('jax', 'mujoco', 'onnx', 'mqe_jax')))"
+        "print(*(name for name in sys.modules if name.split('.')[0] in ('jax', 'mujoco', 'onnx', "
+        "'mqe_jax')))"
     )
     command = [sys.executable, "-c", code, str(files["mean"]), str(policy.dims.observation)]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
@@ -100,7 +122,10 @@ def test_a_robot_imports_nothing_of_the_simulation(policy: TrainedPolicy, files:
 
 
 def test_a_process_that_ends_is_reported_in_a_line(files: Any) -> None:
-    with pytest.raises(ConnectionError, match=r"^export: the process of robot 1 ended with -9 \(without a message\)$"):
+    with pytest.raises(
+        ConnectionError,
+        match=r"^export: the process of robot 1 ended with -9 \(without a message\)$",
+    ):
         with open_team(files["mean"]) as team:
             team._processes[1]._process.kill()
             size = team.needs.dims.observation
@@ -111,7 +136,10 @@ def test_a_process_that_ends_is_reported_in_a_line(files: Any) -> None:
 @pytest.mark.parametrize(
     ("network", "said"),
     [
-        ({"name": "mat", "heads": 2}, "network: 'mat' is not allowed; it must be one whose robots act on their own"),
+        (
+            {"name": "mat", "heads": 2},
+            "network: 'mat' is not allowed; it must be one whose robots act on their own",
+        ),
         ({"recurrent": False, "share_policy": False}, "must be one whose robots share a network"),
     ],
 )
@@ -120,7 +148,9 @@ def test_robots_that_cannot_act_alone_are_refused(network: dict[str, Any], said:
     refuses(said, verify_robot, new_policy(env, "position", **network).acting(True), env)
 
 
-def test_what_is_no_file_of_a_robot_is_refused(policy: Any, files: Any, tmp_path: Path, monkeypatch: Any) -> None:
+def test_what_is_no_file_of_a_robot_is_refused(
+    policy: Any, files: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
     def opened(file: Any) -> None:
         with open_team(file):
             pass
@@ -137,12 +167,24 @@ def test_what_is_no_file_of_a_robot_is_refused(policy: Any, files: Any, tmp_path
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["eval", "go1tug", "--export", "{mean}"], "needs task 'go1gate'; the environment has 'go1tug'"),
-        (["eval", "go1gate", "--export", "{mean}", "--set", "senses=[lidar]"], "the environment has ('lidar',)"),
-        (["eval", "go1gate", "--export", "{mean}", "--policy", "idle"], "policy: 'idle' is not allowed; it"),
-        (["export", "{run}", "--sampled", "--onnx", "a.onnx"], "sampled: is not allowed for the graph of a team"),
+        (
+            ["eval", "go1tug", "--export", "{mean}"],
+            "needs task 'go1gate'; the environment has 'go1tug'",
+        ),
+        (
+            ["eval", "go1gate", "--export", "{mean}", "--set", "senses=[lidar]"],
+            "the environment has ('lidar',)",
+        ),
+        (
+            ["eval", "go1gate", "--export", "{mean}", "--policy", "idle"],
+            "policy: 'idle' is not allowed; it",
+        ),
+        (
+            ["export", "{run}", "--sampled", "--onnx", "a.onnx"],
+            "sampled: is not allowed for the graph of a team",
+        ),
     ],
-)  # fmt: skip
+)
 def test_commands_refuse_in_a_line(words: list[str], said: str, files: Any, capfd: Any) -> None:
     assert cli.main([word.format(**files) for word in words]) == 2
     err = capfd.readouterr().err

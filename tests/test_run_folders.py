@@ -1,4 +1,6 @@
-"""Run folders that are lost or replaced while a training writes; files written whole; several seeds in one program."""
+"""Run folders that are lost or replaced while a training writes; files written whole; several seeds
+in one program.
+"""
 
 import json
 import os
@@ -48,17 +50,23 @@ def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> N
     folder = tmp_path / "runs" / "run"
 
     def lose(state: object, row: dict[str, float]) -> None:
-        if row["updates"] == (2 if how == "replaced" else 1):  # followed by a checkpoint, or by a row
+        # followed by a checkpoint, or by a row
+        if row["updates"] == (2 if how == "replaced" else 1):
             LOST[how](folder)
 
-    with pytest.raises(InputError, match=f"run_dir: {folder} was removed, renamed or replaced; nothing more is"):
+    with pytest.raises(
+        InputError, match=f"run_dir: {folder} was removed, renamed or replaced; nothing more is"
+    ):
         train(PROBE, SETTINGS, folder, on_update=lose)
     assert not folder.exists() or list(folder.iterdir()) == []
     moved = next(tmp_path.rglob("moved"), tmp_path / "other" / "run")
     if how != "removed":
         assert [path.name for path in list_checkpoints(moved)] == ["step_000000000000.safetensors"]
-        assert len((moved / "metrics.csv").read_text().splitlines()) == (3 if how == "replaced" else 2)
-    assert [path.name for path in tmp_path.rglob(".*")] == [files.LOCK] * (how != "removed")  # not through the old path
+        assert len((moved / "metrics.csv").read_text().splitlines()) == (
+            3 if how == "replaced" else 2
+        )
+    # not through the old path
+    assert [path.name for path in tmp_path.rglob(".*")] == [files.LOCK] * (how != "removed")
 
 
 def test_a_folder_that_is_lost_while_a_file_is_written_gets_none(tmp_path: Path) -> None:
@@ -88,7 +96,8 @@ def test_seeds_and_a_single_run_do_not_share_a_folder(capfd: pytest.CaptureFixtu
 
 @pytest.mark.parametrize("name", ["checkpoints", "best", "metrics.csv"])
 def test_a_training_writes_and_removes_nothing_through_links(name: str, tmp_path: Path) -> None:
-    run, other = tmp_path / "run", tmp_path / "other"
+    run = tmp_path / "run"
+    other = tmp_path / "other"
     run.mkdir()
     other.mkdir()
     (other / "step_000000000001.safetensors").touch()
@@ -112,7 +121,9 @@ def test_policies_of_others_beside_the_best_one_stay(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "best").iterdir()] == ["mine.safetensors"]
 
 
-def test_temporary_files_are_new_and_unpredictable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_temporary_files_are_new_and_unpredictable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with replacing(tmp_path / "a") as first, replacing(tmp_path / "a") as second:
         assert first != second and first.stat().st_mode & 0o777 == 0o666 & ~os.umask(os.umask(0o22))
     monkeypatch.setattr("secrets.token_hex", lambda size: 16 * "a")
@@ -124,10 +135,17 @@ def test_temporary_files_are_new_and_unpredictable(tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "foreign").exists()
 
 
-def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, seen = tmp_path / "policy.safetensors", []
+def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "policy.safetensors"
+    seen = []
     path.write_bytes(b"old")
-    monkeypatch.setattr(os, "fsync", lambda descriptor: seen.append((path.read_bytes(), os.fstat(descriptor).st_size)))
+    monkeypatch.setattr(
+        os,
+        "fsync",
+        lambda descriptor: seen.append((path.read_bytes(), os.fstat(descriptor).st_size)),
+    )
     files.write_atomically(path, b"the new one")
     assert seen == [(b"old", len(b"the new one"))]  # flushed before it is renamed
     assert path.read_bytes() == b"the new one" and list(tmp_path.iterdir()) == [path]
@@ -147,9 +165,12 @@ def seeded(seed: int, **values: Any) -> TrainConfig:
     return settings(seed=seed, **{"checkpoint__every": 1, **values})
 
 
-def test_seeds_killed_between_two_checkpoints_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seeds_killed_between_two_checkpoints_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where each keeps one checkpoint, they keep the one before too, which all have."""
-    configs, folders = [seeded(seed, checkpoint__kept=1) for seed in (0, 1)], [tmp_path / "0", tmp_path / "1"]
+    configs = [seeded(seed, checkpoint__kept=1) for seed in (0, 1)]
+    folders = [tmp_path / "0", tmp_path / "1"]
     save = runner.save_checkpoint
 
     def killed(folder: Path, tree: Any, step: int, *arguments: Any) -> Path:
@@ -193,9 +214,13 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
         (policy,) = (folder / "best").glob("*.safetensors")
         chosen = read_policy(policy)
         assert chosen.metadata["env_steps"] == best["env_steps"]
-        (again,) = Monitor(PROBE, configs[0]).evaluate([chosen], [best["env_steps"]], 40, absolute=True)
+        (again,) = Monitor(PROBE, configs[0]).evaluate(
+            [chosen], [best["env_steps"]], 40, absolute=True
+        )
         assert record["absolute"]["sampled"] == again["sampled"]
-        assert best["deterministic"]["average_step_reward"] != best["sampled"]["average_step_reward"]
+        assert (
+            best["deterministic"]["average_step_reward"] != best["sampled"]["average_step_reward"]
+        )
 
 
 def test_seeds_need_the_same_settings_and_evaluation_needs_environments(tmp_path: Path) -> None:
@@ -205,7 +230,9 @@ def test_seeds_need_the_same_settings_and_evaluation_needs_environments(tmp_path
 
 
 def test_a_compiled_program_is_stored_whole_or_not_at_all(tmp_path: Path) -> None:
-    """JAX reads a file that was cut off, by a kill or a full disk, in vain at every start, and never replaces it."""
+    """JAX reads a file that was cut off, by a kill or a full disk, in vain at every start, and
+    never replaces it.
+    """
     from jax._src.lru_cache import LRUCache
 
     programs.write_whole()

@@ -1,4 +1,6 @@
-"""Robots and motors: compiled models, robots as data, torque-speed curves and limits on every engine, payloads."""
+"""Robots and motors: compiled models, robots as data, torque-speed curves and limits on every
+engine, payloads.
+"""
 
 import dataclasses
 from collections.abc import Iterator
@@ -76,16 +78,28 @@ def test_legs_and_what_is_drawn_of_the_trunk_are_mirror_images(name: str) -> Non
     model = compiled(robots.get(name)).model
     for leg in LEGS:
         for link in ("hip", "thigh", "calf"):
-            signs = np.array([-1.0 if link == "hip" and leg[0] == "R" else 1.0, 1.0 if leg[1] == "L" else -1.0, 1.0])
+            signs = np.array(
+                [
+                    -1.0 if link == "hip" and leg[0] == "R" else 1.0,
+                    1.0 if leg[1] == "L" else -1.0,
+                    1.0,
+                ]
+            )
             com = model.body(f"robot0/FL_{link}").ipos
-            np.testing.assert_allclose(model.body(f"robot0/{leg}_{link}").ipos, signs * com, atol=1e-12)
+            np.testing.assert_allclose(
+                model.body(f"robot0/{leg}_{link}").ipos, signs * com, atol=1e-12
+            )
             reflected = np.outer(signs, signs) * tensor(model, f"FL_{link}")
             np.testing.assert_allclose(tensor(model, f"{leg}_{link}"), reflected, atol=1e-9)
 
 
 def test_principal_inertia_is_turned_into_the_link_frame() -> None:
-    """A quarter turn about z swaps x and y; the compiled model has the principal moments of the Go2's trunk."""
-    turned = Link.from_principal(1.0, (0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5))
+    """A quarter turn about z swaps x and y; the compiled model has the principal moments of the
+    Go2's trunk.
+    """
+    turned = Link.from_principal(
+        1.0, (0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+    )
     np.testing.assert_allclose(turned.matrix(), np.diag([2.0, 1.0, 3.0]), atol=1e-12)
     trunk = compiled(robots.get("go2")).model.body("robot0/trunk")
     np.testing.assert_allclose(np.sort(trunk.inertia), [0.0245, 0.0981, 0.1070], rtol=1e-6)
@@ -107,26 +121,41 @@ def test_closed_form_feet_are_where_mujoco_puts_them(name: str) -> None:
     np.testing.assert_allclose(knee_positions(robot, jnp.asarray(joints)), knees, atol=1e-5)
 
 
-@pytest.mark.parametrize("task", ["go1football-2vs2", "go1revolvingdoor", "go1seesaw", "go1pushbox"])
+@pytest.mark.parametrize(
+    "task", ["go1football-2vs2", "go1revolvingdoor", "go1seesaw", "go1pushbox"]
+)
 def test_poses_of_all_bodies_are_where_mujoco_puts_them(task: str) -> None:
-    env, random = made(task), np.random.default_rng(0)
+    env = made(task)
+    random = np.random.default_rng(0)
     model = env.compiled.model
     data = mujoco.MjData(model)
     mujoco.mj_integratePos(model, data.qpos, random.normal(size=model.nv), 1.0)
     data.mocap_pos += random.normal(size=data.mocap_pos.shape)
     mujoco.mj_kinematics(model, data)
     names = "qpos", "mocap_pos", "mocap_quat"
-    state: Any = SimpleNamespace(**{name: jnp.asarray(getattr(data, name), jnp.float32) for name in names})
+    state: Any = SimpleNamespace(
+        **{name: jnp.asarray(getattr(data, name), jnp.float32) for name in names}
+    )
     found = poses(model, state, range(model.nbody))
     np.testing.assert_allclose(found.position, data.xpos, atol=1e-5)
-    np.testing.assert_allclose(np.abs(np.sum(found.quaternion * data.xquat, axis=1)), 1.0, atol=1e-5)
+    np.testing.assert_allclose(
+        np.abs(np.sum(found.quaternion * data.xquat, axis=1)), 1.0, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("name", list(robots.ROBOTS))
 def test_stands_on_its_default_pose(name: str) -> None:
     robot = robots.get(name)
-    env = make("go1plane", impl="c", control="position", robot=name, spawn_velocity=0.0, spawn_joint_scale=(1.0, 1.0))
-    state, step = jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.jit(env.step)
+    env = make(
+        "go1plane",
+        impl="c",
+        control="position",
+        robot=name,
+        spawn_velocity=0.0,
+        spawn_joint_scale=(1.0, 1.0),
+    )
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(env.step)
     for _ in range(100):
         state = step(state, np.zeros((env.num_agents, 12), np.float32))
     robot_state = jax.jit(env.read)(state.data)
@@ -158,7 +187,10 @@ def test_collision_sets_are_swapped_as_data() -> None:
     scene = compiled(dataclasses.replace(GO1, collision=shapes), 2)
     assert scene.index.trunk_force.shape == (2, 2, 3) and scene.index.geoms.shape == (2, 2 + 4 + 4)
     model = scene.model
-    thigh, foot, own = (model.geom(f"robot{i}/{name}") for i, name in ((0, "FL_thigh"), (1, "RR_foot"), (0, "RL_foot")))
+    thigh, foot, own = (
+        model.geom(f"robot{i}/{name}")
+        for i, name in ((0, "FL_thigh"), (1, "RR_foot"), (0, "RL_foot"))
+    )
 
     def touch(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
         return bool(a.contype[0] & b.conaffinity[0] or b.contype[0] & a.conaffinity[0])
@@ -170,7 +202,12 @@ def test_collision_sets_are_swapped_as_data() -> None:
 
 
 def test_wrong_data_is_refused_by_name() -> None:
-    refuses(r"Robot\.torque_limit: shape \(3,\); expected \(12,\)", dataclasses.replace, GO1, torque_limit=np.ones(3))
+    refuses(
+        r"Robot\.torque_limit: shape \(3,\); expected \(12,\)",
+        dataclasses.replace,
+        GO1,
+        torque_limit=np.ones(3),
+    )
     refuses(r"Robot\.default_joints", dataclasses.replace, GO1, default_joints=np.zeros(12))
     with pytest.raises(InputError, match=r"Robot\.collision: duplicate names foot"):
         dataclasses.replace(GO1, collision=(*GO1.collision, GO1.collision[-1]))
@@ -178,7 +215,11 @@ def test_wrong_data_is_refused_by_name() -> None:
 
 
 def test_missing_walk_weights_say_how_to_make_them() -> None:
-    robots.register(dataclasses.replace(GO1, name="new", walk=dataclasses.replace(GO1.walk, weights="walk_new.x")))
+    robots.register(
+        dataclasses.replace(
+            GO1, name="new", walk=dataclasses.replace(GO1.walk, weights="walk_new.x")
+        )
+    )
     try:
         said = r"no weights are shipped for new.*mqe skill train walk --robot new.*'position'"
         refuses(said, make, "go1gate", impl="c", robot="new")
@@ -194,8 +235,15 @@ def test_idle_motors_keep_their_control_and_have_no_armature(name: str) -> None:
     random = np.random.default_rng(0)
     scale = random.uniform(0.0, 1.2, (2, 4000, 1))
     shares = (scale * random.uniform(-1.0, 1.0, (2, 4000, 12))).astype(np.float32)
-    asked, velocity = shares[0] * motors.torque, shares[1] * motors.speed
-    arguments = asked, np.zeros_like(asked), velocity, np.ones(12, np.float32), np.zeros((12, 3), np.float32)
+    asked = shares[0] * motors.torque
+    velocity = shares[1] * motors.speed
+    arguments = (
+        asked,
+        np.zeros_like(asked),
+        velocity,
+        np.ones(12, np.float32),
+        np.zeros((12, 3), np.float32),
+    )
     ctrl, armature = motors.limit(np, *arguments)
     acts = (ctrl != asked).any(axis=1) | armature.any(axis=1)
     idle = motors.idle(*arguments)
@@ -206,19 +254,31 @@ def test_idle_motors_keep_their_control_and_have_no_armature(name: str) -> None:
 
 
 def test_steps_without_limits_are_taken_only_where_limits_have_no_effect(monkeypatch: Any) -> None:
-    """Twenty steps under actions of 0 to 100% are the same when the limits are evaluated in all environments."""
+    """Twenty steps under actions of 0 to 100% are the same when the limits are evaluated in all
+    environments.
+    """
     params = {"control": "torque", "num_agents": 1, "randomization": {"motor_strength": (0.7, 1.3)}}
     env: Any = make("go1plane", impl="c", num_envs=32, **params)
-    vector, keys = VectorEnv(env, 32), jax.random.split(jax.random.PRNGKey(1), 20)
-    start, step = jax.jit(vector.reset)(jax.random.PRNGKey(0)), jax.jit(vector.step)
-    scale, states, rollouts = jnp.linspace(0.0, 1.0, 32)[:, None, None], [], []
+    vector = VectorEnv(env, 32)
+    keys = jax.random.split(jax.random.PRNGKey(1), 20)
+    start = jax.jit(vector.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(vector.step)
+    scale = jnp.linspace(0.0, 1.0, 32)[:, None, None]
+    states = []
+    rollouts = []
     rollout = Batch.rollout
-    monkeypatch.setattr(Batch, "rollout", lambda *a, ids, **k: rollouts.append(len(ids)) or rollout(*a, ids=ids, **k))
+    monkeypatch.setattr(
+        Batch,
+        "rollout",
+        lambda *a, ids, **k: rollouts.append(len(ids)) or rollout(*a, ids=ids, **k),
+    )
     for share in (0.0, 1.0):
         monkeypatch.setattr(c, "SHARE", share)
         state = start
         for key in keys:
-            state = step(state, scale * jax.random.uniform(key, (32, 1, env.action_size), minval=-1.0))
+            state = step(
+                state, scale * jax.random.uniform(key, (32, 1, env.action_size), minval=-1.0)
+            )
         states.append(jax.tree.map(np.asarray, state))
     assert len(rollouts) == 20 and 0 < sum(rollouts) < 20 * 32
     jax.tree.map(np.testing.assert_array_equal, *states)
@@ -227,11 +287,22 @@ def test_steps_without_limits_are_taken_only_where_limits_have_no_effect(monkeyp
 def test_a_step_that_is_interrupted_leaves_no_armature(monkeypatch: Any) -> None:
     env: Any = make("go1plane", impl="c", control="torque", num_agents=1, num_envs=2)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
-    data = state.data.replace(qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(env.robot.joint_speed_limit))
+    data = state.data.replace(
+        qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(env.robot.joint_speed_limit)
+    )
     arrays = [
-        np.asarray(x) for x in (data.qpos, data.qvel, data.qacc_warmstart, np.tile(env.robot.torque_limit, (2, 1)))
+        np.asarray(x)
+        for x in (
+            data.qpos,
+            data.qvel,
+            data.qacc_warmstart,
+            np.tile(env.robot.torque_limit, (2, 1)),
+        )
     ]
-    call = lambda: env.physics._stepper.call((), False, env.physics.num_substeps, *arrays)  # noqa: E731
+
+    def call():
+        return env.physics._stepper.call((), False, env.physics.num_substeps, *arrays)
+
     expected = call()
 
     def interrupted(*_: Any, **__: Any) -> None:
@@ -247,13 +318,22 @@ def test_the_clamp_keeps_angle_and_speed_consistent() -> None:
     motors = compiled(GO1).motors
     velocity = np.where(np.arange(12) == 2, 3.0, 0.5) * motors.speed
     position, clamped = motors.clamp(np.zeros(12), velocity)
-    assert clamped[2] == pytest.approx(1.09 * motors.speed[2]) and np.all(np.delete(clamped == velocity, 2))
-    assert position[2] == pytest.approx(-0.005 * (3.0 - 1.09) * motors.speed[2]) and np.count_nonzero(position) == 1
+    assert clamped[2] == pytest.approx(1.09 * motors.speed[2]) and np.all(
+        np.delete(clamped == velocity, 2)
+    )
+    assert (
+        position[2] == pytest.approx(-0.005 * (3.0 - 1.09) * motors.speed[2])
+        and np.count_nonzero(position) == 1
+    )
 
 
 def test_the_response_is_that_of_a_leg() -> None:
     response = leg_response(robots.get("go1"))
-    assert response.shape == (3, 3) and np.all(np.diff(np.diag(response)[1:]) > 0) and response[1, 2] > 20.0
+    assert (
+        response.shape == (3, 3)
+        and np.all(np.diff(np.diag(response)[1:]) > 0)
+        and response[1, 2] > 20.0
+    )
     np.testing.assert_allclose(response, response.T, rtol=1e-6)
 
 
@@ -268,9 +348,15 @@ def test_joints_in_the_air_start_along_their_torque_line() -> None:
 def test_engines_agree_where_motors_saturate(robot: str) -> None:
     states = {}
     for impl in ("c", "jax"):
-        env: Any = make("go1plane", impl=impl, control="torque", robot=robot, num_agents=1, num_envs=4)
+        env: Any = make(
+            "go1plane", impl=impl, control="torque", robot=robot, num_agents=1, num_envs=4
+        )
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
-        speed = 0.9 * env.robot.joint_speed_limit * jax.random.uniform(jax.random.PRNGKey(1), (4, 12), minval=-1.0)
+        speed = (
+            0.9
+            * env.robot.joint_speed_limit
+            * jax.random.uniform(jax.random.PRNGKey(1), (4, 12), minval=-1.0)
+        )
         qvel = np.array(state.data.qvel)
         qvel[:, env.index.joint_qvel[0]] = speed
         data = state.data.replace(qvel=jnp.asarray(qvel))
@@ -278,28 +364,41 @@ def test_engines_agree_where_motors_saturate(robot: str) -> None:
         step = jax.jit(jax.vmap(lambda d, t, env=env: env.physics.step(d, t)[0]))
         states[impl] = step.lower(data, torque).compile(compiler_options=QUICK)(data, torque)
     for field, atol in (("qpos", 1e-4), ("qvel", 0.02)):
-        expected, other = (np.asarray(getattr(states[impl], field)) for impl in ("c", "jax"))
+        expected = np.asarray(getattr(states["c"], field))
+        other = np.asarray(getattr(states["jax"], field))
         np.testing.assert_allclose(other, expected, atol=atol, err_msg=field)
-    assert np.all(np.asarray(states["c"].ctrl) == np.asarray(torque))  # of the step, not of its last physics step
+    # of the step, not of its last physics step
+    assert np.all(np.asarray(states["c"].ctrl) == np.asarray(torque))
 
 
 def test_joint_mechanics_are_in_the_model() -> None:
     env: Any = make("go1plane", impl="c", num_agents=1, joint_mechanics=True)
-    joints, model = env.index.joint_qvel[0], env.compiled.model
+    joints = env.index.joint_qvel[0]
+    model = env.compiled.model
     np.testing.assert_allclose(model.dof_armature[joints], env.robot.rotor_inertia)
     np.testing.assert_allclose(model.dof_damping[joints], env.robot.joint_damping)
     assert not model.dof_dampingpoly.any()
     np.testing.assert_allclose(model.dof_frictionloss[joints], env.robot.friction_loss)
     plain: Any = make("go1plane", impl="c", num_agents=1)
-    assert not plain.compiled.model.dof_armature.any() and not plain.compiled.model.dof_frictionloss.any()
+    assert (
+        not plain.compiled.model.dof_armature.any()
+        and not plain.compiled.model.dof_frictionloss.any()
+    )
 
 
 @pytest.mark.parametrize("robot", ["go1", "go2"])
 def test_legs_with_joint_mechanics_stay_finite(robot: str) -> None:
-    settings: dict[str, Any] = {"num_agents": 2, "num_envs": 8, "control": "position", "robot": robot}
+    settings: dict[str, Any] = {
+        "num_agents": 2,
+        "num_envs": 8,
+        "control": "position",
+        "robot": robot,
+    }
     env: Any = make("go1plane", impl="c", joint_mechanics=True, **settings)
-    step, key = jax.jit(jax.vmap(env.step)), jax.random.PRNGKey(0)
-    state, fastest = jax.jit(jax.vmap(env.reset))(jax.random.split(key, 8)), 0.0
+    step = jax.jit(jax.vmap(env.step))
+    key = jax.random.PRNGKey(0)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, 8))
+    fastest = 0.0
     for each in jax.random.split(key, 50):
         state = step(state, 0.3 * jax.random.normal(each, (8, 2, env.action_size)))
         fastest = max(fastest, float(jnp.abs(state.data.qvel[:, env.index.joint_qvel]).max()))
@@ -307,11 +406,15 @@ def test_legs_with_joint_mechanics_stay_finite(robot: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "impl", ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=pytest.mark.gpu)]
+    "impl",
+    ["c", pytest.param("jax", marks=pytest.mark.soak), pytest.param("warp", marks=pytest.mark.gpu)],
 )
 def test_payloads_act_as_in_models_compiled_with_them(impl: str) -> None:
-    env = make("go1plane", impl=impl, control="position", num_envs=2, randomization={"payload": (0.0, 6.0)})
-    model, trunk = env.compiled.model, env.index.trunk_body
+    env = make(
+        "go1plane", impl=impl, control="position", num_envs=2, randomization={"payload": (0.0, 6.0)}
+    )
+    model = env.compiled.model
+    trunk = env.index.trunk_body
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
     start = state.data.replace(qpos=state.data.qpos.at[:, env.index.base_qpos[:, 2]].set(2.0))
     fields = jax.vmap(env.randomizer.fields)(state.randomized)
@@ -330,7 +433,9 @@ def test_payloads_act_as_in_models_compiled_with_them(impl: str) -> None:
         qvel = []
         for used in (compiled, model):
             mujoco.mj_resetData(used, data)
-            data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos[number], start.qvel[number], start.ctrl[number]
+            data.qpos[:] = start.qpos[number]
+            data.qvel[:] = start.qvel[number]
+            data.ctrl[:] = start.ctrl[number]
             mujoco.mj_step(used, data, 20)
             qvel.append(data.qvel.copy())
         np.testing.assert_allclose(after[number], qvel[0], atol=1e-3)

@@ -1,4 +1,6 @@
-"""Sensors against MuJoCo's rays on a model built from the declared shapes; memory, mirrored frames, settings."""
+"""Sensors against MuJoCo's rays on a model built from the declared shapes; memory, mirrored frames,
+settings.
+"""
 
 import dataclasses
 import itertools
@@ -27,22 +29,33 @@ from tests.sensing import EXACT, RANGE, SENSING, Shapes, rays, readings, scatter
 from tests.states import initial, made, placed
 
 LIKE_OTHERS = ("go1sheep-easy", "go1football-1vs1", "go1football-defender")
-EACH = [pytest.param(task, marks=pytest.mark.soak if task in LIKE_OTHERS else ()) for task in SENSING]
+EACH = [
+    pytest.param(task, marks=pytest.mark.soak if task in LIKE_OTHERS else ()) for task in SENSING
+]
 COUNTS = [5, pytest.param(500, marks=pytest.mark.soak)]
 
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("task", EACH)
 def test_the_lidar_agrees_with_mujoco_on_the_declared_shapes(task: str, count: int) -> None:
-    env, states = made(task), scattered(task, count)
-    read, shapes = readings(env, states, Lidar(range=RANGE)), Shapes(env)
+    env = made(task)
+    states = scattered(task, count)
+    read = readings(env, states, Lidar(range=RANGE))
+    shapes = Shapes(env)
     for number in range(count):
-        shapes.place(np.asarray(states.data.qpos[number], float), np.asarray(states.anchors[number], float))
+        shapes.place(
+            np.asarray(states.data.qpos[number], float), np.asarray(states.anchors[number], float)
+        )
         for agent, origin, angles in rays(env, states, number):
-            origin, body = np.array([*origin[:2], 0.0]), env.index.trunk_body[agent]
+            origin = np.array([*origin[:2], 0.0])
+            body = env.index.trunk_body[agent]
             # Near an edge float32 may see either side of it.
-            beside = [[shapes.ray(origin, angle + shift, body) for angle in angles] for shift in (-1e-5, 0.0, 1e-5)]
-            low, high = np.minimum(np.min(beside, axis=0), RANGE), np.minimum(np.max(beside, axis=0), RANGE)
+            beside = [
+                [shapes.ray(origin, angle + shift, body) for angle in angles]
+                for shift in (-1e-5, 0.0, 1e-5)
+            ]
+            low = np.minimum(np.min(beside, axis=0), RANGE)
+            high = np.minimum(np.max(beside, axis=0), RANGE)
             assert np.all((read[number, agent] > low - 1e-4) & (read[number, agent] < high + 1e-4))
 
 
@@ -50,8 +63,12 @@ def test_the_lidar_agrees_with_mujoco_on_the_declared_shapes(task: str, count: i
 @pytest.mark.parametrize("task", EACH)
 def test_visibility_agrees_with_mujoco_on_the_declared_shapes(task: str, count: int) -> None:
     """Outside of 1 cm of an edge: where no line of sight with its ends 1 cm beside differs."""
-    env, states, shapes, sensor = made(task), scattered(task, count), Shapes(made(task)), Detections()
-    scene, checked = env.suite.scene, set()
+    env = made(task)
+    states = scattered(task, count)
+    shapes = Shapes(made(task))
+    sensor = Detections()
+    scene = env.suite.scene
+    checked = set()
 
     def see(state: State) -> jax.Array:
         return sensor.visible(scene, env.snapshot(state, env.read(state.data)))
@@ -61,9 +78,15 @@ def test_visibility_agrees_with_mujoco_on_the_declared_shapes(task: str, count: 
         anchors = np.asarray(states.anchors[number], float)
         shapes.place(np.asarray(states.data.qpos[number], float), anchors)
         names = [entity.place for entity in env.entities]
-        bodies = [*env.index.trunk_body, *(-2 if isinstance(x, int) else env.objects[x].body for x in names)]
+        bodies = [
+            *env.index.trunk_body,
+            *(-2 if isinstance(x, int) else env.objects[x].body for x in names),
+        ]
         spots = [shapes.scene.xpos[body, :2] if body >= 0 else None for body in bodies]
-        spots = [anchors[x] if at is None else at for x, at in zip([*env.index.trunk_body, *names], spots, strict=True)]
+        spots = [
+            anchors[x] if at is None else at
+            for x, at in zip([*env.index.trunk_body, *names], spots, strict=True)
+        ]
         for agent, row in itertools.product(range(env.num_agents), range(len(spots))):
             if row == agent:
                 continue
@@ -73,10 +96,17 @@ def test_visibility_agrees_with_mujoco_on_the_declared_shapes(task: str, count: 
                 way = spots[row] - spots[agent]
                 ahead = way / np.linalg.norm(way)
                 side = np.array([-ahead[1], ahead[0]])
-                start, end = spots[agent] + near * side, spots[row] + far * side + along * ahead
-                distance, angle = np.linalg.norm(end - start), np.arctan2(*(end - start)[::-1])
-                bearing = np.abs((angle - 2 * np.arctan2(base[6], base[3]) + np.pi) % (2 * np.pi) - np.pi)
-                free = shapes.ray(np.array([*start, 0.0]), angle, bodies[agent], bodies[row]) > distance
+                start = spots[agent] + near * side
+                end = spots[row] + far * side + along * ahead
+                distance = np.linalg.norm(end - start)
+                angle = np.arctan2(*(end - start)[::-1])
+                bearing = np.abs(
+                    (angle - 2 * np.arctan2(base[6], base[3]) + np.pi) % (2 * np.pi) - np.pi
+                )
+                free = (
+                    shapes.ray(np.array([*start, 0.0]), angle, bodies[agent], bodies[row])
+                    > distance
+                )
                 views.append(bool(free and distance < 6.0 and np.degrees(bearing) < 60))
             if len({*views}) == 1:
                 checked |= {views[0]}
@@ -88,11 +118,15 @@ def test_visibility_agrees_with_mujoco_on_the_declared_shapes(task: str, count: 
 
 
 def test_a_detection_is_kept_with_its_age() -> None:
-    env, sensor = made("go1gate"), EXACT[1]
-    layout, see = ObservationLayout(sensor.layout(env.suite.scene)), sense(env, sensor)
+    env = made("go1gate")
+    sensor = EXACT[1]
+    layout = ObservationLayout(sensor.layout(env.suite.scene))
+    see = sense(env, sensor)
 
     def mate(position: Any, yaw: float, memory: Any) -> tuple[list[float], bool, Any]:
-        blocks, memory = see(placed(env, [position, [2.0, 0.5, 0.3]], [[0, 0, yaw], [0, 0, 0.5]]), memory)
+        blocks, memory = see(
+            placed(env, [position, [2.0, 0.5, 0.3]], [[0, 0, yaw], [0, 0, 0.5]]), memory
+        )
         (entry,), (there,) = layout.entities(layout.pack(blocks)[0], "mates")
         return np.asarray(entry).round(5).tolist(), bool(there), memory
 
@@ -110,43 +144,68 @@ def test_a_detection_is_kept_with_its_age() -> None:
 
 @pytest.mark.parametrize("task", ["go1revolvingdoor", "go1bridge"])
 def test_sensors_of_the_second_team_are_mirrored_as_its_frame(task: str) -> None:
-    """The second robot is the image of the first: everything reads alike. Odometry follows the true pose."""
-    env, rng = made(task), np.random.default_rng(0)
-    state, reflect = initial(env), task == "go1revolvingdoor"
-    joints, speeds = GO1.default_joints + rng.normal(0, 0.2, 12), rng.normal(size=12)
-    image = lambda x: x[MIRRORED_JOINTS] * MIRRORED_SIGNS if reflect else x  # noqa: E731
-    spin, sign = np.array([0.3, -0.4, 0.5]), np.array([-1, 1, -1]) if reflect else np.ones(3)
-    position, euler = np.array([1.1, 0.5, 0.3]), np.array([0.1, 0.2, 0.4])
+    """The second robot is the image of the first: everything reads alike.
+
+    Odometry follows the true pose.
+    """
+    env = made(task)
+    rng = np.random.default_rng(0)
+    state = initial(env)
+    reflect = task == "go1revolvingdoor"
+    joints = GO1.default_joints + rng.normal(0, 0.2, 12)
+    speeds = rng.normal(size=12)
+
+    def image(x):
+        return x[MIRRORED_JOINTS] * MIRRORED_SIGNS if reflect else x
+
+    spin = np.array([0.3, -0.4, 0.5])
+    sign = np.array([-1, 1, -1]) if reflect else np.ones(3)
+    position = np.array([1.1, 0.5, 0.3])
+    euler = np.array([0.1, 0.2, 0.4])
     middle = np.array([*env.center, 0.0])
     other = position * [1, -1, 1] if reflect else 2 * middle - position + [0, 0, 0.6]
     turned = euler * sign if reflect else euler + np.array([0, 0, np.pi])
     state = placed(env, [position, other], [euler, turned])
-    qpos, qvel = np.array(state.data.qpos), np.array(state.data.qvel)
-    qpos[env.index.joint_qpos], qvel[env.index.joint_qvel] = [joints, image(joints)], [speeds, image(speeds)]
+    qpos = np.array(state.data.qpos)
+    qvel = np.array(state.data.qvel)
+    qpos[env.index.joint_qpos] = [joints, image(joints)]
+    qvel[env.index.joint_qvel] = [speeds, image(speeds)]
     qvel[env.index.base_qvel[:, 3:]] = [spin, spin * sign]
-    state = dataclasses.replace(state, data=state.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)))
+    state = dataclasses.replace(
+        state, data=state.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
+    )
     for sensor in EXACT:
         blocks, _ = sense(env, sensor)(state, sensor.init_memory(env.suite.scene))
         for name, (first, second) in blocks.items():
             np.testing.assert_allclose(first, second, atol=1e-5, err_msg=name)
-    for name, (first, second) in env.observe_group("proprioception", state, env.read(state.data)).items():
+    for name, (first, second) in env.observe_group(
+        "proprioception", state, env.read(state.data)
+    ).items():
         np.testing.assert_allclose(first, second, atol=1e-5, err_msg=name)
 
 
 def test_senses_add_a_group_and_change_nothing_else() -> None:
-    """Their memory advances once a step, with or without final observations, and restarts with the episode."""
+    """Their memory advances once a step, with or without final observations, and restarts with the
+    episode.
+    """
     options: Any = {"impl": "c", "control": "position", "num_envs": 2}
     senses = (*EXACT[:2], Lidar(pipeline={"all": Pipeline(history=2)}))
-    blind, env = make("go1bridge", **options), make("go1bridge", **options, senses=senses)
+    blind = make("go1bridge", **options)
+    env = make("go1bridge", **options, senses=senses)
     batches = [VectorEnv(blind, 2), VectorEnv(env, 2).with_groups(["onboard"])]
     batches.append(VectorEnv(env, 2, final=()).with_groups(["onboard"]))
     states = [jax.jit(batch.reset)(jax.random.PRNGKey(0)) for batch in batches]
-    steps, action = [jax.jit(batch.step) for batch in batches], np.full((2, 2, 12), 0.3, np.float32)
+    steps = [jax.jit(batch.step) for batch in batches]
+    action = np.full((2, 2, 12), 0.3, np.float32)
 
     @jax.jit
     def sensed(state: State) -> tuple[dict[str, jax.Array], jax.Array]:
-        x, y, _, _, _, yaw = jnp.moveaxis(jax.vmap(env.own_frame)(jax.vmap(env.read)(state.data).base_info), -1, 0)
-        return env.groups["onboard"].split(state.groups["onboard"]), jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw)], -1)
+        x, y, _, _, _, yaw = jnp.moveaxis(
+            jax.vmap(env.own_frame)(jax.vmap(env.read)(state.data).base_info), -1, 0
+        )
+        return env.groups["onboard"].split(state.groups["onboard"]), jnp.stack(
+            [x, y, jnp.cos(yaw), jnp.sin(yaw)], -1
+        )
 
     for count in range(4):
         if count == 2:
@@ -169,7 +228,9 @@ def test_senses_add_a_group_and_change_nothing_else() -> None:
 def test_a_pipeline_delays_drops_and_keeps_readings() -> None:
     block = entities("mates", "robot", 2, 1, masked=True)
     pipeline = Pipeline(noise=0.1, clip=(0.0, 3.0), scale=2.0, delay=2, dropout=0.3, history=2)
-    assert pipeline.block(block) == dataclasses.replace(block, width=8, entities=Entities("robot", 4, 1, True))
+    assert pipeline.block(block) == dataclasses.replace(
+        block, width=8, entities=Entities("robot", 4, 1, True)
+    )
     assert pipeline.block(image("depth", 2, 3)) == Block("depth", 12, image=(2, 2, 3))
 
     def play(pipeline: Pipeline, readings: np.ndarray) -> np.ndarray:
@@ -178,12 +239,15 @@ def test_a_pipeline_delays_drops_and_keeps_readings() -> None:
             return memory, out
 
         rng = np.random.default_rng(0)
-        noise, lost = rng.normal(size=readings.shape), rng.uniform(size=(len(readings), 2, 1)) < pipeline.dropout
+        noise = rng.normal(size=readings.shape)
+        lost = rng.uniform(size=(len(readings), 2, 1)) < pipeline.dropout
         given = readings, np.float32(noise), lost
         return np.asarray(jax.lax.scan(step, pipeline.init_memory(block, 2), given)[1])
 
     steps = 400
-    rows = np.stack([np.arange(steps) % 7.0, np.arange(steps) % 3 > 0, np.ones(steps), np.ones(steps)], axis=-1)
+    rows = np.stack(
+        [np.arange(steps) % 7.0, np.arange(steps) % 3 > 0, np.ones(steps), np.ones(steps)], axis=-1
+    )
     readings = np.stack([rows, rows + 0.5], axis=1).astype(np.float32)
     exact = play(Pipeline(delay=2, history=2), readings)
     np.testing.assert_array_equal(exact[:3, :, :4], readings[[0, 0, 0]])
@@ -203,11 +267,14 @@ def test_noise_is_drawn_from_the_state() -> None:
     """From a copy of a state the same readings follow, and others after another key."""
     env = make("go1gate", impl="c", control="position", num_envs=1, senses="onboard")
     batch = VectorEnv(env, 1).with_groups(["onboard"])
-    step, action = jax.jit(batch.step), jnp.zeros((1, 2, 12))
+    step = jax.jit(batch.step)
+    action = jnp.zeros((1, 2, 12))
     middle = step(jax.jit(batch.reset)(jax.random.PRNGKey(0)), action)
     copied = jax.device_put(jax.tree.map(np.array, middle))
     other = dataclasses.replace(middle, key=middle.key + 1)
-    first, again, changed = (step(step(state, action), action).groups["onboard"] for state in (middle, copied, other))
+    first = step(step(middle, action), action).groups["onboard"]
+    again = step(step(copied, action), action).groups["onboard"]
+    changed = step(step(other, action), action).groups["onboard"]
     np.testing.assert_array_equal(first, again)
     assert np.mean(np.asarray(first != changed)) > 0.5
 
@@ -215,7 +282,9 @@ def test_noise_is_drawn_from_the_state() -> None:
 class Watcher:
     """A policy that acts only if the last two readings of its lidar differ."""
 
-    task, agents, groups = "go1gate", 2, ("onboard",)
+    task = "go1gate"
+    agents = 2
+    groups = ("onboard",)
 
     def initial_memory(self, num_envs: int) -> Any:
         return ()
@@ -230,7 +299,9 @@ def test_a_recorded_policy_has_sensors_with_memory() -> None:
     env = make("go1gate", impl="c", control="position", num_envs=1, senses=senses)
     key = jax.random.PRNGKey(0)
     policies: list[Any] = [Watcher(), lambda obs, memory, key: (jnp.zeros((1, 2, 12)), memory)]
-    watched, still = (recording.record_episodes(env, each, key, seconds=0.2)[0].qpos for each in policies)
+    watched, still = (
+        recording.record_episodes(env, each, key, seconds=0.2)[0].qpos for each in policies
+    )
     assert np.abs(watched - still).max() > 0.01
 
 
@@ -250,7 +321,10 @@ def test_senses_are_settings() -> None:
         ([{"name": "lidar", "beams": 8}], r"^senses\.lidar\.beams: unknown name"),
         (["lidar", "lidar"], r"^senses: .*sensors of different names"),
         (3, r"^senses: 3 .*full, onboard"),
-        ([{"name": "lidar", "pipeline": {"lida": {}}}], r"senses.lidar.pipeline: 'lida' .*one of all, lidar"),
+        (
+            [{"name": "lidar", "pipeline": {"lida": {}}}],
+            r"senses.lidar.pipeline: 'lida' .*one of all, lidar",
+        ),
     ],
 )
 def test_bad_senses_are_named(senses: Any, message: str) -> None:
@@ -273,7 +347,9 @@ class Faulty(Sensor):
 
     def observe(self, scene: Any, snapshot: Any, memory: Any, key: Any) -> Any:
         yaw = snapshot.pose[:, 2:]
-        readings = {"name": {"jaw": yaw}, "shape": {"yaw": yaw[:, 0]}}.get(self.mistake, {"yaw": yaw})
+        readings = {"name": {"jaw": yaw}, "shape": {"yaw": yaw[:, 0]}}.get(
+            self.mistake, {"yaw": yaw}
+        )
         return readings, jnp.broadcast_to(memory, (2, 3)) if self.mistake == "memory" else memory
 
 
@@ -288,7 +364,10 @@ class Faulty(Sensor):
 )
 def test_mistakes_of_a_sensor_are_named(mistake: str, message: str) -> None:
     env = made("go1gate")
-    suite = Suite(env.suite.scene, (Lidar(rays=1), Faulty(mistake=mistake, pipeline={"all": Pipeline(delay=1)})))
+    suite = Suite(
+        env.suite.scene,
+        (Lidar(rays=1), Faulty(mistake=mistake, pipeline={"all": Pipeline(delay=1)})),
+    )
 
     def read(state: State) -> Any:
         return suite.observe(env.snapshot(state, env.read(state.data)), suite.reset(), state.key)

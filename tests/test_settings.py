@@ -1,4 +1,6 @@
-"""Settings classes: accepted values, and one-line errors with path, value and bounds; files of training settings."""
+"""Settings classes: accepted values, and one-line errors with path, value and bounds; files of
+training settings.
+"""
 
 import dataclasses
 import pickle
@@ -70,7 +72,10 @@ class Derived(Outer):
         ({"sizes": np.array([3, 4])}, {"sizes": (3, 4)}),
         ({"span": np.array([0, 1])}, {"span": (0.0, 1.0)}),
         ({"span": "none", "label": "none"}, {"span": None, "label": None}),
-        ({"inner": {"clip": np.float32(0.5)}, "inner.gamma": 0.5}, {"inner": Inner(clip=0.5, gamma=0.5)}),
+        (
+            {"inner": {"clip": np.float32(0.5)}, "inner.gamma": 0.5},
+            {"inner": Inner(clip=0.5, gamma=0.5)},
+        ),
         ({"free": {"a.b": 3}, "free.c.d": 4}, {"free": {"a": {"b": 3}, "c": {"d": 4}}}),
         ({"free": {"a": {"b": 3}}, "free.a": {"c": 4}}, {"free": {"a": {"b": 3, "c": 4}}}),
         ({"inner": Inner(clip=0.5), "inner.gamma": 0.5}, {"inner": Inner(clip=0.5, gamma=0.5)}),
@@ -107,9 +112,15 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"inner.clip": "much"}, "inner.clip: 'much' is not allowed; it must be a valid number"),
     ({"inner.dual": 1}, "inner.dual: 1 is not allowed; it must be greater than 1"),
     ({"inner.gamma": 1.1}, "inner.gamma: 1.1 is not allowed; it must be less than or equal to 1"),
-    ({"inner.kind": "agnet"}, "inner.kind: 'agnet' is not allowed; it must be 'agent' or 'joint' (did you"),
+    (
+        {"inner.kind": "agnet"},
+        "inner.kind: 'agnet' is not allowed; it must be 'agent' or 'joint' (did you",
+    ),
     ({"inner": {"clp": 1}}, "inner.clp: unknown name (value 1) (did you mean 'clip'?)"),
-    ({"inner": {"clip": 6, "kind": "joint"}}, "inner.clip: 6.0 is not allowed; it must be at most 5 when"),
+    (
+        {"inner": {"clip": 6, "kind": "joint"}},
+        "inner.clip: 6.0 is not allowed; it must be at most 5 when",
+    ),
     ({"inner.clip": 0.1, "inner": {"clip": 0.2}}, "inner.clip: is given twice"),
     ({"free.a.b": 1, "free": {"a": {"b": 1}}}, "free.a.b: is given twice"),
 ]
@@ -118,11 +129,17 @@ TRAINING: list[tuple[dict[str, Any], str]] = [
     ({"ppo": {"gama": 1.0}}, "ppo.gama: unknown name .*did you mean 'gamma'"),
     ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be greater than 0"),
     ({"ppo.ratio": "joint"}, "ppo.value: 'agent' .* 'joint' when ppo.ratio is 'joint'"),
-    ({"ppo.critic_warmup": 0.1, "network": {"name": "mat"}}, "ppo.critic_warmup: 0.1 .* 0 with the network mat"),
+    (
+        {"ppo.critic_warmup": 0.1, "network": {"name": "mat"}},
+        "ppo.critic_warmup: 0.1 .* 0 with the network mat",
+    ),
     ({"ppo.dual_clip": 0.5}, "ppo.dual_clip: 0.5 .* greater than 1"),
     ({"network.hidden_sizes": []}, "network.hidden_sizes: .* should have at least 1 item"),
     ({"network.hidden_size": 3}, "network.hidden_size: unknown name .* 'hidden_sizes'"),
-    ({"network.name": "actor_crtic"}, "network.name: 'actor_crtic' .* a registered network: .*actor_critic"),
+    (
+        {"network.name": "actor_crtic"},
+        "network.name: 'actor_crtic' .* a registered network: .*actor_critic",
+    ),
     ({"network.name": [1]}, r"network.name: \[1\] .* a registered network"),
     ({"network.log_std_min": 1.0}, r"network.log_std_init: 0.0 .* at least log_std_min \(1.0\)"),
     ({"network": 3}, "network: 3 is not allowed; it must be an instance of NetworkSettings"),
@@ -130,7 +147,11 @@ TRAINING: list[tuple[dict[str, Any], str]] = [
 """Settings of a training that are refused, and patterns of what is said."""
 
 
-DEEP = (Outer, {"free": {"a" + ".a" * 1000: 1}}, "a: .* is not allowed; it must be nested at most 32 deep")
+DEEP = (
+    Outer,
+    {"free": {"a" + ".a" * 1000: 1}},
+    "a: .* is not allowed; it must be nested at most 32 deep",
+)
 CASES = [
     DEEP,
     *((Derived, values, re.escape(said)) for values, said in REFUSED),
@@ -139,8 +160,12 @@ CASES = [
 
 
 @pytest.mark.parametrize(("kind", "values", "said"), CASES)
-@pytest.mark.parametrize("way", [build, lambda kind, values: override(kind(), values)], ids=["build", "override"])
-def test_refused_in_one_line(way: Callable[..., Any], kind: type[Any], values: dict[str, Any], said: str) -> None:
+@pytest.mark.parametrize(
+    "way", [build, lambda kind, values: override(kind(), values)], ids=["build", "override"]
+)
+def test_refused_in_one_line(
+    way: Callable[..., Any], kind: type[Any], values: dict[str, Any], said: str
+) -> None:
     refuses(f"^{said}", way, kind, values)
 
 
@@ -158,7 +183,10 @@ def test_overriding_merges_nested_records_and_free_mappings() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "values"),
-    [(GateParams, {"command_ranges": {"vx": (-1.0, 1.2)}}), (TrainConfig, {"env": {"commands": ["vx"]}})],
+    [
+        (GateParams, {"command_ranges": {"vx": (-1.0, 1.2)}}),
+        (TrainConfig, {"env": {"commands": ["vx"]}}),
+    ],
 )
 def test_records_can_be_hashed_and_copied(kind: type[Any], values: dict[str, Any]) -> None:
     given = build(kind, values)
@@ -178,7 +206,9 @@ def test_records_can_be_hashed_and_copied(kind: type[Any], values: dict[str, Any
         ({"a": Inner(clip=0.5)}, {"a.gamma": 0.5}, {"a": {**vars(Inner(clip=0.5)), "gamma": 0.5}}),
     ],
 )
-def test_the_second_of_two_mappings_replaces_only_what_it_names(first: Any, second: Any, expected: Any) -> None:
+def test_the_second_of_two_mappings_replaces_only_what_it_names(
+    first: Any, second: Any, expected: Any
+) -> None:
     before = repr((first, second))
     assert merge(first, second) == expected
     assert override(Outer(free=first), {"free": second}).free == expected
@@ -213,7 +243,14 @@ def test_files(tmp_path: Path) -> None:
 
 
 def test_parameters_in_training_change_those_that_they_name() -> None:
-    config = build(TrainConfig, {"env": {"rewards": {"collision": -5}}, "train_env": {"rewards": {"approach": 10}}})
+    config = build(
+        TrainConfig,
+        {"env": {"rewards": {"collision": -5}}, "train_env": {"rewards": {"approach": 10}}},
+    )
     assert config.training_env == {"rewards": {"collision": -5, "approach": 10}}
-    for changes in ({"env": {"rewards": {"success": 9}}}, {"env.rewards.success": 9}, {"env": {"rewards.success": 9}}):
+    for changes in (
+        {"env": {"rewards": {"success": 9}}},
+        {"env.rewards.success": 9},
+        {"env": {"rewards.success": 9}},
+    ):
         assert override(config, changes).env == {"rewards": {"collision": -5, "success": 9}}

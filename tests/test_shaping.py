@@ -1,4 +1,6 @@
-"""Help in training alone: shaping terms and head starts, which are off by default, and demonstrated first states."""
+"""Help in training alone: shaping terms and head starts, which are off by default, and demonstrated
+first states.
+"""
 
 import dataclasses
 import functools
@@ -17,7 +19,10 @@ from mqe_jax.train.config import TrainConfig
 from tests.inputs import refuses
 from tests.states import initial, made, terms_of
 
-BOX, BALL, DUEL, SUMO = "go1pushbox", "go1football-defender", "go1football-1vs1", "go1wrestling"
+BOX = "go1pushbox"
+BALL = "go1football-defender"
+DUEL = "go1football-1vs1"
+SUMO = "go1wrestling"
 GOAL = np.array([12.0, 0.0])
 
 
@@ -33,12 +38,21 @@ def resets(task: str, assistance: float, **params: Any) -> tuple[Any, State]:
     return env, reset(jax.random.split(jax.random.PRNGKey(3), 64), assistance)
 
 
-def moved(task: str, name: str, assistance: float, head_start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far assistance moves robots (64, R, 2) and an object (64, 2) at the reset, m, and where it is without."""
+def moved(
+    task: str, name: str, assistance: float, head_start: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far assistance moves robots (64, R, 2) and an object (64, 2) at the reset, m, and where
+    it is without.
+    """
     env, plain = resets(task, 0.0, head_start=head_start)
-    before, after = (np.asarray(x.data.qpos) for x in (plain, resets(task, assistance, head_start=head_start)[1]))
+    before = np.asarray(plain.data.qpos)
+    after = np.asarray(resets(task, assistance, head_start=head_start)[1].data.qpos)
     item = env.objects[name].qpos[:2]
-    return (after - before)[:, env.index.base_qpos[:, :2]], (after - before)[:, item], before[:, item]
+    return (
+        (after - before)[:, env.index.base_qpos[:, :2]],
+        (after - before)[:, item],
+        before[:, item],
+    )
 
 
 @pytest.mark.parametrize(("task", "name"), [(BOX, "box"), (BALL, "ball")])
@@ -55,7 +69,8 @@ def test_box_and_robots_start_further_by_the_same_distance() -> None:
 
 def test_head_starts_have_room() -> None:
     refuses(r"head_start: 1.0 .* at most 0.95", make, BOX, impl="c", head_start=1.0)
-    assert make(BOX, impl="c", num_envs=1, box_x=4.5).params.head_start == 0  # where there is no room for any
+    # where there is no room for any
+    assert make(BOX, impl="c", num_envs=1, box_x=4.5).params.head_start == 0
     refuses(r"head_start: 0.7 .* at most 0.60", make, SUMO, impl="c", head_start=0.7)
 
 
@@ -72,7 +87,9 @@ def test_ball_and_attackers_start_nearer_to_either_goal() -> None:
     robots, ball, _ = moved(DUEL, "ball", 1.0, 0.8)
     way = ball[:, :1]
     assert way.min() < -3.0 and way.max() > 3.0 and abs(way).max() <= 4.0
-    np.testing.assert_allclose(robots[..., 0], np.where(way > 0, [1.0, 0.0], [0.0, 1.0]) * way, atol=1e-6)
+    np.testing.assert_allclose(
+        robots[..., 0], np.where(way > 0, [1.0, 0.0], [0.0, 1.0]) * way, atol=1e-6
+    )
 
 
 def test_wrestlers_start_nearer_to_the_edge() -> None:
@@ -82,13 +99,20 @@ def test_wrestlers_start_nearer_to_the_edge() -> None:
 
 
 def terms_after(env: Any, state: State, columns: Any, values: Any) -> dict[str, float]:
-    data = state.data.replace(qpos=state.data.qpos.at[jnp.asarray(columns)].set(jnp.asarray(values)))
-    return {name: float(x) for name, x in terms_of(env, state, dataclasses.replace(state, data=data))[0].items()}
+    data = state.data.replace(
+        qpos=state.data.qpos.at[jnp.asarray(columns)].set(jnp.asarray(values))
+    )
+    return {
+        name: float(x)
+        for name, x in terms_of(env, state, dataclasses.replace(state, data=data))[0].items()
+    }
 
 
 def test_shaping_terms_of_push_box() -> None:
-    env, state = made(BOX), initial(made(BOX))
-    box, gate = env.objects["box"].qpos, float(state.anchors[0, 1])
+    env = made(BOX)
+    state = initial(made(BOX))
+    box = env.objects["box"].qpos
+    gate = float(state.anchors[0, 1])
     here = float(state.data.qpos[box[1]])
     nearer = terms_after(env, state, box[1:2], [here + 0.25 * (gate - here)])
     assert nearer["aim"] == pytest.approx(0.25 * abs(gate - here), abs=1e-5)
@@ -96,29 +120,38 @@ def test_shaping_terms_of_push_box() -> None:
     first = env.index.base_qpos[0, :2]
     place = position + np.array([-0.8, -0.25])
     start = np.asarray(state.data.qpos)[first]
-    assert terms_after(env, state, first, place)["approach"] == pytest.approx(np.linalg.norm(start - place), abs=1e-5)
+    assert terms_after(env, state, first, place)["approach"] == pytest.approx(
+        np.linalg.norm(start - place), abs=1e-5
+    )
     assert env.params.rewards.approach == env.params.rewards.aim == 0
 
 
 def test_shaping_terms_of_football() -> None:
-    env, state = made(BALL), initial(made(BALL))
+    env = made(BALL)
+    state = initial(made(BALL))
     ball = env.objects["ball"].qpos[:2]
     here = np.asarray(state.data.qpos)[ball]
     moved = here + 0.1 * (GOAL - here)
     terms = terms_after(env, state, ball, moved)
     assert terms["progress"] == pytest.approx(0.1 * np.linalg.norm(GOAL - here), abs=1e-4)
     robots = np.asarray(state.data.qpos)[env.index.base_qpos[:2, :2]]
-    near = lambda point: np.linalg.norm(robots - point, axis=1).min()  # noqa: E731
+
+    def near(point):
+        return np.linalg.norm(robots - point, axis=1).min()
+
     assert terms["approach"] == pytest.approx(near(here) - near(moved), abs=1e-4)
     assert env.params.rewards.progress == env.params.rewards.approach == 0
 
 
 def test_one_sided_shaping_of_a_football_match() -> None:
-    env, state = made(DUEL), initial(made(DUEL))
+    env = made(DUEL)
+    state = initial(made(DUEL))
     ball = jnp.asarray(env.objects["ball"].qpos[:1])
 
     def moved(state: State, x: float) -> tuple[State, np.ndarray]:
-        after = dataclasses.replace(state, data=state.data.replace(qpos=state.data.qpos.at[ball].set(x)))
+        after = dataclasses.replace(
+            state, data=state.data.replace(qpos=state.data.qpos.at[ball].set(x))
+        )
         now = Moment(after, env.read(after.data))
         after = dataclasses.replace(after, task=env.step_task(Moment(state, now.robots), now))
         return after, np.asarray(terms_of(env, state, after)[0]["advance"])
@@ -126,7 +159,9 @@ def test_one_sided_shaping_of_a_football_match() -> None:
     there, first = moved(state, 8.0)
     back, second = moved(there, 6.5)
     _, third = moved(back, 8.25)
-    np.testing.assert_allclose([first, second, third], [[1.0, 0.0], [0.0, 0.5], [0.25, 0.0]], atol=1e-4)
+    np.testing.assert_allclose(
+        [first, second, third], [[1.0, 0.0], [0.0, 0.5], [0.25, 0.0]], atol=1e-4
+    )
     robot = jnp.asarray(env.index.base_qpos[:, 0])
     qpos = state.data.qpos.at[robot].add(jnp.array([0.5, 0.0]))
     near = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
@@ -135,14 +170,25 @@ def test_one_sided_shaping_of_a_football_match() -> None:
 
 def test_a_goal_of_both_needs_touches_of_both() -> None:
     """A robot beside the ball touches it where its velocity changes."""
-    env, state = made(BALL), initial(made(BALL))
-    ball, speed = env.objects["ball"].qpos[:2], env.objects["ball"].qvel[0]
+    env = made(BALL)
+    state = initial(made(BALL))
+    ball = env.objects["ball"].qpos[:2]
+    speed = env.objects["ball"].qvel[0]
 
     def kicked(
-        state: State, robot: int, change: float, apart: float = 0.4, x: float = 6.0, other: float = 3.0
+        state: State,
+        robot: int,
+        change: float,
+        apart: float = 0.4,
+        x: float = 6.0,
+        other: float = 3.0,
     ) -> State:
         qpos = state.data.qpos.at[jnp.asarray(ball)].set(jnp.array([x, 0.0]))
-        places = jnp.array([[x, other], [x, -other], [10.0, 0.0]]).at[robot].set(jnp.array([x - apart, 0.0]))
+        places = (
+            jnp.array([[x, other], [x, -other], [10.0, 0.0]])
+            .at[robot]
+            .set(jnp.array([x - apart, 0.0]))
+        )
         qpos = qpos.at[jnp.asarray(env.index.base_qpos[:, :2])].set(places)
         qvel = state.data.qvel.at[speed].add(change)
         after = dataclasses.replace(state, data=state.data.replace(qpos=qpos, qvel=qvel))
@@ -151,10 +197,16 @@ def test_a_goal_of_both_needs_touches_of_both() -> None:
 
     first = kicked(state, 0, 0.5)
     assert first.task.play.touched.tolist() == [True, False, False]
-    assert kicked(state, 1, 0.5, other=0.5).task.play.touched.tolist() == [False, True, False]  # the nearest alone
-    for nothing in (kicked(state, 0, 0.05), kicked(state, 0, 0.5, apart=0.8), kicked(state, 2, 0.5)):
+    # the nearest alone
+    assert kicked(state, 1, 0.5, other=0.5).task.play.touched.tolist() == [False, True, False]
+    for nothing in (
+        kicked(state, 0, 0.05),
+        kicked(state, 0, 0.5, apart=0.8),
+        kicked(state, 2, 0.5),
+    ):
         assert not nothing.task.play.touched[:2].any()
-    alone, both = kicked(first, 0, 0.5, x=12.1), kicked(kicked(first, 1, 0.5), 2, 0.0, x=12.1)
+    alone = kicked(first, 0, 0.5, x=12.1)
+    both = kicked(kicked(first, 1, 0.5), 2, 0.0, x=12.1)
     late = kicked(alone, 1, 0.5, x=12.1)  # after the goal
     for end, together in ((alone, False), (both, True), (late, False)):
         outcome = env.outcome(end, env.read(end.data), jnp.array(False))
@@ -167,9 +219,12 @@ N = 32
 
 
 class Bending:
-    """A demonstrator that bends all joints further in every step of an episode, by its recurrent state."""
+    """A demonstrator that bends all joints further in every step of an episode, by its recurrent
+    state.
+    """
 
-    task, agents = "go1plane", 2
+    task = "go1plane"
+    agents = 2
 
     def initial_memory(self, num_envs: int) -> jax.Array:
         return jnp.ones(num_envs)
@@ -182,18 +237,31 @@ def test_a_demonstrator_needs_assistance_and_episodes_of_sixteen_steps() -> None
     with pytest.raises(InputError, match=r"curriculum\.assistance.*above 0"):
         build(TrainConfig, {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}})
     task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.2)
-    refuses(r"episode_length: 0\.2 .*at least 16 steps with a demonstrator", Demonstrated, task, N, Bending())
+    refuses(
+        r"episode_length: 0\.2 .*at least 16 steps with a demonstrator",
+        Demonstrated,
+        task,
+        N,
+        Bending(),
+    )
 
 
 def test_thousands_of_environments_have_a_demonstrator() -> None:
     """More than 4096, whose memory is checked before they are made."""
-    assert Demonstrated(make("go1plane", impl="c", control="position"), 4097, Bending()).num_envs == 4097
+    assert (
+        Demonstrated(make("go1plane", impl="c", control="position"), 4097, Bending()).num_envs
+        == 4097
+    )
 
 
 @pytest.fixture(scope="module")
 def rollout() -> tuple[Any, dict[str, Any]]:
-    """A batch of short episodes, and its states over two time limits for assistance 0 to 1, leading axis time."""
-    task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.64, min_height=0.3)
+    """A batch of short episodes, and its states over two time limits for assistance 0 to 1, leading
+    axis time.
+    """
+    task = make(
+        "go1plane", impl="c", num_envs=N, control="position", episode_length=0.64, min_height=0.3
+    )
     env = Demonstrated(task, N, Bending())
 
     @jax.jit
@@ -209,11 +277,15 @@ def rollout() -> tuple[Any, dict[str, Any]]:
         last, seen = jax.lax.scan(advance, state, None, length=2 * env.max_episode_steps)
         return last.demonstrations, seen
 
-    return env, {name: run(jnp.asarray(level)) for name, level in (("none", 0.0), ("few", 0.3), ("all", 1.0))}
+    return env, {
+        name: run(jnp.asarray(level)) for name, level in (("none", 0.0), ("few", 0.3), ("all", 1.0))
+    }
 
 
 def test_episodes_start_in_demonstrated_states(rollout: Any) -> None:
-    """With assistance 1 every new episode starts in a recorded state, with the time that was left to it."""
+    """With assistance 1 every new episode starts in a recorded state, with the time that was left
+    to it.
+    """
     env, runs = rollout
     demonstrations, (step, qpos, done) = runs["all"]
     recorded = demonstrations["step"], demonstrations["data"]["qpos"]
@@ -236,7 +308,10 @@ def test_the_assistance_is_the_share_of_demonstrated_starts(rollout: Any) -> Non
 def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> None:
     env, runs = rollout
     demonstrations = runs["all"][0]
-    step, ctrl = np.asarray(demonstrations["step"]), np.asarray(demonstrations["data"]["ctrl"])
+    step = np.asarray(demonstrations["step"])
+    ctrl = np.asarray(demonstrations["data"]["ctrl"])
     assert len(step) == 128 * 16 and len(set(step.tolist())) > 8
-    bent = (ctrl - env.env.controller.neutral.ravel()) / np.tile(env.env.robot.action_scale, env.num_agents)
+    bent = (ctrl - env.env.controller.neutral.ravel()) / np.tile(
+        env.env.robot.action_scale, env.num_agents
+    )
     np.testing.assert_allclose(bent, 0.01 * np.tile(step[:, None], bent.shape[1]), atol=1e-5)

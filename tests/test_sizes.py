@@ -1,4 +1,6 @@
-"""Sizes of teams and flocks: where robots and sheep start, their looks and buffers, the rules of larger teams."""
+"""Sizes of teams and flocks: where robots and sheep start, their looks and buffers, the rules of
+larger teams.
+"""
 
 import functools
 from collections.abc import Callable
@@ -21,7 +23,8 @@ from tests.inputs import refuses
 from tests.states import initial, observation, placed, terms_of, with_object
 
 GATE, EASY, HARD, BOX, FOOTBALL, SUMO = (
-    f"go1{name}" for name in ("gate", "sheep-easy", "sheep-hard", "pushbox", "football-1vs1", "wrestling")
+    f"go1{name}"
+    for name in ("gate", "sheep-easy", "sheep-hard", "pushbox", "football-1vs1", "wrestling")
 )
 
 
@@ -33,12 +36,30 @@ def ring(radius: float) -> dict[str, Any]:
 
 SIZES: dict[int, list[tuple[str, dict[str, Any]]]] = {
     2: [(task, {}) for task in (GATE, EASY, HARD, BOX, FOOTBALL, SUMO)],
-    4: [(GATE, {}), (EASY, {"num_sheep": 5}), (HARD, {"num_sheep": 30}), (BOX, {}), (FOOTBALL, {}), (SUMO, {})],
+    4: [
+        (GATE, {}),
+        (EASY, {"num_sheep": 5}),
+        (HARD, {"num_sheep": 30}),
+        (BOX, {}),
+        (FOOTBALL, {}),
+        (SUMO, {}),
+    ],
     8: [(GATE, {}), (EASY, {}), (HARD, {"num_sheep": 1}), (BOX, {}), (FOOTBALL, {}), (SUMO, {})],
-    16: [(GATE, {}), (EASY, {}), (HARD, {"num_sheep": 100}), (BOX, {}), (FOOTBALL, {}), (SUMO, ring(2.5))],
+    16: [
+        (GATE, {}),
+        (EASY, {}),
+        (HARD, {"num_sheep": 100}),
+        (BOX, {}),
+        (FOOTBALL, {}),
+        (SUMO, ring(2.5)),
+    ],
     32: [(GATE, {}), (EASY, {}), (HARD, {}), (BOX, {}), (FOOTBALL, {}), (SUMO, ring(4.8))],
 }
-ROWS = [pytest.param(task, size, settings, id=f"{task}-{size}") for size in SIZES for task, settings in SIZES[size]]
+ROWS = [
+    pytest.param(task, size, settings, id=f"{task}-{size}")
+    for size in SIZES
+    for task, settings in SIZES[size]
+]
 
 
 @functools.cache
@@ -53,17 +74,23 @@ def apart(places: Any) -> float:
 
 
 @pytest.mark.parametrize(("task", "size", "settings"), ROWS)
-def test_a_scene_of_any_size_has_room_and_buffers(task: str, size: int, settings: dict[str, Any]) -> None:
+def test_a_scene_of_any_size_has_room_and_buffers(
+    task: str, size: int, settings: dict[str, Any]
+) -> None:
     env: Any = make(task, impl="c", control="position", num_envs=1, num_agents=size, **settings)
-    scene, poses = env.compiled.scene, np.array(env.spawn_poses())
+    scene = env.compiled.scene
+    poses = np.array(env.spawn_poses())
     assert len(poses) == env.num_agents == env.index.num_robots == sum(map(len, env.teams)) == size
     assert apart(poses) > 0.69
-    low, high = scene.track.start, scene.track.start + scene.track.length
+    low = scene.track.start
+    high = scene.track.start + scene.track.length
     if scene.track.walled:
         assert np.all(np.abs(poses[:, 1]) <= scene.track.width / 2 - 0.35)
         assert np.all((poses[:, 0] >= low + 0.9) & (poses[:, 0] <= high - 0.9))
     else:
-        assert np.all(np.linalg.norm(poses[:, :2] - env.center, axis=1) <= env.params.ring_radius - 0.39)
+        assert np.all(
+            np.linalg.norm(poses[:, :2] - env.center, axis=1) <= env.params.ring_radius - 0.39
+        )
     if "sheep0" in env.objects:
         start, noise = env.params.flock_grid()
         assert len(start) == env.num_sheep and apart(start) - 2 * noise >= 0.39
@@ -72,7 +99,9 @@ def test_a_scene_of_any_size_has_room_and_buffers(task: str, size: int, settings
     elif len(env.teams) == 2:
         mirrored = 2 * np.array(env.center) - poses[: size // 2, :2]
         np.testing.assert_allclose(poses[size // 2 :, :2], mirrored, atol=1e-9)
-        np.testing.assert_allclose(np.exp(1j * poses[size // 2 :, 2]), -np.exp(1j * poses[: size // 2, 2]), atol=1e-9)
+        np.testing.assert_allclose(
+            np.exp(1j * poses[size // 2 :, 2]), -np.exp(1j * poses[: size // 2, 2]), atol=1e-9
+        )
     assert scene.max_contacts >= env.params.contacts_per_robot * size + 2 * (len(env.objects) - 9)
     team = len(env.teams[0])
     obs = jax.ShapeDtypeStruct((team, env.observation_size), jnp.float32)
@@ -84,7 +113,10 @@ def test_robots_are_told_apart_by_colours_and_numbers(task: str, size: int) -> N
     model = sized(task, size).mj_model
     colors = [robot_color(model, trunk) for trunk in robot_bases(model)]
     teams = size if size <= UNNUMBERED or task == GATE else 2
-    assert len(set(colors)) == teams and [colors.count(color) for color in colors] == [size // teams] * size
+    assert (
+        len(set(colors)) == teams
+        and [colors.count(color) for color in colors] == [size // teams] * size
+    )
     parts = [model.body_geomnum[trunk] for trunk in robot_bases(model)]
     assert (len(set(parts)) > 1) == (size > UNNUMBERED)  # digits have different numbers of segments
     assert len(set(ROBOT_COLORS)) == len(ROBOT_COLORS) == MAX_ROBOTS
@@ -100,15 +132,33 @@ REFUSED = [
     ("go1tug", {"num_agents": 4}, "num_agents: 4 .* must be 2, the size of go1tug"),
     (GATE, {"num_agents": 65}, "num_agents: 65 .* less than or equal to 64"),
     (FOOTBALL, {"num_agents": 5}, "num_agents: 5 .* even, .* at most 64 with field_width 9"),
-    (FOOTBALL, {"num_agents": 26, "field_width": 3.0}, "num_agents: 26 .* at most 24 with field_width 3"),
-    (SUMO, {"num_agents": 12}, r"num_agents: 12 .* at most 10 with ring_radius 1.7 and platform.size \(4.37"),
-    (SUMO, {"num_agents": 16, "ring_radius": 2.5}, "num_agents: 16 .* at most 14 with ring_radius 2.5"),
-    (EASY, {"num_sheep": 29}, "num_sheep: 29 .* at most 28, for which there is room before the gate"),
+    (
+        FOOTBALL,
+        {"num_agents": 26, "field_width": 3.0},
+        "num_agents: 26 .* at most 24 with field_width 3",
+    ),
+    (
+        SUMO,
+        {"num_agents": 12},
+        r"num_agents: 12 .* at most 10 with ring_radius 1.7 and platform.size \(4.37",
+    ),
+    (
+        SUMO,
+        {"num_agents": 16, "ring_radius": 2.5},
+        "num_agents: 16 .* at most 14 with ring_radius 2.5",
+    ),
+    (
+        EASY,
+        {"num_sheep": 29},
+        "num_sheep: 29 .* at most 28, for which there is room before the gate",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("task", "settings", "said"), REFUSED, ids=str)
-def test_a_size_without_room_is_refused_by_name(task: str, settings: dict[str, Any], said: str) -> None:
+def test_a_size_without_room_is_refused_by_name(
+    task: str, settings: dict[str, Any], said: str
+) -> None:
     refuses(said, make, task, impl="c", **settings)
 
 
@@ -124,7 +174,8 @@ def test_the_mass_of_the_box_grows_with_the_robots() -> None:
 def played(env: Any, steps: int) -> Any:
     """The state of two environments after random steps, in which nothing diverges or overflows."""
     batch = VectorEnv(env, 2)
-    state, step = jax.jit(batch.reset)(jax.random.PRNGKey(0)), jax.jit(batch.step)
+    state = jax.jit(batch.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(batch.step)
     random = np.random.default_rng(0)
     for _ in range(steps):
         action = random.uniform(-1, 1, (2, env.num_agents, env.action_size)).astype(np.float32)
@@ -137,7 +188,9 @@ def played(env: Any, steps: int) -> Any:
     return state
 
 
-@pytest.mark.parametrize(("task", "size", "settings"), [(FOOTBALL, 6, {}), (HARD, 3, {"num_sheep": 5})])
+@pytest.mark.parametrize(
+    ("task", "size", "settings"), [(FOOTBALL, 6, {}), (HARD, 3, {"num_sheep": 5})]
+)
 def test_larger_teams_step(task: str, size: int, settings: dict[str, Any]) -> None:
     env = sized(task, size, **settings)
     state = played(env, 5)
@@ -155,23 +208,35 @@ def test_a_step_of_three_against_three_is_symmetric() -> None:
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize(("task", "size", "settings"), [row for row in ROWS if row.values[0] in (FOOTBALL, SUMO)])
+@pytest.mark.parametrize(
+    ("task", "size", "settings"), [row for row in ROWS if row.values[0] in (FOOTBALL, SUMO)]
+)
 def test_a_step_of_any_match_is_symmetric(task: str, size: int, settings: dict[str, Any]) -> None:
-    check_symmetry(make(task, impl="c", control="position", num_envs=1, num_agents=size, **settings))
+    check_symmetry(
+        make(task, impl="c", control="position", num_envs=1, num_agents=size, **settings)
+    )
 
 
 def check_symmetry(env: Any) -> None:
-    """Compares a step of a match with that of its image, in which the teams have changed sides; feet on the ground."""
-    size, random = env.num_agents, np.random.default_rng(1)
+    """Compares a step of a match with that of its image, in which the teams have changed sides;
+    feet on the ground.
+    """
+    size = env.num_agents
+    random = np.random.default_rng(1)
     start = np.array(env.spawn_poses()) + random.uniform(-0.1, 0.1, (size, 3))
     action = random.uniform(-1, 1, (size, env.action_size)).astype(np.float32)
-    ball, speed, swap = np.array([6.4, 0.3]), np.array([1.0, 0.5]), np.roll(np.arange(size), size // 2)
+    ball = np.array([6.4, 0.3])
+    speed = np.array([1.0, 0.5])
+    swap = np.roll(np.arange(size), size // 2)
     states = []
     for turned in (False, True):
         sign, order = (-1, swap) if turned else (1, np.arange(size))
-        place, spot = (2 * np.array(env.center) * turned + sign * x for x in (start[:, :2], ball))
+        place = 2 * np.array(env.center) * turned + sign * start[:, :2]
+        spot = 2 * np.array(env.center) * turned + sign * ball
         position = np.c_[place, np.full(size, env.params.spawn_height - 0.13)][order]
-        state = placed(env, position, np.c_[np.zeros((size, 2)), start[:, 2] + np.pi * turned][order])
+        state = placed(
+            env, position, np.c_[np.zeros((size, 2)), start[:, 2] + np.pi * turned][order]
+        )
         if "ball" in env.objects:
             state = with_object(env, state, "ball", [*spot, 0.1], sign * speed)
         states.append(stepped(env)(state, action[order]))
@@ -192,7 +257,12 @@ def test_sumo_ends_when_the_last_robot_of_a_team_is_out() -> None:
     env = sized(SUMO, 4)
     x, y = env.center
     inside = np.array(
-        [[x - 0.5, y - 0.6, 0.7], [x + 0.5, y - 0.6, 0.7], [x - 0.5, y + 0.6, 0.7], [x + 0.5, y + 0.6, 0.7]]
+        [
+            [x - 0.5, y - 0.6, 0.7],
+            [x + 0.5, y - 0.6, 0.7],
+            [x - 0.5, y + 0.6, 0.7],
+            [x + 0.5, y + 0.6, 0.7],
+        ]
     )
     out = inside + np.array([[-1.5, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
 
@@ -204,7 +274,11 @@ def test_sumo_ends_when_the_last_robot_of_a_team_is_out() -> None:
     back = judged(inside, one)
     assert back.task.tolist() == one.task.tolist()  # it remains out
     seen = env.observation_layout.split(observation(env, back))
-    assert seen["teammate"][1, -1] == 0 and not seen["teammate"][1].any() and seen["teammate"][2, -1] == 1
+    assert (
+        seen["teammate"][1, -1] == 0
+        and not seen["teammate"][1].any()
+        and seen["teammate"][2, -1] == 1
+    )
     np.testing.assert_array_equal(seen["opponents"].reshape(4, 2, 7)[2:, :, 6], [[0, 1]] * 2)
     second = out + np.array([[0, 0, 0], [1.5, 0, 0], [0, 0, 0], [0, 0, 0]])
     lost = judged(second, back)
@@ -212,7 +286,9 @@ def test_sumo_ends_when_the_last_robot_of_a_team_is_out() -> None:
     np.testing.assert_allclose(lost.reward, [-10, -10, 10, 10])
     both = judged(inside + np.array([[0, -1.5, 0]] * 2 + [[0, 1.5, 0]] * 2), initial(env))
     assert both.terminated and both.outcome.draw.tolist() == [1, 1]
-    terms = terms_of(env, one, placed(env, inside + np.array([[9, 0, 0]] + [[0.1, 0, 0]] * 3), state=one))[0]
+    terms = terms_of(
+        env, one, placed(env, inside + np.array([[9, 0, 0]] + [[0.1, 0, 0]] * 3), state=one)
+    )[0]
     nearer = np.linalg.norm([0.6, 0.6]) - np.linalg.norm(
         [0.5, 0.6]
     )  # of robot 1, the only one of team 0, from the centre
@@ -232,15 +308,18 @@ def herding(robots: list[list[float]], sheep: list[list[float]]) -> dict[str, ja
     """Observations of robots at x, y that face the gate at x 8.5 m, y 0."""
     base = np.zeros((len(robots), 6), np.float32)
     base[:, :2] = robots
-    gate, flock = np.array([8.5, 0.0], np.float32), np.ravel(np.array(sheep, np.float32))
+    gate = np.array([8.5, 0.0], np.float32)
+    flock = np.ravel(np.array(sheep, np.float32))
     return {"base": jnp.asarray(base)} | {
-        name: jnp.tile(jnp.asarray(value), (len(robots), 1)) for name, value in (("gate", gate), ("sheep", flock))
+        name: jnp.tile(jnp.asarray(value), (len(robots), 1))
+        for name, value in (("gate", gate), ("sheep", flock))
     }
 
 
 def test_the_robots_of_a_large_team_drive_sheep_whatever_their_order() -> None:
     random = np.random.default_rng(0)
-    robots, sheep = random.uniform([0, -2.5], [7, 2.5], (5, 2)), random.uniform([2, -2.5], [9, 2.5], (11, 2))
+    robots = random.uniform([0, -2.5], [7, 2.5], (5, 2))
+    sheep = random.uniform([2, -2.5], [9, 2.5], (11, 2))
     order = np.array([3, 0, 4, 1, 2])
     actions = plan_sheep_hard(herding(robots.tolist(), sheep.tolist()))
     np.testing.assert_allclose(
@@ -250,7 +329,9 @@ def test_the_robots_of_a_large_team_drive_sheep_whatever_their_order() -> None:
 
 
 def test_robots_brake_before_they_touch_what_they_drive() -> None:
-    """The first wants to pass the second, the third the sheep before it, the fourth the gate's wall."""
+    """The first wants to pass the second, the third the sheep before it, the fourth the gate's
+    wall.
+    """
     robots = [[2.0, 0.0], [2.7, 0.0], [5.0, 1.5], [8.1, 2.2]]
     forward = plan_sheep_hard(herding(robots, [[5.4, 1.5], [8.2, 1.6], [7.0, -1.5]]))[:, 0]
     assert forward[0] <= 0 and forward[2] < 0 and forward[3] < 0

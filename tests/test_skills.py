@@ -45,7 +45,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def skill_commands(env: Any, policy: Any, obs: Any) -> np.ndarray:
-    """What the skills of the first team's agents are commanded by a policy (N, C), for observations (N, 1, O)."""
+    """What the skills of the first team's agents are commanded by a policy (N, C), for observations
+    (N, 1, O).
+    """
 
     @jax.jit
     def commands(obs: jax.Array) -> jax.Array:
@@ -74,17 +76,26 @@ def controller(skill: str = "walk", commands: tuple[str, ...] = NAMES, **ranges:
         ("agile", WIDE, (0.1, 0.0, -1.0), (0.5, 0.0, -2.5)),
     ],
 )
-def test_actions_are_scaled_to_the_range_on_their_side(skill: str, ranges: Any, action: Any, commands: Any) -> None:
+def test_actions_are_scaled_to_the_range_on_their_side(
+    skill: str, ranges: Any, action: Any, commands: Any
+) -> None:
     given = controller(skill, **ranges).skill_commands(jnp.array([action]))
     np.testing.assert_allclose(given[0, :3], commands, rtol=1e-6)
 
 
-@pytest.mark.parametrize("commands", [NAMES, ("body_height", "gait_frequency", "pitch", "roll", "stance_width")])
+@pytest.mark.parametrize(
+    "commands", [NAMES, ("body_height", "gait_frequency", "pitch", "roll", "stance_width")]
+)
 def test_the_default_ranges_change_nothing(commands: tuple[str, ...]) -> None:
     walk = WalkPolicy(GO1)
-    gain, limit = (walk.column(field, commands) for field in ("gain", "limit"))
-    action = jax.random.uniform(jax.random.PRNGKey(0), (500, len(commands)), minval=-1.0, maxval=1.0)
-    expected = walk.default_commands()[walk.index(commands)] + jnp.clip(gain * action, -limit, limit)
+    gain = walk.column("gain", commands)
+    limit = walk.column("limit", commands)
+    action = jax.random.uniform(
+        jax.random.PRNGKey(0), (500, len(commands)), minval=-1.0, maxval=1.0
+    )
+    expected = walk.default_commands()[walk.index(commands)] + jnp.clip(
+        gain * action, -limit, limit
+    )
     given = controller(commands=commands).skill_commands(action)[:, walk.index(commands)]
     np.testing.assert_array_equal(given, expected)
 
@@ -97,12 +108,20 @@ def test_a_range_is_of_the_command_not_of_its_change() -> None:
 
 @pytest.mark.parametrize(
     "parameters",
-    [{}, {"command_ranges": {"vx": (-0.5, 1.2)}}, {"commands": ("gait_frequency", "body_height"), "gait": "pace"}],
+    [
+        {},
+        {"command_ranges": {"vx": (-0.5, 1.2)}},
+        {"commands": ("gait_frequency", "body_height"), "gait": "pace"},
+    ],
 )
 def test_the_ranges_shown_are_those_of_actions(parameters: Any) -> None:
     env = make("go1plane", impl="c", num_envs=1, **parameters)
-    names, columns = env.params.commands, env.controller.skill.index(env.params.commands)
-    ends = [env.controller.skill_commands(jnp.full((1, len(names)), end))[0, columns] for end in (-1.0, 1.0)]
+    names = env.params.commands
+    columns = env.controller.skill.index(env.params.commands)
+    ends = [
+        env.controller.skill_commands(jnp.full((1, len(names)), end))[0, columns]
+        for end in (-1.0, 1.0)
+    ]
     shown = env.params.action_ranges()
     assert tuple(shown) == names
     np.testing.assert_allclose(np.stack(ends, axis=-1), list(shown.values()), rtol=1e-5)
@@ -111,9 +130,14 @@ def test_the_ranges_shown_are_those_of_actions(parameters: Any) -> None:
 @pytest.mark.parametrize("task", ["go1football-1vs1", "go1football-2vs2", "go1revolvingdoor"])
 def test_scripted_policies_command_the_same_in_other_ranges(task: str, weights: str) -> None:
     plain = make(task, impl="c", num_envs=1)
-    wide = make(task, impl="c", num_envs=1, skill="agile", skill_weights=weights, command_ranges=WIDE)
-    obs = 3.0 * jax.random.normal(jax.random.PRNGKey(1), (40, len(plain.teams[0]), plain.observation_size))
-    first, second = (skill_commands(env, load_policy("scripted", env), obs) for env in (plain, wide))
+    wide = make(
+        task, impl="c", num_envs=1, skill="agile", skill_weights=weights, command_ranges=WIDE
+    )
+    obs = 3.0 * jax.random.normal(
+        jax.random.PRNGKey(1), (40, len(plain.teams[0]), plain.observation_size)
+    )
+    first = skill_commands(plain, load_policy("scripted", plain), obs)
+    second = skill_commands(wide, load_policy("scripted", wide), obs)
     np.testing.assert_allclose(second, first[:, :3], atol=1e-6)
     assert np.abs(first[:, :3]).max(0) == pytest.approx([1.0, 0.5, 0.5])
 
@@ -122,15 +146,26 @@ def test_scripted_policies_command_the_same_in_other_ranges(task: str, weights: 
 def test_npc_robots_keep_the_walk_policy(control: str, size: int, weights: str) -> None:
     """The defender's joint targets are those beside agents that walk."""
     parameters: dict[str, Any] = {"impl": "c", "num_envs": 1, "control": control}
-    agile_env = make("go1football-defender", skill="agile", skill_weights=weights, command_ranges=WIDE, **parameters)
+    agile_env = make(
+        "go1football-defender",
+        skill="agile",
+        skill_weights=weights,
+        command_ranges=WIDE,
+        **parameters,
+    )
     targets = []
     for env in (make("go1football-defender", **parameters), agile_env):
         state = jax.jit(env.reset)(jax.random.PRNGKey(0))
         assert env.controller.clock(state.control).shape == (3, 2)
-        act, sensed = jax.jit(env.controller.targets), jax.jit(env.read)(state.data)
-        target, control_state, commands = None, state.control, jax.jit(env.npc_commands)(state, sensed)
+        act = jax.jit(env.controller.targets)
+        sensed = jax.jit(env.read)(state.data)
+        target = None
+        control_state = state.control
+        commands = jax.jit(env.npc_commands)(state, sensed)
         for _ in range(3):
-            target, control_state = act(control_state, jnp.ones((2, size)), sensed.proprioception, commands)
+            target, control_state = act(
+                control_state, jnp.ones((2, size)), sensed.proprioception, commands
+            )
         targets.append(np.asarray(target))
     np.testing.assert_allclose(targets[0][2], targets[1][2], atol=1e-5)
     assert (np.abs(targets[0][:2] - targets[1][:2]).max() > 0.05) == (control == "command")
@@ -142,7 +177,9 @@ def test_graphs_of_tasks_need_the_skill_of_npc_robots(weights: str) -> None:
 
 
 def test_ranges_beyond_training_warn() -> None:
-    with pytest.warns(UserWarning, match=r"'walk' was not trained for vx \[-1.5, 2\] outside \[-1.2, 1.2\]$") as found:
+    with pytest.warns(
+        UserWarning, match=r"'walk' was not trained for vx \[-1.5, 2\] outside \[-1.2, 1.2\]$"
+    ) as found:
         make("go1gate", impl="c", num_envs=1, command_ranges={"vx": (-1.5, 2), "vy": (-0.6, 0.6)})
     assert found[0].filename == __file__
 
@@ -151,8 +188,14 @@ def test_ranges_beyond_training_warn() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"command_ranges": {"vx": (-1.0, 1.2)}}, r"command_ranges .*'vx': \(-1.0, 1.0\).* has .*'vx': \(-1.0, 1.2\)"),
-        ({"commands": ("yaw_rate", "vy", "vx")}, r"commands \('vx', 'vy', .* has \('yaw_rate', 'vy', 'vx'\)"),
+        (
+            {"command_ranges": {"vx": (-1.0, 1.2)}},
+            r"command_ranges .*'vx': \(-1.0, 1.0\).* has .*'vx': \(-1.0, 1.2\)",
+        ),
+        (
+            {"commands": ("yaw_rate", "vy", "vx")},
+            r"commands \('vx', 'vy', .* has \('yaw_rate', 'vy', 'vx'\)",
+        ),
         ({"robot": "go2"}, "robot 'go1'; .* has 'go2'"),
         ({"control": "position"}, "control 'command'; .* has 'position'"),
         ({"skill": "agile"}, "skill 'walk'; .* has 'agile'"),
@@ -169,8 +212,13 @@ def test_policies_of_other_needs_are_refused(
     field: str, changes: Any, said: str, weights: str, monkeypatch: Any
 ) -> None:
     """Each by name with both values, whether the policy is an object, a name or a file."""
-    monkeypatch.setattr(TrainedPolicy, "__post_init__", lambda self: None)  # which checks the shapes of weights
-    own = {name.removeprefix("needs."): value for name, value in changes.items() if name.startswith("needs.")}
+    # which checks the shapes of weights
+    monkeypatch.setattr(TrainedPolicy, "__post_init__", lambda self: None)
+    own = {
+        name.removeprefix("needs."): value
+        for name, value in changes.items()
+        if name.startswith("needs.")
+    }
     others = {name: value for name, value in changes.items() if not name.startswith("needs.")}
     if "skill" in others:
         others["skill_weights"] = weights
@@ -182,12 +230,21 @@ def test_policies_of_other_needs_are_refused(
 
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
-    batch = VectorEnv(make("go1plane", impl="c", num_envs=2, control="position", position_scale=2.0), 2)
-    small = {"total_steps": 16, "rollout_steps": 8, "ppo.minibatches": 1, "network.recurrent": False}
+    batch = VectorEnv(
+        make("go1plane", impl="c", num_envs=2, control="position", position_scale=2.0), 2
+    )
+    small = {
+        "total_steps": 16,
+        "rollout_steps": 8,
+        "ppo.minibatches": 1,
+        "network.recurrent": False,
+    }
     policy = learn(batch, small).policy
     assert policy.config.env == {"control": "position", "position_scale": 2.0}
     load_as("policy", policy, batch.env)
-    with pytest.raises(InputError, match=r"policy: .* needs position_scale 2.0; the environment has 1.0"):
+    with pytest.raises(
+        InputError, match=r"policy: .* needs position_scale 2.0; the environment has 1.0"
+    ):
         load_as("policy", policy, make("go1plane", impl="c", num_envs=1, control="position"))
 
 
@@ -197,25 +254,38 @@ TASK = "go1football-1vs1"
 
 @pytest.fixture(scope="module")
 def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Files of the shipped policy, and of one with the same network for the agile skill and its ranges."""
-    policy, folder = load_policy(WALKING), tmp_path_factory.mktemp("policies")
+    """Files of the shipped policy, and of one with the same network for the agile skill and its
+    ranges.
+    """
+    policy = load_policy(WALKING)
+    folder = tmp_path_factory.mktemp("policies")
     needs = dataclasses.replace(policy.needs, skill="agile", gait=None, command_ranges=WIDE)
     agile = dataclasses.replace(policy, needs=needs)
     return {
-        name: str(save_policy(folder, x, f"{name}.safetensors")) for name, x in zip(BOTH, (policy, agile), strict=True)
+        name: str(save_policy(folder, x, f"{name}.safetensors"))
+        for name, x in zip(BOTH, (policy, agile), strict=True)
     }
 
 
-match = pytest.fixture(scope="module")(lambda: make(TASK, impl="c", num_envs=4, skill=BOTH, command_ranges=WIDE))
+match = pytest.fixture(scope="module")(
+    lambda: make(TASK, impl="c", num_envs=4, skill=BOTH, command_ranges=WIDE)
+)
 
 
 def rolled(skill: Any, entries: Any, params: Any = None) -> tuple[np.ndarray, list[Any]]:
-    """Returns the joint targets and the recurrent states of a robot that senses the same noise in every call."""
-    random, memory, targets, memories = np.random.default_rng(0), skill.init_memory(), [], []
+    """Returns the joint targets and the recurrent states of a robot that senses the same noise in
+    every call.
+    """
+    random = np.random.default_rng(0)
+    memory = skill.init_memory()
+    targets = []
+    memories = []
     act = jax.jit(skill.targets)
     params = skill.load_params() if params is None else params
     for entry in entries:
-        sensed = Proprioception(*(jnp.asarray(0.3 * random.normal(size=n), jnp.float32) for n in (3, 12, 12)))
+        sensed = Proprioception(
+            *(jnp.asarray(0.3 * random.normal(size=n), jnp.float32) for n in (3, 12, 12))
+        )
         command = skill.default_commands(vx=0.8, yaw_rate=0.4)
         if skill.selector:
             command[-1] = entry
@@ -241,7 +311,9 @@ def test_a_choice_that_never_changes_is_the_skill_alone(name: str, entry: float)
         ([1.0] + [0.05] * HOLD + [-0.05, -0.11], [1] * (HOLD + 2) + [0]),
     ],
 )
-def test_the_entry_changes_the_skill_beyond_the_threshold_and_after_the_hold(entries: Any, acting: Any) -> None:
+def test_the_entry_changes_the_skill_beyond_the_threshold_and_after_the_hold(
+    entries: Any, acting: Any
+) -> None:
     _, memories = rolled(make_skill(BOTH, GO1), entries)
     np.testing.assert_array_equal([memory["acting"] for memory in memories], acting)
 
@@ -250,19 +322,22 @@ def test_every_skill_remembers_what_was_executed() -> None:
     entries = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 6), HOLD)
     targets, memories = rolled(make_skill(BOTH, GO1), entries)
     for target, memory in zip(targets, memories, strict=True):
-        walk, agile = memory["walk"], memory["agile"]
+        walk = memory["walk"]
+        agile = memory["agile"]
         np.testing.assert_allclose(GO1.joint_targets(walk.action), target, atol=1e-6)
         np.testing.assert_array_equal(walk.action, agile.action)
         np.testing.assert_array_equal(walk.gait, agile.gait)
     # The history of both holds the same: gravity, joints and executed actions of the last steps.
-    walk, agile = memories[-1]["walk"].history, memories[-1]["agile"].frames
+    walk = memories[-1]["walk"].history
+    agile = memories[-1]["agile"].frames
     np.testing.assert_allclose(walk[-9:, np.r_[0:3, 18:54]], agile, atol=1e-6)
     np.testing.assert_allclose(walk[:, 54:66][1:], walk[:, 42:54][:-1], atol=1e-6)
     assert 0 < np.mean([memory["acting"] for memory in memories]) < 1
 
 
 def test_each_skill_gets_commands_that_it_is_trained_for(match: Any) -> None:
-    skill, names = match.controller.skill, ("vx", "vy", "yaw_rate")
+    skill = match.controller.skill
+    names = ("vx", "vy", "yaw_rate")
     commands = match.controller.skill_commands(jnp.array([[1.0, -1.0, 1.0, 1.0]] * 2))[0]
     np.testing.assert_allclose(commands[skill.index((*names, "skill"))], [2.5, -1.0, 2.5, 1.0])
     given = {}
@@ -270,18 +345,31 @@ def test_each_skill_gets_commands_that_it_is_trained_for(match: Any) -> None:
         own = part.limit_turn(jnp.clip(commands[columns], *bounds))
         given[part.name] = np.asarray(own)[part.index(names)]
     np.testing.assert_allclose(given["walk"], [1.2, -0.7, 1.2], rtol=1e-6)
-    np.testing.assert_allclose(given["agile"], [2.5, -1.0, 1.2], rtol=1e-6)  # |vx x yaw rate| is at most 3
+    # |vx x yaw rate| is at most 3
+    np.testing.assert_allclose(given["agile"], [2.5, -1.0, 1.2], rtol=1e-6)
     assert list(match.params.action_ranges()) == [*names, "skill"] and match.action_size == 4
 
 
 @pytest.mark.parametrize("name", BOTH)
-def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(name: str, policies: Any, match: Any) -> None:
-    alone = make(TASK, impl="c", num_envs=1, **({"skill": "agile", "command_ranges": WIDE} if name == "agile" else {}))
-    obs, key = jax.random.normal(jax.random.PRNGKey(1), (64, 1, match.observation_size)), jax.random.PRNGKey(2)
-    own, translated = (load_as("policy", policies[name], env) for env in (alone, match))
+def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(
+    name: str, policies: Any, match: Any
+) -> None:
+    alone = make(
+        TASK,
+        impl="c",
+        num_envs=1,
+        **({"skill": "agile", "command_ranges": WIDE} if name == "agile" else {}),
+    )
+    obs = jax.random.normal(jax.random.PRNGKey(1), (64, 1, match.observation_size))
+    key = jax.random.PRNGKey(2)
+    own = load_as("policy", policies[name], alone)
+    translated = load_as("policy", policies[name], match)
     assert isinstance(own, TrainedPolicy) and isinstance(translated, Translated)
     actions = [x.act(obs, x.initial_memory(64), key)[0][:, 0] for x in (own, translated)]
-    commands = [env.controller.skill_commands(x)[:, :3] for env, x in zip((alone, match), actions, strict=True)]
+    commands = [
+        env.controller.skill_commands(x)[:, :3]
+        for env, x in zip((alone, match), actions, strict=True)
+    ]
     bounded = match.controller.skill.parts[BOTH.index(name)].limit_turn(commands[1])
     np.testing.assert_allclose(bounded, commands[0], atol=1e-6)
     assert set(np.asarray(actions[1])[:, 3].tolist()) == {-0.5 if name == "walk" else 0.5}
@@ -290,7 +378,13 @@ def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(name: str, 
 def test_a_gait_is_of_the_skill_that_has_it(policies: Any) -> None:
     env = make(TASK, impl="c", num_envs=1, skill=BOTH, command_ranges=WIDE, gait="pace")
     assert isinstance(load_as("policy", policies["agile"], env), Translated)
-    refuses(r"policy: .* needs gait 'trot'; the environment has 'pace'", load_as, "policy", policies["walk"], env)
+    refuses(
+        r"policy: .* needs gait 'trot'; the environment has 'pace'",
+        load_as,
+        "policy",
+        policies["walk"],
+        env,
+    )
 
 
 @pytest.mark.parametrize("skill", ["walk", BOTH])
@@ -304,14 +398,16 @@ def test_scripted_and_idle_policies_use_the_first_skill(skill: Any) -> None:
 
 def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     batch = VectorEnv(match, 4)
-    env, own = (
-        versus(BothSides(batch), [policies["walk"], policies["agile"]]),
-        load_as("policy", policies["agile"], match),
-    )
+    env = versus(BothSides(batch), [policies["walk"], policies["agile"]])
+    own = load_as("policy", policies["agile"], match)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    action = jax.jit(own.act)(observations(state).to(own), own.initial_memory(4), jax.random.PRNGKey(1))[0]
+    action = jax.jit(own.act)(
+        observations(state).to(own), own.initial_memory(4), jax.random.PRNGKey(1)
+    )[0]
     state = jax.jit(env.step)(state, action)
-    np.testing.assert_array_equal(state.match.inner.control.skill["acting"], [[1, 0], [1, 1], [0, 1], [1, 1]])
+    np.testing.assert_array_equal(
+        state.match.inner.control.skill["acting"], [[1, 0], [1, 1], [0, 1], [1, 1]]
+    )
     team = TeamEnv(match, policies["agile"])
     state = jax.jit(team.step)(jax.jit(team.reset)(jax.random.PRNGKey(0)), jnp.zeros((1, 4)))
     np.testing.assert_array_equal(state.control.skill["acting"], [0, 1])
@@ -327,25 +423,50 @@ def test_policies_of_two_skills_meet_in_the_viewer(policies: Any, match: Any) ->
 def test_policies_of_two_skills_meet_on_the_page(policies: Any, match: Any) -> None:
     chosen = []
     for name in BOTH:
-        act, shapes = readings_function(load_as("policy", policies[name], match), match.observation_size)
-        (action,) = jax.jit(act)({each: jnp.zeros(shape) for each, shape in shapes.items()})["action"]
+        act, shapes = readings_function(
+            load_as("policy", policies[name], match), match.observation_size
+        )
+        (action,) = jax.jit(act)({each: jnp.zeros(shape) for each, shape in shapes.items()})[
+            "action"
+        ]
         chosen.append(float(action[-1]))
     assert chosen == [-0.5, 0.5]
 
 
 @pytest.mark.soak
 def test_commands_seat_them(policies: Any, tmp_path: Path) -> None:
-    walk, agile = policies["walk"], policies["agile"]
-    result = evaluate(agile, opponent=walk, episodes=2, num_envs=2, env={"episode_length": 0.2}, impl="c", sides="both")
+    walk = policies["walk"]
+    agile = policies["agile"]
+    result = evaluate(
+        agile,
+        opponent=walk,
+        episodes=2,
+        num_envs=2,
+        env={"episode_length": 0.2},
+        impl="c",
+        sides="both",
+    )
     assert result.about["opponent"] == walk
-    words = ["tournament", TASK, walk, agile, "--set", "episode_length=0.1", "--episodes", "2", "--impl", "c"]
+    words = [
+        "tournament",
+        TASK,
+        walk,
+        agile,
+        "--set",
+        "episode_length=0.1",
+        "--episodes",
+        "2",
+        "--impl",
+        "c",
+    ]
     assert cli.main([*words, "-o", str(tmp_path / "t")]) == 0
 
 
 def test_ranges_for_which_no_skill_is_trained_warn() -> None:
     make("go1plane", impl="c", num_envs=1, skill=BOTH, command_ranges={"vx": (-1.5, 2.5)})
     with pytest.warns(
-        UserWarning, match=r"skill \('walk', 'agile'\) was not trained for vx \[-1, 3\] outside \[-1.5, 2.5\]"
+        UserWarning,
+        match=r"skill \('walk', 'agile'\) was not trained for vx \[-1, 3\] outside \[-1.5, 2.5\]",
     ):
         make("go1plane", impl="c", num_envs=1, skill=BOTH, command_ranges={"vx": (-1.0, 3.0)})
 
@@ -354,10 +475,15 @@ def test_ranges_for_which_no_skill_is_trained_warn() -> None:
     ("parameters", "said"),
     [
         ({"skill": "agile", "command_ranges": WIDE}, "needs skill 'walk'; .* has 'agile'"),
-        ({"skill": BOTH, "command_ranges": {"vx": (-0.5, 0.5)}}, r"needs skill 'walk'; .* has \('walk', 'agile'\)"),
+        (
+            {"skill": BOTH, "command_ranges": {"vx": (-0.5, 0.5)}},
+            r"needs skill 'walk'; .* has \('walk', 'agile'\)",
+        ),
         ({"skill": BOTH, "robot": "go2"}, "needs robot 'go1'"),
     ],
 )
-def test_policies_that_the_actions_do_not_admit_are_refused(policies: Any, parameters: Any, said: str) -> None:
+def test_policies_that_the_actions_do_not_admit_are_refused(
+    policies: Any, parameters: Any, said: str
+) -> None:
     with pytest.raises(InputError, match=f"opponent: .* {said}"):
         load_as("opponent", policies["walk"], make(TASK, impl="c", num_envs=1, **parameters))

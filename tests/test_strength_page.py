@@ -1,4 +1,6 @@
-"""tools/strength_page.py: the tables of docs/results/strength.md, mates.md and skills.md and the data behind them."""
+"""tools/strength_page.py: the tables of docs/results/strength.md, mates.md and skills.md and the
+data behind them.
+"""
 
 import csv
 import importlib
@@ -28,7 +30,9 @@ strength_page: Any = importlib.import_module("strength_page")
 @pytest.fixture
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the published data, which a test may change."""
-    shutil.copytree(strength_page.DATA, tmp_path / "data", ignore=shutil.ignore_patterns("policies"))
+    shutil.copytree(
+        strength_page.DATA, tmp_path / "data", ignore=shutil.ignore_patterns("policies")
+    )
     monkeypatch.setattr(strength_page, "DATA", tmp_path / "data")
     return tmp_path / "data"
 
@@ -38,8 +42,13 @@ def write(file: Path, values: Mapping[tuple[str, str, str], float]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
-        writer.writerow(("task", "variant", "opponent", "sides", "actions", "rate", "value", "low", "high"))
-        writer.writerows((t, v, "scripted", "both", "sampled", n, *Rate.of(x, 256)) for (t, v, n), x in values.items())
+        writer.writerow(
+            ("task", "variant", "opponent", "sides", "actions", "rate", "value", "low", "high")
+        )
+        writer.writerows(
+            (t, v, "scripted", "both", "sampled", n, *Rate.of(x, 256))
+            for (t, v, n), x in values.items()
+        )
 
 
 def lines(table: str) -> list[list[str]]:
@@ -55,18 +64,28 @@ def test_the_pages_show_the_published_data() -> None:
 
 
 def test_the_page_on_settings_shows_the_worst_of_three_seeds() -> None:
-    """It has a row for each change, in the order of the data, whose variant `usual` are the default settings."""
+    """It has a row for each change, in the order of the data, whose variant `usual` are the default
+    settings.
+    """
     seeds: dict[tuple[str, str], list[Rate]] = {}
-    with (strength_page.ROOT / "results" / "levers.csv").open(encoding="utf-8", newline="") as stream:
+    with (strength_page.ROOT / "results" / "levers.csv").open(
+        encoding="utf-8", newline=""
+    ) as stream:
         for row in csv.DictReader(stream):
             rate = Rate(*(float(row[name]) for name in ("success", "low", "high")))
             seeds.setdefault((row["task"], row["variant"]), []).append(rate)
     assert {*map(len, seeds.values())} == {3}
     worst = {case: min(rates).percent for case, rates in seeds.items()}
     page = (strength_page.PAGES / "levers.md").read_text("utf-8")
-    header, *shown = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    header, *shown = [
+        line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ")
+    ]
     cells = [dict(zip(header, row, strict=True)) for row in shown]
-    expected = [(f"`{task}`", worst[task, "usual"], worst[task, name]) for task, name in worst if name != "usual"]
+    expected = [
+        (f"`{task}`", worst[task, "usual"], worst[task, name])
+        for task, name in worst
+        if name != "usual"
+    ]
     assert [(row["task"], row["default"], row["changed"]) for row in cells] == expected
 
 
@@ -75,15 +94,22 @@ def test_mixed_teams_of_a_page_are_those_of_their_rates(task: str) -> None:
     """All act alike, and the published means are those of the published rates."""
     found = json.loads((strength_page.DATA / f"crossplay_{task}.json").read_text("utf-8"))
     names = {name: tuple(found[name]) for name in ("policies", "references")}
-    play = CrossPlay(task, episodes=found["episodes"], success=np.array(found["success"]["value"]), **names)
-    expected, shipped = play.to_dict(), [name for name in found["policies"] if name in zoo.names()]
-    for name, key in itertools.product(("same", "cross", "gap", "worst", *found["references"]), Rate._fields):
+    play = CrossPlay(
+        task, episodes=found["episodes"], success=np.array(found["success"]["value"]), **names
+    )
+    expected = play.to_dict()
+    shipped = [name for name in found["policies"] if name in zoo.names()]
+    for name, key in itertools.product(
+        ("same", "cross", "gap", "worst", *found["references"]), Rate._fields
+    ):
         assert found[name][key] == pytest.approx(expected[name][key], abs=1e-6), name
     assert len(found["policies"]) == 5 and all(zoo.card(name).mode == "sampled" for name in shipped)
 
 
 def test_every_file_has_its_command_date_and_hardware() -> None:
-    about = json.loads((strength_page.ROOT / "results" / "measurements.json").read_text("utf-8"))["strength/data"]
+    about = json.loads((strength_page.ROOT / "results" / "measurements.json").read_text("utf-8"))[
+        "strength/data"
+    ]
     assert about["date"] and about["columns"] == ["files", "command", "hardware"]
     for file in filter(Path.is_file, strength_page.DATA.iterdir()):
         (row,) = (row for row in about["rows"] if file.match(row[0]))
@@ -91,15 +117,23 @@ def test_every_file_has_its_command_date_and_hardware() -> None:
 
 
 def test_every_match_has_best_responses_of_two_seeds_and_the_page_shows_the_largest_lead() -> None:
-    found, shown = strength_page.rows("exploitability"), lines(strength_page.tables()["exploitability"])
+    found = strength_page.rows("exploitability")
+    shown = lines(strength_page.tables()["exploitability"])
     for task, row in zip(strength_page.MATCHES, shown, strict=True):
         own = [each for each in found if each["task"] == task]
         assert len({(each["seed"], each["from"], each["actions"]) for each in own}) == len(own)
-        assert sum(each["actions"] == "sampled" for each in own) == 4 and len({each["seed"] for each in own}) == 2
+        assert (
+            sum(each["actions"] == "sampled" for each in own) == 4
+            and len({each["seed"] for each in own}) == 2
+        )
         best = max(own, key=lambda x: float(x["value"]))
         assert row[:2] == [f"`{task}`", Rate(*(float(best[name]) for name in Rate._fields)).percent]
     mixtures = {row[0].strip("`"): row[2] for row in shown if len(row) > 2}
-    bounds = {task: each["rounds"][-1] for task, each in strength_page.published("oracle").items() if "go1" in task}
+    bounds = {
+        task: each["rounds"][-1]
+        for task, each in strength_page.published("oracle").items()
+        if "go1" in task
+    }
     assert {*mixtures} == {task for task, last in bounds.items() if len(last["weights"]) > 1}
     for task, text in mixtures.items():
         assert text == Rate(**bounds[task]["exploitability_lower_bound"]).percent
@@ -107,8 +141,11 @@ def test_every_match_has_best_responses_of_two_seeds_and_the_page_shows_the_larg
 
 def test_a_match_has_a_row_once_all_conditions_are_measured(data: Path) -> None:
     (data / "robustness-matches.csv").unlink(missing_ok=True)
-    before, picture = strength_page.tables()["robustness"], strength_page.draw_heat(strength_page.robust_rates())
-    assert [line[0] for line in lines(before)] == [f"`{task}`" for task in strength_page.COOPERATIVE]
+    before = strength_page.tables()["robustness"]
+    picture = strength_page.draw_heat(strength_page.robust_rates())
+    assert [line[0] for line in lines(before)] == [
+        f"`{task}`" for task in strength_page.COOPERATIVE
+    ]
     tug = {("go1tug", name, "win_rate"): 1.0 for name in strength_page.CONDITIONS}
     tug |= {("go1tug", "delay", "win_rate"): 0.25, ("go1tug", "go2", "win_rate"): 0.5}
     write(data / "robustness-matches.csv", tug | {("go1bridge", "usual", "win_rate"): 1.0})
@@ -143,15 +180,20 @@ def save(folder: Path, part: str, task: str, result: Any) -> None:
     """Writes the result of a call of a part."""
     place = folder / part / "results" / task / "plain"
     place.mkdir(parents=True)
-    (place / "result.json").write_text(json.dumps({"measure": part, "result": {"task": task, **result}}))
+    (place / "result.json").write_text(
+        json.dumps({"measure": part, "result": {"task": task, **result}})
+    )
 
 
 def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     """Those of other tasks stay."""
-    with pytest.raises(InputError, match=r"--rates: .* has no results of a part: cooperative, matches, .*, pools"):
+    with pytest.raises(
+        InputError, match=r"--rates: .* has no results of a part: cooperative, matches, .*, pools"
+    ):
         strength_page.copy_rates(tmp_path)
     before = {file.name: file.read_bytes() for file in data.iterdir()}
-    responses, games = strength_page.rows("exploitability"), strength_page.published("oracle")
+    responses = strength_page.rows("exploitability")
+    games = strength_page.published("oracle")
     write(tmp_path / "population" / "rates.csv", {("go1tug", "plain", "win_rate"): 0.5})
     mixed = {"same": {"value": 0.5}}
     save(tmp_path, "crossplay", "go1gate", mixed)
@@ -159,7 +201,10 @@ def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     save(tmp_path, "oracle", "go1tug", {"rounds": []})
     chosen = {
         f"runs/go1tug/default+{start}/seed20": {
-            actions: {name: {"value": share} for name, share in zip(("win", "draw", "loss"), shares, strict=True)}
+            actions: {
+                name: {"value": share}
+                for name, share in zip(("win", "draw", "loss"), shares, strict=True)
+            }
             for actions, shares in each.items()
         }
         for start, each in RESPONSES.items()
@@ -168,24 +213,45 @@ def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     strength_page.copy_rates(tmp_path)
     others = [row for row in strength_page.rows("exploitability") if row["task"] != "go1tug"]
     assert others == [row for row in responses if row["task"] != "go1tug"]
-    scratch, champion, mean = (row for row in strength_page.rows("exploitability") if row["task"] == "go1tug")
-    assert (scratch["from"], scratch["seed"], scratch["wins"], scratch["value"]) == ("scratch", "20", "0.5", "0.25")
+    scratch, champion, mean = (
+        row for row in strength_page.rows("exploitability") if row["task"] == "go1tug"
+    )
+    assert (scratch["from"], scratch["seed"], scratch["wins"], scratch["value"]) == (
+        "scratch",
+        "20",
+        "0.5",
+        "0.25",
+    )
     assert champion["from"] == "champion" and float(champion["value"]) == 0.75
     assert (champion["actions"], mean["actions"], mean["value"]) == ("sampled", "mean", "1")
     assert float(champion["low"]) < 0.75 < float(champion["high"]) <= 1.0
     assert strength_page.published("oracle") == games | {"go1tug": {"task": "go1tug", "rounds": []}}
     assert strength_page.published("crossplay_go1gate") == {"task": "go1gate", **mixed}
     assert strength_page.published("pool_go1seesaw")["start"] == "before"
-    assert (data / "population.csv").read_bytes() == (tmp_path / "population" / "rates.csv").read_bytes()
-    names = ("population.csv", "exploitability.csv", "oracle.json", "crossplay_go1gate.json", "pool_go1seesaw.json")
+    assert (data / "population.csv").read_bytes() == (
+        tmp_path / "population" / "rates.csv"
+    ).read_bytes()
+    names = (
+        "population.csv",
+        "exploitability.csv",
+        "oracle.json",
+        "crossplay_go1gate.json",
+        "pool_go1seesaw.json",
+    )
     assert {name: before[name] for name in names} == {
-        file.name: before[file.name] for file in data.iterdir() if file.read_bytes() != before[file.name]
+        file.name: before[file.name]
+        for file in data.iterdir()
+        if file.read_bytes() != before[file.name]
     }
 
 
 @pytest.mark.parametrize("task", strength_page.POOLS)
 def test_a_pool_of_mates_has_neither_the_team_nor_the_new_mate(task: str) -> None:
     pool = strength_page.published(f"pool_{task}")
-    part = yaml.safe_load((strength_page.ROOT / "configs" / "strength.yaml").read_text("utf-8"))["pools"]
+    part = yaml.safe_load((strength_page.ROOT / "configs" / "strength.yaml").read_text("utf-8"))[
+        "pools"
+    ]
     assert len(pool["mates"]) == 3 and not {pool["start"], pool["policies"][-1]} & {*pool["mates"]}
-    assert (pool["start"], [pool["policies"][-1]]) == tuple(part["by_task"][task][name] for name in ("start", "others"))
+    assert (pool["start"], [pool["policies"][-1]]) == tuple(
+        part["by_task"][task][name] for name in ("start", "others")
+    )

@@ -1,4 +1,6 @@
-"""Sweeps on a probe: what is left, stops at any moment, complete run folders and a report at the end."""
+"""Sweeps on a probe: what is left, stops at any moment, complete run folders and a report at the
+end.
+"""
 
 import json
 import re
@@ -59,7 +61,8 @@ def load(tmp_path: Path, text: str = FILE) -> Sweep:
 
 @pytest.mark.soak
 def test_processes_share_a_sweep(tmp_path: Path) -> None:
-    sweep, folder = load(tmp_path), tmp_path / "study"
+    sweep = load(tmp_path)
+    folder = tmp_path / "study"
     jobs = sweeps.plan(sweep, folder, config_of)
     trained: list[str] = []
 
@@ -77,12 +80,17 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
 
 
 def test_a_sweep_that_is_stopped_and_copied_resumes_elsewhere(tmp_path: Path) -> None:
-    sweep, folder, there = load(tmp_path), tmp_path / "study", tmp_path / "there"
+    sweep = load(tmp_path)
+    folder = tmp_path / "study"
+    there = tmp_path / "there"
     sweep = override(sweep, {"algorithms": ("mappo",), "settings.checkpoint": {"every": 9}})
     sweeps.prepare(sweep, folder)
     asked = iter([False, False, False, True, True])
     jobs = sweeps.plan(sweep, folder, config_of)
-    assert sweeps.run(jobs, lambda config, seeds: Cast(PROBE, PROBE), stop=lambda: next(asked)) == ([], [])
+    assert sweeps.run(jobs, lambda config, seeds: Cast(PROBE, PROBE), stop=lambda: next(asked)) == (
+        [],
+        [],
+    )
     shutil.copytree(folder, there)
     left = sweeps.plan(sweep, there, config_of)
     assert [job.steps_left for job in left] == [32]
@@ -92,11 +100,18 @@ def test_a_sweep_that_is_stopped_and_copied_resumes_elsewhere(tmp_path: Path) ->
 
 
 def test_seeds_and_names_of_tasks(tmp_path: Path) -> None:
-    text = FILE.replace("settings:", 'settings:\n  opponents: ["{task}", idle]\n  start: "{task}.safetensors"')
+    text = FILE.replace(
+        "settings:", 'settings:\n  opponents: ["{task}", idle]\n  start: "{task}.safetensors"'
+    )
     jobs = sweeps.plan(load(tmp_path, text), tmp_path, config_of, ["*/jrpo"], [1])
     assert [folder.name for job in jobs for folder in job.folders] == ["seed1"]
-    assert jobs[0].configs[0].opponents == ("go1gate", "idle") and jobs[0].configs[0].start == "go1gate.safetensors"
-    with pytest.raises(InputError, match="seeds: 7 is not allowed; it must be one of the sweep's: 0, 1"):
+    assert (
+        jobs[0].configs[0].opponents == ("go1gate", "idle")
+        and jobs[0].configs[0].start == "go1gate.safetensors"
+    )
+    with pytest.raises(
+        InputError, match="seeds: 7 is not allowed; it must be one of the sweep's: 0, 1"
+    ):
         sweeps.plan(load(tmp_path), tmp_path, config_of, (), [1, 7])
 
 
@@ -132,7 +147,9 @@ def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
 
 
 def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) -> None:
-    refuses(rf"^{tmp_path}/none\.yaml: cannot be read \(", sweeps.load_sweep, tmp_path / "none.yaml")
+    refuses(
+        rf"^{tmp_path}/none\.yaml: cannot be read \(", sweeps.load_sweep, tmp_path / "none.yaml"
+    )
     with pytest.raises(InputError, match="folder: /proc/none cannot be written"):
         sweeps.prepare(build(Sweep, {"tasks": ["go1gate"]}), Path("/proc/none"))
 
@@ -141,25 +158,51 @@ def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) ->
     ("text", "message"),
     [
         ("settings: {ppo: {clips: 1}}\n", r"^settings\.ppo"),
-        ("variants: {a: {task: go1tug}}\n", r"^variants\.a\.task: 'go1tug' is not allowed; it must be left out"),
+        (
+            "variants: {a: {task: go1tug}}\n",
+            r"^variants\.a\.task: 'go1tug' is not allowed; it must be left out",
+        ),
         ("settings: {seed: 3}\n", r"^settings\.seed: 3 is not allowed; it must be left out"),
-        ("variants: {plain: {}, a: {env: {gate_wdth: 1}}}\n", r"^go1gate/mappo\+a: gate_wdth.*'gate_width'"),
+        (
+            "variants: {plain: {}, a: {env: {gate_wdth: 1}}}\n",
+            r"^go1gate/mappo\+a: gate_wdth.*'gate_width'",
+        ),
         ("settings: {train_env: {rewards: {colision: 1}}}\n", r"^go1gate/mappo: rewards\.colision"),
-        ("variants: {a: {env: {task: go1tug}}}\n", r"^variants\.a\.env\.task: is not a task parameter"),
+        (
+            "variants: {a: {env: {task: go1tug}}}\n",
+            r"^variants\.a\.env\.task: is not a task parameter",
+        ),
         ("settings: {start: none.safetensors}\n", r"^go1gate/mappo: .*none\.safetensors"),
-        (f"settings: {{start: {zoo.file_of('go1tug')}}}\n", r"^go1gate/mappo: start: .* needs task 'go1tug'"),
-        (f"settings: {{start: {zoo.file_of('go1gate')}}}\n", r"^go1gate/mappo: .* with this run's network"),
-        ("settings: {num_envs: 7, ppo: {minibatches: 1000}}\n", r"^go1gate/mappo: ppo\.minibatches: 1000"),
+        (
+            f"settings: {{start: {zoo.file_of('go1tug')}}}\n",
+            r"^go1gate/mappo: start: .* needs task 'go1tug'",
+        ),
+        (
+            f"settings: {{start: {zoo.file_of('go1gate')}}}\n",
+            r"^go1gate/mappo: .* with this run's network",
+        ),
+        (
+            "settings: {num_envs: 7, ppo: {minibatches: 1000}}\n",
+            r"^go1gate/mappo: ppo\.minibatches: 1000",
+        ),
         ("settings: {opponents: [idle]}\n", r"^go1gate/mappo: opponents"),
-        ("settings: {train_env: {control: position}}\n", r"^go1gate/mappo: train_env\.control: .* env, 'command'"),
+        (
+            "settings: {train_env: {control: position}}\n",
+            r"^go1gate/mappo: train_env\.control: .* env, 'command'",
+        ),
         (
             "tasks: [go1tug]\nsettings: {opponents: [older, older], league: {members: 2}}\n",
             r"^go1tug/mappo: league\.members: 2",
         ),
-        ("tasks: [go1gate, go1tug]\nvariants: {a: {opponents: [nobody]}}\n", r"^go1gate/mappo\+a: opponents"),
+        (
+            "tasks: [go1gate, go1tug]\nvariants: {a: {opponents: [nobody]}}\n",
+            r"^go1gate/mappo\+a: opponents",
+        ),
     ],
 )
-def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, tmp_path: Path) -> None:
+def test_every_cell_is_checked_before_the_first_trains(
+    text: str, message: str, tmp_path: Path
+) -> None:
     sweep = load(tmp_path, text if text.startswith("tasks") else "tasks: [go1gate]\n" + text)
     refuses(message, sweeps.plan, sweep, tmp_path, config_of, check=setup.check_start)
 
@@ -167,23 +210,38 @@ def test_every_cell_is_checked_before_the_first_trains(text: str, message: str, 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda study: (study / "runs").touch(), r"run_dir: .*seed0 cannot be written \(Not a directory"),
-        (lambda study: (study / "runs/go1gate/jrpo/seed1/a").mkdir(parents=True), None),
-        (lambda study: (study / "runs/go1gate/jrpo/seed1/a/b").mkdir(parents=True), "seed1 holds a but no checkpoint"),
-        (lambda study: (study / "report").symlink_to("/proc/none"), "folder: .*report cannot be written"),
         (
-            lambda study: (study / "sweep.yaml").write_text("tasks: [go1gate]\nsettings: {num_envs: 8}"),
+            lambda study: (study / "runs").touch(),
+            r"run_dir: .*seed0 cannot be written \(Not a directory",
+        ),
+        (lambda study: (study / "runs/go1gate/jrpo/seed1/a").mkdir(parents=True), None),
+        (
+            lambda study: (study / "runs/go1gate/jrpo/seed1/a/b").mkdir(parents=True),
+            "seed1 holds a but no checkpoint",
+        ),
+        (
+            lambda study: (study / "report").symlink_to("/proc/none"),
+            "folder: .*report cannot be written",
+        ),
+        (
+            lambda study: (study / "sweep.yaml").write_text(
+                "tasks: [go1gate]\nsettings: {num_envs: 8}"
+            ),
             "settings: .* differs",
         ),
     ],
     ids=["file", "empty folder", "other files", "report", "other sweep"],
 )
-def test_folders_are_checked_before_the_first_cell_trains(make: Any, message: Any, tmp_path: Path, capfd: Any) -> None:
+def test_folders_are_checked_before_the_first_cell_trains(
+    make: Any, message: Any, tmp_path: Path, capfd: Any
+) -> None:
     load(tmp_path)
     (tmp_path / "study").mkdir()
     make(tmp_path / "study")
     before = sorted(tmp_path.rglob("*"))
-    code = cli.main(["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study"), "--dry-run"])
+    code = cli.main(
+        ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study"), "--dry-run"]
+    )
     assert code == (0 if message is None else 2)
     assert re.search(message or "^$", capfd.readouterr().err)
     assert sorted(tmp_path.rglob("*")) == before
@@ -194,16 +252,23 @@ def test_folders_are_checked_before_the_first_cell_trains(make: Any, message: An
     [
         ("zoo", "published", "go1seesaw/*", 10),
         pytest.param("zoo", "matches", "go1bridge/*", 10, marks=pytest.mark.soak),
-        *(("levers", task, "*", 0) for task in ("go1gate", "go1seesaw", "go1sheep-easy", "go1pushbox")),
+        *(
+            ("levers", task, "*", 0)
+            for task in ("go1gate", "go1seesaw", "go1sheep-easy", "go1pushbox")
+        ),
     ],
 )
-def test_published_sweeps_can_be_planned_on_a_gpu(file: str, part: str, cell: str, seed: int, monkeypatch: Any) -> None:
+def test_published_sweeps_can_be_planned_on_a_gpu(
+    file: str, part: str, cell: str, seed: int, monkeypatch: Any
+) -> None:
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
     sweep = sweeps.load_sweep(CONFIGS / f"{file}.yaml", part)
     assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=setup.check_start)
 
 
-def test_a_cell_that_fails_is_named_and_the_others_are_trained(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
+def test_a_cell_that_fails_is_named_and_the_others_are_trained(
+    tmp_path: Path, monkeypatch: Any, capfd: Any
+) -> None:
     load(tmp_path)
     trained: list[str] = []
 
@@ -215,7 +280,9 @@ def test_a_cell_that_fails_is_named_and_the_others_are_trained(tmp_path: Path, m
     monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: Cast(PROBE, PROBE))
     monkeypatch.setattr(sweeps, "train_seeds", train)
     monkeypatch.setattr("mqe_jax.study.report.report", lambda folder: [])
-    assert cli.main(["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]) == 2
+    assert (
+        cli.main(["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]) == 2
+    )
     assert trained == ["joint"]
     assert capfd.readouterr().err.splitlines() == [
         "mqe: go1gate/mappo failed: opponents: this one cannot be read",
@@ -227,12 +294,22 @@ def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:
     sweep = load(tmp_path, VARIANTS)
 
     def names(*patterns: str) -> list[str]:
-        return [job.cell.path.as_posix() for job in sweeps.plan(sweep, tmp_path, config_of, patterns)]
+        return [
+            job.cell.path.as_posix() for job in sweeps.plan(sweep, tmp_path, config_of, patterns)
+        ]
 
-    assert names() == ["go1gate/mappo", "go1gate/mappo+scratch", "go1gate/jrpo", "go1gate/jrpo+scratch"]
+    assert names() == [
+        "go1gate/mappo",
+        "go1gate/mappo+scratch",
+        "go1gate/jrpo",
+        "go1gate/jrpo+scratch",
+    ]
     assert names("go1gate/jrpo") == ["go1gate/jrpo"]
     assert names("go1gate/jrpo+scratch", "*/mappo") == ["go1gate/mappo", "go1gate/jrpo+scratch"]
-    with pytest.raises(InputError, match=r"cells: 'go1gate/mapo' matches no cell \(did you mean 'go1gate/mappo'\?\)"):
+    with pytest.raises(
+        InputError,
+        match=r"cells: 'go1gate/mapo' matches no cell \(did you mean 'go1gate/mappo'\?\)",
+    ):
         names("*/mappo", "go1gate/mapo")
 
 
@@ -244,22 +321,33 @@ def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
         sweeps.prepare(override(sweep, {"settings": {"total_steps": 9}}), tmp_path / "study")
 
 
-def test_the_commands_say_what_is_left_and_report(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
+def test_the_commands_say_what_is_left_and_report(
+    tmp_path: Path, monkeypatch: Any, capfd: Any
+) -> None:
     load(tmp_path)
     monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: Cast(PROBE, PROBE))
     arguments = ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]
     assert cli.main([*arguments, "--dry-run"]) == 0
     out = capfd.readouterr().out
-    assert "go1gate jrpo plain" in out and "time unknown" in out and not (tmp_path / "study").exists()
+    assert (
+        "go1gate jrpo plain" in out and "time unknown" in out and not (tmp_path / "study").exists()
+    )
     assert cli.main([*arguments, "--cells", "*/mappo", "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["left"]["jobs"] == []
     assert [run.cell.algorithm for run in read_runs(tmp_path / "study")] == ["mappo", "mappo"]
     assert cli.main([*arguments, "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["left"]["jobs"] == []
     text = (tmp_path / "study" / "report" / "report.md").read_text()
-    assert "| go1gate | mappo |" in text and "| go1gate | jrpo |" in text and "reference" not in text
-    (tmp_path / "values.yaml").write_text("label: theirs\nvalues: {plain: {go1gate: {mappo: 123.5}}}")
-    assert cli.main(["report", str(tmp_path / "study"), "--reference", str(tmp_path / "values.yaml")]) == 0
+    assert (
+        "| go1gate | mappo |" in text and "| go1gate | jrpo |" in text and "reference" not in text
+    )
+    (tmp_path / "values.yaml").write_text(
+        "label: theirs\nvalues: {plain: {go1gate: {mappo: 123.5}}}"
+    )
+    assert (
+        cli.main(["report", str(tmp_path / "study"), "--reference", str(tmp_path / "values.yaml")])
+        == 0
+    )
     text = (tmp_path / "study" / "report" / "report.md").read_text()
     assert "`reference`: theirs" in text and "| 124 |" in text
     (tmp_path / "small.yaml").write_text("tasks: [go1gat]")
@@ -271,4 +359,9 @@ def test_one_file_may_hold_several_sweeps(tmp_path: Path) -> None:
     path = tmp_path / "sweeps.yaml"
     path.write_text("first: {tasks: [go1gate]}\nsecond: {tasks: [go1tug]}")
     assert sweeps.load_sweep(path, "second").tasks == ("go1tug",)
-    refuses(r"has no part 'secnd' \(did you mean 'second'\?\); it has: first, second", sweeps.load_sweep, path, "secnd")
+    refuses(
+        r"has no part 'secnd' \(did you mean 'second'\?\); it has: first, second",
+        sweeps.load_sweep,
+        path,
+        "secnd",
+    )

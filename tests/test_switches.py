@@ -1,4 +1,6 @@
-"""JAX: `jax_enable_x64`, `jax_default_prng_impl`, `jax_debug_nans`, `jax_numpy_..._promotion`; random numbers."""
+"""JAX: `jax_enable_x64`, `jax_default_prng_impl`, `jax_debug_nans`, `jax_numpy_..._promotion`;
+random numbers.
+"""
 
 import contextlib
 import os
@@ -31,12 +33,17 @@ from tests.inputs import refuses
 from tests.test_opponents import matches
 from tests.training import Probe, content, differences, settings
 
-PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4, max_episode_steps=6)  # none ends at first
+# none ends at first
+PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4, max_episode_steps=6)
 
 
 @contextlib.contextmanager
 def strict_x64() -> Iterator[None]:
-    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+    with (
+        jax.enable_x64(True),
+        jax.numpy_dtype_promotion("strict"),
+        jax.numpy_rank_promotion("raise"),
+    ):
         yield
 
 
@@ -53,22 +60,33 @@ def kinds(tree: Any) -> list[tuple[Any, ...]]:
 @pytest.mark.parametrize("task", TASKS)
 def test_the_loops_of_jax_step_every_task(task: str) -> None:
     with jax.enable_x64(False):
-        env = make(task, impl="c", control="torque" if task == "go1plane" else "command", num_envs=2)
+        env = make(
+            task, impl="c", control="torque" if task == "go1plane" else "command", num_envs=2
+        )
         plain = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
 
     def loops(key: jax.Array, action: jax.Array) -> Any:
         first = env.reset(key)
-        state, _ = jax.lax.scan(lambda state, _: (env.step(state, action), None), first, None, length=2)
-        state = jax.lax.cond(state.terminated, lambda state: env.step(state, action), lambda state: state, state)
-        return first, jax.lax.while_loop(lambda state: state.terminated, lambda state: env.step(state, action), state)
+        state, _ = jax.lax.scan(
+            lambda state, _: (env.step(state, action), None), first, None, length=2
+        )
+        state = jax.lax.cond(
+            state.terminated, lambda state: env.step(state, action), lambda state: state, state
+        )
+        return first, jax.lax.while_loop(
+            lambda state: state.terminated, lambda state: env.step(state, action), state
+        )
 
     with strict_x64():
-        first, last = jax.eval_shape(loops, jax.random.PRNGKey(0), jnp.zeros((env.num_agents, env.action_size)))
+        first, last = jax.eval_shape(
+            loops, jax.random.PRNGKey(0), jnp.zeros((env.num_agents, env.action_size))
+        )
     assert kinds(first) == kinds(last) == kinds(plain)
 
 
 @pytest.mark.parametrize(
-    ("task", "name"), [*((x, x) for x in TASKS if x != "go1plane"), *((x, "scripted") for x in SCRIPTED)]
+    ("task", "name"),
+    [*((x, x) for x in TASKS if x != "go1plane"), *((x, "scripted") for x in SCRIPTED)],
 )
 def test_policies_act_in_single_precision(task: str, name: str) -> None:
     with strict_x64():
@@ -76,8 +94,13 @@ def test_policies_act_in_single_precision(task: str, name: str) -> None:
         policy = load_policy(name, env)
         policy = all_agents(env, policy, policy if len(env.teams) > 1 else None)
         obs = jax.ShapeDtypeStruct((2, env.num_agents, env.observation_size), jnp.float32)
-        act = lambda obs: policy.act(obs, policy.initial_memory(2), jax.random.PRNGKey(0))  # noqa: E731
-        assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(act, obs))} == {jnp.dtype(jnp.float32)}
+
+        def act(obs):
+            return policy.act(obs, policy.initial_memory(2), jax.random.PRNGKey(0))
+
+        assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(act, obs))} == {
+            jnp.dtype(jnp.float32)
+        }
 
 
 @pytest.mark.parametrize("learns", ["league", "joint", "mat"])
@@ -110,10 +133,16 @@ def test_switches_do_not_change_a_training(tmp_path: Path) -> None:
         with switch():
             train(PROBE, config, tmp_path / name)
             result = evaluate_batch(PROBE, read_policy(tmp_path / name), 4, jax.random.PRNGKey(0))
-        results[name] = {key: value for key, value in result.to_dict().items() if isinstance(value, float)}
+        results[name] = {
+            key: value for key, value in result.to_dict().items() if isinstance(value, float)
+        }
     plain = content(tmp_path / "plain")
-    assert not differences(plain, content(tmp_path / "strict")) and results["strict"] == results["plain"]
-    for name, values in content(tmp_path / "x64").items():  # loops are counted in 64 bits, which XLA fuses otherwise
+    assert (
+        not differences(plain, content(tmp_path / "strict"))
+        and results["strict"] == results["plain"]
+    )
+    # loops are counted in 64 bits, which XLA fuses otherwise
+    for name, values in content(tmp_path / "x64").items():
         assert values.dtype == plain[name].dtype
         if values.dtype == np.float32:
             np.testing.assert_allclose(values, plain[name], rtol=1e-3, atol=1e-5, err_msg=name)
@@ -127,14 +156,23 @@ def test_environments_take_raw_and_typed_keys_of_every_generator(generator: str)
     for key in (jax.random.key(0, impl=generator), jax.random.PRNGKey(0, impl=generator)):
         with jax.default_prng_impl(generator):
             state = jax.eval_shape(batch.reset, key)
-            after = jax.eval_shape(batch.step, state, jnp.zeros((2, env.num_agents, env.action_size)))
+            after = jax.eval_shape(
+                batch.step, state, jnp.zeros((2, env.num_agents, env.action_size))
+            )
         assert state.key.dtype == after.key.dtype == key.dtype
-    with jax.default_prng_impl("rbg"), pytest.raises(InputError, match=r"key: .* a raw one of rbg is \(4,\) uint32"):
+    with (
+        jax.default_prng_impl("rbg"),
+        pytest.raises(InputError, match=r"key: .* a raw one of rbg is \(4,\) uint32"),
+    ):
         env.reset(jnp.zeros(2, jnp.uint32))
 
 
 def test_typed_keys_are_saved(tmp_path: Path) -> None:
-    tree = {"key": jax.random.key(3, impl="rbg"), "keys": jax.random.split(jax.random.key(4), 2), "x": jnp.ones(2)}
+    tree = {
+        "key": jax.random.key(3, impl="rbg"),
+        "keys": jax.random.split(jax.random.key(4), 2),
+        "x": jnp.ones(2),
+    }
     save_tree(tmp_path / "file", tree, {}, kind="checkpoint")
     loaded = load_tree(tmp_path / "file", jax.eval_shape(lambda: tree), kind="checkpoint").tree
     for name, key in tree.items():
@@ -142,11 +180,17 @@ def test_typed_keys_are_saved(tmp_path: Path) -> None:
 
 
 def test_a_training_resumes_with_its_own_generator(tmp_path: Path) -> None:
-    config, states = settings(network__recurrent=False), []
+    config = settings(network__recurrent=False)
+    states = []
     with jax.default_prng_impl("rbg"):
         train(PROBE, config, tmp_path / "whole")
-        note = lambda state, row: states.append(state)  # noqa: E731
-        train_seeds(PROBE, [config], [tmp_path / "half"], on_update=note, stop=lambda: len(states) == 2)
+
+        def note(state, row):
+            return states.append(state)
+
+        train_seeds(
+            PROBE, [config], [tmp_path / "half"], on_update=note, stop=lambda: len(states) == 2
+        )
     refuses(r"jax_default_prng_impl.*rbg", train, PROBE, config, tmp_path / "half", resume=True)
     with jax.default_prng_impl("rbg"):
         train(PROBE, config, tmp_path / "half", resume=True)
@@ -187,5 +231,6 @@ def draw(key):
 
 jax.jit(draw).lower(jax.random.PRNGKey(0)).compile()
 """
-    usual = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}  # tests optimise less
+    # tests optimise less
+    usual = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     subprocess.run([sys.executable, "-c", code], env=usual, check=True, timeout=100)

@@ -49,7 +49,9 @@ TURNS: list[Any] = []
 
 class Noted(Stages):
     def update(self, carry: Any, batch: Batch, now: Any, key: jax.Array) -> Any:
-        jax.debug.callback(lambda *turn: TURNS.append(turn), batch.advantage, batch.learners, ordered=True)
+        jax.debug.callback(
+            lambda *turn: TURNS.append(turn), batch.advantage, batch.learners, ordered=True
+        )
         return super().update(carry, batch, now, key)
 
 
@@ -87,10 +89,20 @@ def test_memory_carries_a_sign_through_an_episode() -> None:
 
 @pytest.fixture(scope="module")
 def one_pass() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
-    """Runs updates of one epoch over one batch, with a recurrent network; odd environments have longer episodes."""
-    env = Probe(probes.show_hidden_first, probes.pay_one, num_envs=4, max_episode_steps=2, odd_episode_steps=4)
+    """Runs updates of one epoch over one batch, with a recurrent network; odd environments have
+    longer episodes.
+    """
+    env = Probe(
+        probes.show_hidden_first,
+        probes.pay_one,
+        num_envs=4,
+        max_episode_steps=2,
+        odd_episode_steps=4,
+    )
     once = {"epochs": 1, "minibatches": 1}
-    return updated(env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo=once), 3)
+    return updated(
+        env, small(num_envs=4, network={"recurrent": True, "chunk_length": 4}, ppo=once), 3
+    )
 
 
 def test_a_chunk_repeats_the_rollout(one_pass: Any) -> None:
@@ -105,7 +117,8 @@ def test_updates_are_counted_and_take_new_random_keys(one_pass: Any) -> None:
 
 
 def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, permutation = [], jax.random.permutation
+    drawn = []
+    permutation = jax.random.permutation
 
     def noted(key: jax.Array, count: int) -> jax.Array:
         order = permutation(key, count)
@@ -113,7 +126,9 @@ def test_every_epoch_has_its_own_minibatches(monkeypatch: pytest.MonkeyPatch) ->
         return order
 
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
-    learner = make_learner(env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2}))
+    learner = make_learner(
+        env, small(num_envs=4, rollout_steps=2, ppo={"epochs": 3, "minibatches": 2})
+    )
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
     assert not state.rollout.episode_steps.any()
     monkeypatch.setattr(jax.random, "permutation", noted)
@@ -127,31 +142,55 @@ def test_settings_must_fit_the_environment() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
     for values, message in (
         ({}, "num_envs: 32 is not allowed; it must be equal to the environment's num_envs, 4"),
-        ({"num_envs": 4, "ppo__minibatches": 7}, "ppo.minibatches: 7 is not allowed; it must be a divisor"),
-        ({"num_envs": 4, "network": {"recurrent": True, "chunk_length": 3}}, "rollout_steps: 8 .* chunk_length"),
-        ({"num_envs": 4, "curriculum__assistance": 1.0}, "curriculum.assistance: 1.0 is not allowed"),
+        (
+            {"num_envs": 4, "ppo__minibatches": 7},
+            "ppo.minibatches: 7 is not allowed; it must be a divisor",
+        ),
+        (
+            {"num_envs": 4, "network": {"recurrent": True, "chunk_length": 3}},
+            "rollout_steps: 8 .* chunk_length",
+        ),
+        (
+            {"num_envs": 4, "curriculum__assistance": 1.0},
+            "curriculum.assistance: 1.0 is not allowed",
+        ),
         (
             {"num_envs": 4, "imitation__teacher": "scripted"},
             "imitation.teacher: 'scripted' is not allowed; .* argument `teacher`",
         ),
-        ({"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"}, "network.critic_input: 'own'"),
+        (
+            {"num_envs": 4, "network__critic_input": "own", "ppo__value": "joint"},
+            "network.critic_input: 'own'",
+        ),
     ):
         refuses(f"^{message}", make_learner, env, small(**values))
 
 
 def test_a_wrong_observation_size_is_named() -> None:
-    env = type("WrongSize", (Probe,), {"observation_size": 7})(probes.show_hidden, probes.pay_one, num_envs=4)
-    refuses(r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)", make_learner, env, small(num_envs=4))
+    env = type("WrongSize", (Probe,), {"observation_size": 7})(
+        probes.show_hidden, probes.pay_one, num_envs=4
+    )
+    refuses(
+        r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)",
+        make_learner,
+        env,
+        small(num_envs=4),
+    )
 
 
 def test_a_policy_of_another_task_is_not_evaluated() -> None:
     env = Probe(probes.show_hidden, probes.pay_one, num_envs=4)
-    with pytest.raises(InputError, match=f"policy: 'one of go1tug' is not allowed; it must be one of {env.name}"):
-        evaluate_batch(env, SimplePolicy("go1tug", 2, lambda obs, key: obs[..., :1]), 4, jax.random.PRNGKey(0))
+    with pytest.raises(
+        InputError, match=f"policy: 'one of go1tug' is not allowed; it must be one of {env.name}"
+    ):
+        evaluate_batch(
+            env, SimplePolicy("go1tug", 2, lambda obs, key: obs[..., :1]), 4, jax.random.PRNGKey(0)
+        )
 
 
 def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:
-    env, seen = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=6), []
+    env = Probe(probes.show_hidden, probes.pay_one, num_envs=4, max_episode_steps=6)
+    seen = []
 
     def see(action: Any) -> Any:
         seen.append(np.array(action))
@@ -196,7 +235,9 @@ def events(folder: Path) -> list[tuple[int, str, float]]:
 
 def test_csv(tmp_path: Path) -> None:
     write(logs.CsvLog(tmp_path, 0))
-    write(logs.CsvLog(tmp_path, 100), [{"env_steps": 200, "average_step_reward": 1.0, "success": 1.0}])
+    write(
+        logs.CsvLog(tmp_path, 100), [{"env_steps": 200, "average_step_reward": 1.0, "success": 1.0}]
+    )
     with (tmp_path / logs.CSV_FILE).open() as file:
         rows = list(csv.DictReader(file))
     assert rows == [
@@ -232,7 +273,9 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (first / "wandb" / "run_id").read_text() == run_id
 
 
-def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_notebook_has_one_bar(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     display = pytest.importorskip("IPython.display", reason="needs the extra notebook")
     shown: list[str] = []
 
@@ -252,8 +295,12 @@ def test_a_notebook_has_one_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_compiling_is_shown_and_does_not_count(terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    """20 s of compiling, then 20 s of evaluating and 60 s of work for each hundredth of the steps."""
+def test_compiling_is_shown_and_does_not_count(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    """20 s of compiling, then 20 s of evaluating and 60 s of work for each hundredth of the
+    steps.
+    """
     now = [0.0]
     monkeypatch.setattr(logs.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(logs, "_PLAIN_SECONDS", 0.0)
@@ -278,8 +325,12 @@ def test_compiling_is_shown_and_does_not_count(terminal: bool, monkeypatch: pyte
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find(name))
-    with pytest.raises(InputError, match=r"'wandb' needs the package wandb; pip install 'mqe-jax\[log\]'"):
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "wandb" else find(name)
+    )
+    with pytest.raises(
+        InputError, match=r"'wandb' needs the package wandb; pip install 'mqe-jax\[log\]'"
+    ):
         logs.check_loggers(("tensorboard", "wandb"))
     logs.check_loggers(("tensorboard",))
 
@@ -296,7 +347,9 @@ def test_a_checkpoint_keeps_every_leaf(tmp_path: Path) -> None:
     save_tree(path, TREE, {"note": "ü"}, kind="checkpoint")
     restored = load_tree(path, jax.eval_shape(lambda: TREE), kind="checkpoint")
     assert_same(restored.tree, TREE)
-    assert [x.dtype for x in jax.tree.leaves(restored.tree)] == [x.dtype for x in jax.tree.leaves(TREE)]
+    assert [x.dtype for x in jax.tree.leaves(restored.tree)] == [
+        x.dtype for x in jax.tree.leaves(TREE)
+    ]
     assert restored.metadata == {"note": "ü"}
     assert [p.name for p in tmp_path.iterdir()] == ["tree.safetensors"]
 

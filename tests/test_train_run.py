@@ -27,7 +27,16 @@ from mqe_jax.train.runner import train
 from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe, Stop, assert_same, assert_same_run, largest_file, rows, settings, stop_after
+from tests.training import (
+    Probe,
+    Stop,
+    assert_same,
+    assert_same_run,
+    largest_file,
+    rows,
+    settings,
+    stop_after,
+)
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 KEY = jax.random.PRNGKey(0)
@@ -35,17 +44,22 @@ PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 
 
 @pytest.fixture(scope="module")
-def straight(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainState]:
+def straight(
+    shared_programs: None, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, TrainState]:
     run_dir = tmp_path_factory.mktemp("runs") / "straight"
     return run_dir, train(PROBE, settings(), run_dir)
 
 
-def test_a_killed_training_resumes_as_if_never_stopped(straight: Any, tmp_path: Path, capsys: Any) -> None:
+def test_a_killed_training_resumes_as_if_never_stopped(
+    straight: Any, tmp_path: Path, capsys: Any
+) -> None:
     straight_dir, expected = straight
     run_dir = tmp_path / "killed"
 
     with pytest.raises(Stop):
-        train(PROBE, settings(), run_dir, on_update=stop_after(2))  # the checkpoint of update 2, the row of update 3
+        # the checkpoint of update 2, the row of update 3
+        train(PROBE, settings(), run_dir, on_update=stop_after(2))
     assert len(rows(run_dir)) == 3
     with (run_dir / "metrics.csv").open("a") as file:
         file.write("64,4,0.1")  # a half-written row
@@ -58,21 +72,36 @@ def test_a_killed_training_resumes_as_if_never_stopped(straight: Any, tmp_path: 
     assert [int(row["env_steps"]) for row in rows(run_dir)] == [16, 32, 48, 64, 80]
 
 
-def test_a_finished_run_is_neither_repeated_nor_overwritten(straight: tuple[Path, TrainState]) -> None:
+def test_a_finished_run_is_neither_repeated_nor_overwritten(
+    straight: tuple[Path, TrainState],
+) -> None:
     run_dir, expected = straight
     assert_same(train(PROBE, settings(), run_dir, resume=True), expected)
     refuses("already holds a run", train, PROBE, settings(), run_dir)
-    refuses(r"ppo.gamma: 0\.5 differs from the run", train, PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
+    refuses(
+        r"ppo.gamma: 0\.5 differs from the run",
+        train,
+        PROBE,
+        settings(ppo__gamma=0.5),
+        run_dir,
+        resume=True,
+    )
     with pytest.raises(ValueError, match=f"its settings are in {run_dir / 'config.yaml'}"):
         train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
-    refuses(r"total_steps: 16 .* at least", train, PROBE, settings(total_steps=16), run_dir, resume=True)
+    refuses(
+        r"total_steps: 16 .* at least", train, PROBE, settings(total_steps=16), run_dir, resume=True
+    )
     assert load_run_config(run_dir) == settings()
 
 
 @pytest.mark.parametrize("before", [{"width": 0.7}, {"width": 0.7, "other": 1}])
 def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> None:
     config = settings(env={"width": 0.7} if "other" in before else {})
-    lost = "env.other: None differs from the run in x, which has 1" if "other" in before else "env.width: None differs"
+    lost = (
+        "env.other: None differs from the run in x, which has 1"
+        if "other" in before
+        else "env.width: None differs"
+    )
     refuses(lost, check_same, Path("x"), {**to_mapping(config), "env": before}, config)
     check_same(Path("x"), to_mapping(config), config)
 
@@ -81,11 +110,19 @@ def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> N
     ("values", "said"),
     [
         ({"task": "go1gate"}, r"env.gate_width: .* differs from the environments, which have 0\.7"),
-        ({"env": {"gate_width": 0.7, "rewards.approach": 9.0}}, r"env.rewards.approach: 9\.0 differs .*, which have"),
-        ({"env": {"gate_width": 0.7}, "train_env": {"control": "torque"}}, r"train_env.control: 'torque' differs"),
+        (
+            {"env": {"gate_width": 0.7, "rewards.approach": 9.0}},
+            r"env.rewards.approach: 9\.0 differs .*, which have",
+        ),
+        (
+            {"env": {"gate_width": 0.7}, "train_env": {"control": "torque"}},
+            r"train_env.control: 'torque' differs",
+        ),
     ],
 )
-def test_environments_with_other_parameters_are_refused(values: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_environments_with_other_parameters_are_refused(
+    values: dict[str, Any], said: str, tmp_path: Path
+) -> None:
     batch = VectorEnv(make("go1gate", num_envs=4, gate_width=0.7), 4)
     refuses(said, train, batch, settings(**values), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -95,7 +132,9 @@ def test_environments_with_other_parameters_are_refused(values: dict[str, Any], 
 
 @pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml", "notes.md"])
 @pytest.mark.parametrize("resume", [False, True])
-def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: bool, tmp_path: Path) -> None:
+def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(
+    left: str, resume: bool, tmp_path: Path
+) -> None:
     (tmp_path / left).write_text("a user's work")
     (tmp_path / "checkpoints").mkdir()  # of a training that was killed at its start
     (tmp_path / "nohup.out").touch()
@@ -107,7 +146,14 @@ def test_a_folder_with_a_run_but_no_checkpoint_is_left_alone(left: str, resume: 
 def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path) -> None:
     def again(state: TrainState, row: dict[str, float]) -> None:
         for resume in (False, True):
-            refuses(r"already holds a run|in use by another process", train, PROBE, settings(), tmp_path, resume=resume)
+            refuses(
+                r"already holds a run|in use by another process",
+                train,
+                PROBE,
+                settings(),
+                tmp_path,
+                resume=resume,
+            )
         raise Stop
 
     with pytest.raises(Stop):
@@ -123,7 +169,9 @@ def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path
     assert len(rows(tmp_path)) == 5
 
 
-def test_an_interrupted_evaluation_is_made_when_the_run_resumes(tmp_path: Path, monkeypatch: Any) -> None:
+def test_an_interrupted_evaluation_is_made_when_the_run_resumes(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
     config = settings(evaluation={"every": 2, "episodes": 4})
 
     def interrupt(*arguments: Any) -> None:
@@ -134,10 +182,14 @@ def test_an_interrupted_evaluation_is_made_when_the_run_resumes(tmp_path: Path, 
         train(PROBE, config, tmp_path, eval_env=PROBE)
     assert list_checkpoints(tmp_path)[-1].name == "step_000000000032.safetensors"
     train(PROBE, config, tmp_path, resume=True, eval_env=PROBE)
-    assert [evaluation["env_steps"] for evaluation in read_evaluations(tmp_path)["evaluations"]] == [32, 64, 80]
+    assert [
+        evaluation["env_steps"] for evaluation in read_evaluations(tmp_path)["evaluations"]
+    ] == [32, 64, 80]
 
 
-def test_a_writer_that_fails_ends_the_training_and_is_named(straight: Any, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_writer_that_fails_ends_the_training_and_is_named(
+    straight: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
     """Every time the lock is released, nothing half-written stays, and the run resumes exactly."""
     pytest.importorskip("tensorboardX", reason="needs the extra log")
     limits = contextlib.ExitStack()
@@ -176,7 +228,11 @@ def pay_nan_later(hidden: jax.Array, action: jax.Array) -> jax.Array:
 def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path) -> None:
     env = Probe(probes.show_hidden_first, pay_nan_later, num_envs=4)
     with pytest.raises(NonFiniteError, match=r"update \d+ \(\d+ environment steps\) made loss/"):
-        train(env, settings(total_steps=100 * 16, network={"recurrent": False, "log_std_init": -0.5}), tmp_path)
+        train(
+            env,
+            settings(total_steps=100 * 16, network={"recurrent": False, "log_std_init": -0.5}),
+            tmp_path,
+        )
     logged = rows(tmp_path)
     assert len(logged) >= 1 and all(row["loss/value"] != "nan" for row in logged)
     assert checkpoint_step(list_checkpoints(tmp_path)[-1]) <= int(logged[-1]["env_steps"])
@@ -189,13 +245,22 @@ def spoil(path: Path, kind: str) -> None:
     save_tree(path, arrays, metadata, kind=kind)
 
 
-def test_weights_that_are_not_finite_are_refused(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
+def test_weights_that_are_not_finite_are_refused(
+    straight: tuple[Path, TrainState], tmp_path: Path
+) -> None:
     run_dir = tmp_path / "run"
     shutil.copytree(straight[0], run_dir)
     spoil(list_checkpoints(run_dir)[-1], "checkpoint")
     spoil(run_dir / "policy.safetensors", "policy")
     refuses(r"policy.safetensors: .*weight holds nan", read_policy, run_dir)
-    refuses(r"step_000000000080.safetensors: .*weight holds nan", train, PROBE, settings(), run_dir, resume=True)
+    refuses(
+        r"step_000000000080.safetensors: .*weight holds nan",
+        train,
+        PROBE,
+        settings(),
+        run_dir,
+        resume=True,
+    )
     policy = read_policy(straight[0])
     broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * jnp.nan, policy.params))
     with pytest.raises(NonFiniteError):
@@ -229,18 +294,25 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
 
     with pytest.raises(Stop):
         train(PROBE, settings(start=str(run_dir)), tmp_path / "a", on_update=kill)
-    first, last = load_file(list_checkpoints(tmp_path / "a")[0]), load_file(list_checkpoints(run_dir)[-1])
+    first = load_file(list_checkpoints(tmp_path / "a")[0])
+    last = load_file(list_checkpoints(run_dir)[-1])
     same = [name for name in first if name.startswith(("params/actor/", "params/log_std"))]
     assert len(same) > 5
     for name in same:
         np.testing.assert_array_equal(first[name], last[name])
-    with pytest.raises(InputError, match=r"action_scale: 0\.25 differs from that of the policy in .*straight, "):
+    with pytest.raises(
+        InputError, match=r"action_scale: 0\.25 differs from that of the policy in .*straight, "
+    ):
         train(PROBE, settings(start=str(run_dir), action_scale=0.25), tmp_path / "b")
     other = settings(start=str(run_dir), network__hidden_sizes=(8,))
     said = r"start: .*straight.* is not allowed; it must be a policy with this run's network"
     refuses(said, train, PROBE, other, tmp_path / "b")
 
 
-def test_a_policy_that_is_missing_or_of_another_kind(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
+def test_a_policy_that_is_missing_or_of_another_kind(
+    straight: tuple[Path, TrainState], tmp_path: Path
+) -> None:
     refuses(r"policy.safetensors: no such file", read_policy, tmp_path)
-    refuses("holds a checkpoint; a policy is needed", read_policy, list_checkpoints(straight[0])[-1])
+    refuses(
+        "holds a checkpoint; a policy is needed", read_policy, list_checkpoints(straight[0])[-1]
+    )

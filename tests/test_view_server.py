@@ -1,4 +1,6 @@
-"""The viewer's server, its scene and its panel: which requests it answers, what it draws, what widgets do."""
+"""The viewer's server, its scene and its panel: which requests it answers, what it draws, what
+widgets do.
+"""
 
 import http.client
 import signal
@@ -48,7 +50,9 @@ def shown() -> Iterator[SimpleNamespace]:
 
 @pytest.fixture
 def said(capfd: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
-    """Returns the lines on standard error, at the beginning of a second without any from earlier tests."""
+    """Returns the lines on standard error, at the beginning of a second without any from earlier
+    tests.
+    """
     time.sleep(1.1)
     capfd.readouterr()
     return lambda: capfd.readouterr().err.splitlines()
@@ -64,10 +68,20 @@ def until(condition: Callable[[], Any], seconds: float = 30.0) -> None:
 @pytest.mark.parametrize(
     ("host", "address", "accepted", "refused"),
     [
-        ("127.0.0.1", "127.0.0.1", "127.0.0.1 localhost LOCALHOST [::1]", "evil.org 127.0.0.2 localhost. 0.0.0.0"),
+        (
+            "127.0.0.1",
+            "127.0.0.1",
+            "127.0.0.1 localhost LOCALHOST [::1]",
+            "evil.org 127.0.0.2 localhost. 0.0.0.0",
+        ),
         ("localhost", "::1", "127.0.0.1 localhost [::1]", "::1 evil.org"),
         ("192.168.1.5", "192.168.1.5", "192.168.1.5", "localhost 127.0.0.1 evil.org"),
-        ("server.lan", "192.168.1.5", "server.lan 192.168.1.5 Server.LAN", "localhost evil.server.lan lan"),
+        (
+            "server.lan",
+            "192.168.1.5",
+            "server.lan 192.168.1.5 Server.LAN",
+            "localhost evil.server.lan lan",
+        ),
         ("0.0.0.0", "192.168.1.5", "192.168.1.5 0.0.0.0", "evil.org localhost"),
         ("::", "fe80::1%eth0", "[::]", "evil.org localhost"),
     ],
@@ -80,7 +94,14 @@ def test_only_the_servers_own_names_and_origin_are_allowed(
         own = f"{name}:8080"
         assert refusal([own], [], allowed) is None
         assert refusal([own], [f"http://{own}"], allowed) is None
-        others = (f"http://{name}:8081", f"https://{own}", f"http://{name}", "http://evil.org:8080", "null", "")
+        others = (
+            f"http://{name}:8081",
+            f"https://{own}",
+            f"http://{name}",
+            "http://evil.org:8080",
+            "null",
+            "",
+        )
         for origin in others:
             assert refusal([own], [origin], allowed) is not None, origin
         assert refusal([own], [f"http://{own}", "http://evil.org"], allowed) is not None
@@ -92,11 +113,19 @@ def test_only_the_servers_own_names_and_origin_are_allowed(
 
 
 def test_port_80_is_implied() -> None:
-    assert refusal(["localhost"], ["http://localhost"], authorities("localhost", "127.0.0.1", 80)) is None
-    assert refusal(["localhost"], ["http://localhost"], authorities("localhost", "127.0.0.1", 8080)) is not None
+    assert (
+        refusal(["localhost"], ["http://localhost"], authorities("localhost", "127.0.0.1", 80))
+        is None
+    )
+    assert (
+        refusal(["localhost"], ["http://localhost"], authorities("localhost", "127.0.0.1", 8080))
+        is not None
+    )
 
 
-def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(shown: SimpleNamespace, said: Any) -> None:
+def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(
+    shown: SimpleNamespace, said: Any
+) -> None:
     with pytest.raises(InvalidStatus) as refused:
         Client(shown.port, origin="http://evil.org")
     assert refused.value.response.status_code == 403
@@ -121,8 +150,10 @@ def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(shown: SimpleN
 
 
 def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> None:
-    run, panel = shown.session, shown.panel
-    run.drive.env, run.drive.robot = 0, 0
+    run = shown.session
+    panel = shown.panel
+    run.drive.env = 0
+    run.drive.robot = 0
     for step in range(4):
         run.drive.command = np.array([0.25 * step, 0.0, 0.0])
         run.advance()
@@ -131,7 +162,10 @@ def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> N
         seen = client.panel()
         client.update(seen.uuid("Back"), 2 * run.env.dt)
         until(lambda: panel.back == 2)
-        assert run.paused and run.moment(panel.back).frame.qpos[0, run.env.robot_x[0]] == places[-3] != places[-1]
+        assert (
+            run.paused
+            and run.moment(panel.back).frame.qpos[0, run.env.robot_x[0]] == places[-3] != places[-1]
+        )
         panel.show(np.zeros((2, 3)), 1.0)
         client.update(seen.uuid("Contacts"), True)
         until(lambda: panel.contacts)
@@ -140,22 +174,32 @@ def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> N
         until(lambda: not run.paused)
     with Client(shown.port) as client:
         text = client.panel().values["state"]
-    assert f"at {(run.steps - 2) * run.env.dt:.2f} s, paused" in text and ">1 (driven)<" in text and ">0.00<" in text
+    assert (
+        f"at {(run.steps - 2) * run.env.dt:.2f} s, paused" in text
+        and ">1 (driven)<" in text
+        and ">0.00<" in text
+    )
     assert "episodes: success 0 of" in text and ">+0.25<" in text
     assert panel.back == 0 and run.moment(1000) is run.moments[0]
-    run.drive.command, run.drive.robot = np.zeros(3), None
+    run.drive.command = np.zeros(3)
+    run.drive.robot = None
 
 
 def test_keys_and_held_buttons_count_and_waiting_steps_are_limited(shown: SimpleNamespace) -> None:
-    run, panel = shown.session, shown.panel
+    run = shown.session
+    panel = shown.panel
     with Client(shown.port) as client:
         seen = client.panel()
         client.send({"type": "CommandTriggerMessage", "uuid": seen.commands["Forward"]})
         until(lambda: run.drive.now()[0] == 0.25)
         client.send({"type": "CommandTriggerMessage", "uuid": seen.commands["Stop"]})
         until(lambda: run.drive.now()[0] == 0.0)
-        client.send({"type": "GuiButtonHoldMessage", "uuid": seen.uuid("Forward"), "frequency": 0.0})
-        client.send({"type": "GuiButtonHoldMessage", "uuid": seen.uuid("Turn left"), "frequency": HOLD_RATE})
+        client.send(
+            {"type": "GuiButtonHoldMessage", "uuid": seen.uuid("Forward"), "frequency": 0.0}
+        )
+        client.send(
+            {"type": "GuiButtonHoldMessage", "uuid": seen.uuid("Turn left"), "frequency": HOLD_RATE}
+        )
         until(lambda: run.drive.now()[2] > 0.0)
         assert run.drive.now()[0] == 0.0
         for _ in range(100):
@@ -178,29 +222,52 @@ def test_a_viser_without_the_hook_is_refused(monkeypatch: pytest.MonkeyPatch) ->
             stopped.append(True)
 
     monkeypatch.setattr(viser, "ViserServer", Other)
-    with pytest.raises(InputError, match=r"view: viser .* cannot be restricted \(pip install 'viser==1.1.1' can\)"):
+    with pytest.raises(
+        InputError, match=r"view: viser .* cannot be restricted \(pip install 'viser==1.1.1' can\)"
+    ):
         open_server("127.0.0.1", free_port(), "test")
     assert stopped == [True]
 
 
 def listening(port: int) -> set[str]:
-    rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
+    rows = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path("/proc/net", name).read_text().splitlines()[1:]
+    ]
     places = [row[1].rsplit(":", 1) for row in rows if row[3] == "0A"]
     return {address for address, number in places if int(number, 16) == port}
 
 
-@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no /proc/net/tcp to read the sockets from")
+@pytest.mark.skipif(
+    not Path("/proc/net/tcp").exists(), reason="no /proc/net/tcp to read the sockets from"
+)
 def test_the_command_listens_on_this_machine_only_plays_and_ends_with_130() -> None:
     port = free_port()
     # A shell starts background jobs with SIGINT ignored, which children inherit.
     program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     program += "from mqe_jax.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "view", "go1gate", "--policy", "idle", "--port", str(port)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+    command = [
+        sys.executable,
+        "-c",
+        program,
+        "view",
+        "go1gate",
+        "--policy",
+        "idle",
+        "--port",
+        str(port),
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
         try:
             assert process.stdout is not None
-            assert f"http://127.0.0.1:{port}" in next(line for line in process.stdout if "open http" in line)
-            threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would stop the viewer
+            assert f"http://127.0.0.1:{port}" in next(
+                line for line in process.stdout if "open http" in line
+            )
+            # a full pipe would stop the viewer
+            threading.Thread(target=process.stdout.read, daemon=True).start()
             assert listening(port) == {"0100007F"}
 
             def plays() -> bool:
@@ -214,33 +281,46 @@ def test_the_command_listens_on_this_machine_only_plays_and_ends_with_130() -> N
             process.kill()
 
 
-EVIL = "<iframe srcdoc=\"<script>top.ran = 'iframe'</script>\"></iframe><img src=x onerror=\"ran = 'img'\">![](a.png)"
+EVIL = (
+    '<iframe srcdoc="<script>top.ran = \'iframe\'</script>"></iframe><img src=x onerror="ran '
+    "= 'img'\">![](a.png)"
+)
 
 
 def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Names of the task, robots, rewards and observations, choices, outcomes, and errors that hold paths."""
+    """Names of the task, robots, rewards and observations, choices, outcomes, and errors that hold
+    paths.
+    """
 
     def fail(choice: object) -> Any:
         raise InputError(f"runs/{EVIL}: damaged")
 
     env: Any = Driven()
     env.name = EVIL
-    env.observation_layout = SimpleNamespace(blocks=[SimpleNamespace(name=EVIL)], slice=lambda name: slice(None))
+    env.observation_layout = SimpleNamespace(
+        blocks=[SimpleNamespace(name=EVIL)], slice=lambda name: slice(None)
+    )
     run = session(env)
     monkeypatch.setattr("mqe_jax.view.viewer.start_frame", lambda *_: run.moment().frame)
     with open_page(640, 480) as page:
-        viewer = Viewer(port=free_port(), menu=Menu(fail, Entry("go1gate", EVIL), {EVIL: "go1gate"}))
+        viewer = Viewer(
+            port=free_port(), menu=Menu(fail, Entry("go1gate", EVIL), {EVIL: "go1gate"})
+        )
         viewer.announce(env, 2)
         page.goto(viewer.url)
         page.get_by_text("is being compiled").wait_for()
-        run.terms, run.last = (EVIL, run.terms[-1]), [EVIL, EVIL]
+        run.terms = (EVIL, run.terms[-1])
+        run.last = [EVIL, EVIL]
         viewer.show(run)
         viewer._panel._robots = (EVIL, EVIL)
         run.advance()
         viewer._panel.show(np.zeros((2, 3)), 1.0)
         page.get_by_text("x real time").wait_for()
         page.get_by_text("Observation of the driven robot").click()
-        assert page.evaluate("window.ran") is None and page.locator("body").inner_text().count(EVIL) >= 6
+        assert (
+            page.evaluate("window.ran") is None
+            and page.locator("body").inner_text().count(EVIL) >= 6
+        )
         viewer._panel._wanted = Entry("go1gate", EVIL)
         assert not viewer._open_chosen()
         page.get_by_text("not loaded: runs/<iframe").wait_for()
@@ -253,21 +333,29 @@ def stage() -> Iterator[Any]:
     """The scene of three environments of Narrow Gate, on a server without a page."""
     env = make("go1gate", impl="c", control="position", num_envs=3)
     data = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3)).data
-    frame = Episode(np.asarray(data.qpos), np.asarray(data.mocap_pos), np.asarray(data.mocap_quat), env.dt)
+    frame = Episode(
+        np.asarray(data.qpos), np.asarray(data.mocap_pos), np.asarray(data.mocap_quat), env.dt
+    )
     server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
-    yield SimpleNamespace(env=env, frame=frame, stage=Stage(server, env.mj_model, frame), server=server)
+    yield SimpleNamespace(
+        env=env, frame=frame, stage=Stage(server, env.mj_model, frame), server=server
+    )
     server.stop()
 
 
 def test_environments_stand_side_by_side_and_every_moving_body_is_drawn(stage: Any) -> None:
-    scene, frame, model = stage.stage, stage.frame, stage.env.mj_model
+    scene = stage.stage
+    frame = stage.frame
+    model = stage.env.mj_model
     drawn = sorted(int(body) for batch in scene._batches for body in batch.bodies)
     with_shape = {int(model.geom_bodyid[g]) for g in range(model.ngeom) if model.geom_group[g] != 3}
     robots = [b for b in with_shape if model.body_mocapid[b] < 0 and b != 0]
     assert drawn == sorted(robots)
     trunk = model.body("robot0/trunk").id
     batch = next(batch for batch in scene._batches if trunk in batch.bodies)
-    place = batch.handle.batched_positions.reshape(3, len(batch.bodies), 3)[:, list(batch.bodies).index(trunk)]
+    place = batch.handle.batched_positions.reshape(3, len(batch.bodies), 3)[
+        :, list(batch.bodies).index(trunk)
+    ]
     away = place - frame.qpos[:, stage.env.index.base_qpos[0, :3]]
     np.testing.assert_allclose(away[:, [0, 2]], 0.0, atol=1e-5)
     apart = np.diff(away[:, 1])
@@ -280,7 +368,14 @@ def test_what_a_robot_senses_is_drawn_in_its_environment(stage: Any) -> None:
     spots = jnp.arange(2 * 3 * 2 * 2.0).reshape(2, 3, 2, 2)
     opacity = jnp.array([[1.0, 1.0, 1.0], [0.0, 1.0, 0.5]])
     area = jnp.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]] * 2)
-    mark = marks("lidar", (1.0, 0.0, 0.0), jnp.full(2, 0.3), lines=spots, line_opacity=opacity, points=spots[:, :, 0])
+    mark = marks(
+        "lidar",
+        (1.0, 0.0, 0.0),
+        jnp.full(2, 0.3),
+        lines=spots,
+        line_opacity=opacity,
+        points=spots[:, :, 0],
+    )
     view = marks("in view", (0.0, 1.0, 0.0), jnp.full(2, 0.3), area=area)
     every = jax.tree.map(lambda x: np.stack([x] * 3), (mark, view))
     overlay = Overlay(stage.server, stage.env.mj_model, stage.stage.offset)
@@ -298,7 +393,8 @@ def test_what_a_robot_senses_is_drawn_in_its_environment(stage: Any) -> None:
 def test_contact_forces_carry_the_robots() -> None:
     """Of two Go1s that stand on their feet; robots are named by colour."""
     env = make("go1plane", impl="c", control="position", num_envs=1)
-    model, joints = env.mj_model, np.asarray(env.index.joint_qpos)
+    model = env.mj_model
+    joints = np.asarray(env.index.joint_qpos)
     data = mujoco.MjData(model)
     data.qpos[joints] = env.robot.default_joints
     for i, base in enumerate(env.index.base_qpos):
@@ -323,14 +419,20 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
 
     viewer = Viewer(port=free_port(), menu=Menu(open_choice, Entry("go1gate"), {}))
     viewer.show(session(Driven()))
-    first, panel, gui = viewer.session, viewer._panel, viewer.server.gui
-    widgets, commands = len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)
+    first = viewer.session
+    panel = viewer._panel
+    gui = viewer.server.gui
+    widgets = len(gui._gui_input_handle_from_uuid)
+    commands = len(gui._command_handle_from_uuid)
     assert not viewer._open_chosen()
     panel._wanted = Entry("go1gate", "bad")
     assert not viewer._open_chosen() and viewer.session is first and first.paused
     panel._wanted = Entry("go1gate", "idle")
     assert viewer._open_chosen() and viewer.session is not first and viewer.session.num_envs == 3
-    assert (len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)) == (widgets, commands)
+    assert (len(gui._gui_input_handle_from_uuid), len(gui._command_handle_from_uuid)) == (
+        widgets,
+        commands,
+    )
     assert viewer._panel is not panel and viewer._panel.take_choice() is None
     viewer._panel.shapes = viewer._panel.contacts = True
     viewer._draw()
@@ -342,21 +444,32 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
-def test_own_lights_alone_and_cameras_at_the_action_of_one_environment(num_envs: int, monkeypatch: Any) -> None:
+def test_own_lights_alone_and_cameras_at_the_action_of_one_environment(
+    num_envs: int, monkeypatch: Any
+) -> None:
     lights: dict[str, Any] = {}
     for name in ("configure_default_lights", "configure_environment_map", "add_light_directional"):
         monkeypatch.setattr(
-            viser.SceneApi, name, lambda _, *first, name=name, **rest: lights.update({name: (first, rest)})
+            viser.SceneApi,
+            name,
+            lambda _, *first, name=name, **rest: lights.update({name: (first, rest)}),
         )
-    viewer, run = Viewer(port=free_port()), session(Driven(), num_envs=num_envs)
+    viewer = Viewer(port=free_port())
+    run = session(Driven(), num_envs=num_envs)
     viewer.show(run)
-    camera, robots = viewer.server.initial_camera, run.moment().frame.qpos[0, FakeEnv.robot_x[:, None] + np.arange(2)]
-    assert [lights[f"configure_{name}"][0] for name in ("default_lights", "environment_map")] == [(False,), (None,)]
+    camera = viewer.server.initial_camera
+    robots = run.moment().frame.qpos[0, FakeEnv.robot_x[:, None] + np.arange(2)]
+    assert [lights[f"configure_{name}"][0] for name in ("default_lights", "environment_map")] == [
+        (False,),
+        (None,),
+    ]
     assert lights["add_light_directional"][1]["cast_shadow"] is False
     distance = float(np.linalg.norm(np.subtract(camera.position, camera.look_at)))
-    followed, (position, target) = num_envs == 1, viewer._stage.overview()
+    followed = num_envs == 1
+    (position, target) = viewer._stage.overview()
     middle = robots.mean(axis=0) if followed else np.zeros(2)
     np.testing.assert_allclose(np.asarray(viewer._stage._root.position)[:2], -middle, atol=1e-5)
-    near, whole = 3.0 + np.linalg.norm(np.subtract(*robots)), np.linalg.norm(np.subtract(position, target))
+    near = 3.0 + np.linalg.norm(np.subtract(*robots))
+    whole = np.linalg.norm(np.subtract(position, target))
     assert distance == pytest.approx(near if followed else whole, abs=0.02) and whole > near + 0.2
     viewer.server.stop()

@@ -77,7 +77,9 @@ def write_torchscript(
     children: dict[str, bytes] = {}
     for name in sorted({name.split(".")[0] for name in layers}, key=int):
         if children:
-            children[str(int(name) - 1)] = child(f"torch.nn.modules.activation.___torch_mangle_3.{activation}")
+            children[str(int(name) - 1)] = child(
+                f"torch.nn.modules.activation.___torch_mangle_3.{activation}"
+            )
         linear = (named(kind, tensor(layers[f"{name}.{kind}"])) for kind in ("weight", "bias"))
         children[name] = module(*linear, kind="torch.nn.modules.linear.Linear")
     children |= {name: child(value) for name, value in (further or {}).items()}
@@ -88,25 +90,36 @@ def write_torchscript(
 
 
 def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.Path) -> None:
-    adaptation, body = random_layers(ADAPTATION_SIZES, 0), random_layers(BODY_SIZES, 1)
+    adaptation = random_layers(ADAPTATION_SIZES, 0)
+    body = random_layers(BODY_SIZES, 1)
     write_torchscript(tmp_path / "a.jit", adaptation)
     write_torchscript(tmp_path / "b.jit", body)
     params = torchscript.convert(tmp_path / "a.jit", tmp_path / "b.jit")
     history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
     latent = apply(adaptation, history)
     action = apply(body, np.concatenate([history, latent], axis=1))
-    for found, expected in zip(walk_policy.infer(params, jnp.asarray(history)), (action, latent), strict=True):
+    for found, expected in zip(
+        walk_policy.infer(params, jnp.asarray(history)), (action, latent), strict=True
+    ):
         np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_converted_weights_are_rounded_to_float16_only_on_request(tmp_path: pathlib.Path, half: bool) -> None:
-    layers = {"adaptation": random_layers(ADAPTATION_SIZES, 0), "body": random_layers(BODY_SIZES, 1)}
+def test_converted_weights_are_rounded_to_float16_only_on_request(
+    tmp_path: pathlib.Path, half: bool
+) -> None:
+    layers = {
+        "adaptation": random_layers(ADAPTATION_SIZES, 0),
+        "body": random_layers(BODY_SIZES, 1),
+    }
     for part, values in layers.items():
         write_torchscript(tmp_path / f"{part}.jit", values)
     file = tmp_path / "walk.safetensors"
     parts = [str(tmp_path / f"{part}.jit") for part in layers]
-    assert cli.main(["walk", "convert", *parts, "-o", str(file), *(["--float16"] if half else [])]) == 0
+    assert (
+        cli.main(["walk", "convert", *parts, "-o", str(file), *(["--float16"] if half else [])])
+        == 0
+    )
     assert (file.stat().st_size < 3.7e6) is half
     found = walk_policy.load_params(GO1, file)
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}
@@ -120,9 +133,13 @@ def test_converted_weights_are_rounded_to_float16_only_on_request(tmp_path: path
 def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
     text = tmp_path / "text.jit"
     text.write_text("hello")
-    refuses(r"text\.jit: damaged, or not a TorchScript Sequential", torchscript.read_torchscript, text)
+    refuses(
+        r"text\.jit: damaged, or not a TorchScript Sequential", torchscript.read_torchscript, text
+    )
     write_torchscript(tmp_path / "small.jit", random_layers((10, 5, 2), 0))
-    with pytest.raises(ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"):
+    with pytest.raises(
+        ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"
+    ):
         torchscript.convert(tmp_path / "small.jit", tmp_path / "small.jit")
 
 
@@ -134,25 +151,43 @@ def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
         ({"alpha": "0.5"}, "1 is an ELU with alpha 0.5"),
         ({"alpha": "1., 1.5e+00"}, "1 is an ELU with alpha 1.5e"),
         ({"root": "policy.Scaled"}, "the network is a policy.Scaled"),
-        ({"further": {"7": "torch.nn.modules.activation.Tanh"}}, "7 is a torch.nn.modules.activation.Tanh"),
-        ({"further": {"7": "torch.nn.modules.activation.___torch_mangle_3.ELU"}}, "the last must be Linear"),
+        (
+            {"further": {"7": "torch.nn.modules.activation.Tanh"}},
+            "7 is a torch.nn.modules.activation.Tanh",
+        ),
+        (
+            {"further": {"7": "torch.nn.modules.activation.___torch_mangle_3.ELU"}},
+            "the last must be Linear",
+        ),
         ({"further": {"scale": np.full(1, 2.0, np.float32)}}, "scale is not expected"),
         ({"further": {"scale": 2.0}}, "scale is not expected"),
         ({"further": {"1": None}}, "1 is a NoneType"),
     ],
 )
-def test_other_networks_are_refused_by_name(network: dict[str, Any], message: str, tmp_path: pathlib.Path) -> None:
+def test_other_networks_are_refused_by_name(
+    network: dict[str, Any], message: str, tmp_path: pathlib.Path
+) -> None:
     write_torchscript(tmp_path / "a.jit", random_layers((6, 5, 4, 3, 2), 0), **network)
     refuses(rf"a\.jit: .*{re.escape(message)}", torchscript.read_torchscript, tmp_path / "a.jit")
 
 
-@pytest.mark.parametrize("read", [functools.partial(walk_policy.load_params, GO1), actuators.load_actuator_network])
+@pytest.mark.parametrize(
+    "read", [functools.partial(walk_policy.load_params, GO1), actuators.load_actuator_network]
+)
 def test_weights_with_other_names_or_shapes_are_refused(read: Any, tmp_path: pathlib.Path) -> None:
     arrays = random_layers((6, 32, 32, 1), 0)
     if read is not actuators.load_actuator_network:
-        parts = {"adaptation": random_layers(ADAPTATION_SIZES, 0), "body": random_layers(BODY_SIZES, 1)}
-        arrays = {f"{part}.{name}": value for part, layers in parts.items() for name, value in layers.items()}
-    first, file = next(iter(arrays)), tmp_path / "weights.safetensors"
+        parts = {
+            "adaptation": random_layers(ADAPTATION_SIZES, 0),
+            "body": random_layers(BODY_SIZES, 1),
+        }
+        arrays = {
+            f"{part}.{name}": value
+            for part, layers in parts.items()
+            for name, value in layers.items()
+        }
+    first = next(iter(arrays))
+    file = tmp_path / "weights.safetensors"
     save_file(arrays, file)
     read(file)
     changed = {
@@ -166,7 +201,9 @@ def test_weights_with_other_names_or_shapes_are_refused(read: Any, tmp_path: pat
 
 
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
-    memory = walk_policy.WalkMemory(jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(()))
+    memory = walk_policy.WalkMemory(
+        jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(())
+    )
     commands = SKILL.default_commands("trot", vx=1.0, vy=-0.5, yaw_rate=0.4)
     joints = GO1.default_joints + np.arange(12)
     sensed = Proprioception(DOWN, jnp.asarray(joints), jnp.full(12, 2.0))
@@ -181,10 +218,17 @@ def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
 
 @pytest.mark.parametrize(
     ("gait", "together"),
-    [("trot", [(0, 3), (1, 2)]), ("pace", [(0, 2), (1, 3)]), ("bound", [(0, 1), (2, 3)]), ("pronk", [(0, 1, 2, 3)])],
+    [
+        ("trot", [(0, 3), (1, 2)]),
+        ("pace", [(0, 2), (1, 3)]),
+        ("bound", [(0, 1), (2, 3)]),
+        ("pronk", [(0, 1, 2, 3)]),
+    ],
 )
 def test_gaits_move_the_right_feet_together(gait: str, together: list[tuple[int, ...]]) -> None:
-    phases = np.asarray(walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(SKILL.default_commands(gait))))
+    phases = np.asarray(
+        walk_policy.foot_phases(jnp.float32(0.1), jnp.asarray(SKILL.default_commands(gait)))
+    )
     for group in together:
         assert np.ptp(phases[list(group)]) < 1e-6
     if len(together) == 2:
@@ -201,10 +245,17 @@ def test_phases_are_warped_by_the_duration() -> None:
 
 @pytest.mark.parametrize(
     ("varied", "size"),
-    [(("yaw_rate", "vx", "vy"), 1344), (("vx", "pitch", "gait_frequency", "stance_width"), 1376), (("phase",), 1376)],
+    [
+        (("yaw_rate", "vx", "vy"), 1344),
+        (("vx", "pitch", "gait_frequency", "stance_width"), 1376),
+        (("phase",), 1376),
+    ],
 )
-def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, ...], size: int) -> None:
-    params, command = walk_policy.init_params(jax.random.PRNGKey(0)), np.array(SKILL.default_commands("pace"))
+def test_a_restricted_policy_acts_alike_on_a_shorter_history(
+    varied: tuple[str, ...], size: int
+) -> None:
+    params = walk_policy.init_params(jax.random.PRNGKey(0))
+    command = np.array(SKILL.default_commands("pace"))
     short: Any = SKILL.restrict(varied, "pace")
     policies = {SKILL: params, short: short.fold_history(params)}
     act = {policy: jax.jit(policy.targets) for policy in policies}
@@ -213,16 +264,24 @@ def test_a_restricted_policy_acts_alike_on_a_shorter_history(varied: tuple[str, 
     random = np.random.default_rng(0)
     for _ in range(33):
         command[SKILL.index(varied)] = random.uniform(-0.5, 0.5, len(varied))
-        sensed = Proprioception(*(jnp.asarray(random.normal(size=n), jnp.float32) for n in (3, 12, 12)))
+        sensed = Proprioception(
+            *(jnp.asarray(random.normal(size=n), jnp.float32) for n in (3, 12, 12))
+        )
         for policy, weights in policies.items():
-            _, memories[policy] = act[policy](weights, memories[policy], jnp.asarray(command), sensed)
+            _, memories[policy] = act[policy](
+                weights, memories[policy], jnp.asarray(command), sensed
+            )
         np.testing.assert_allclose(memories[short].action, memories[SKILL].action, atol=1e-6)
 
 
 def test_environments_store_what_actions_can_change() -> None:
-    gate, defender = (make(task, impl="c", num_envs=1) for task in ("go1gate", "go1football-defender"))
+    gate = make("go1gate", impl="c", num_envs=1)
+    defender = make("go1football-defender", impl="c", num_envs=1)
     leaning = type("Leaning", (type(defender),), {"npc_varied": ()})(impl="c")
-    histories = [jax.eval_shape(env.controller.reset).skill.history.shape for env in (gate, defender, leaning)]
+    histories = [
+        jax.eval_shape(env.controller.reset).skill.history.shape
+        for env in (gate, defender, leaning)
+    ]
     assert histories == [(2, 1344), (3, 1344), (3, 30, 70)]
 
 
@@ -235,7 +294,9 @@ def test_memory_shifts_and_advances() -> None:
     assert target.shape == (12,) and float(memory.gait) == pytest.approx(0.06)
     assert not np.asarray(memory.history[:-1]).any() and np.asarray(memory.history[-1]).any()
     first = np.asarray(memory.action)
-    np.testing.assert_allclose(target, GO1.default_joints + np.tile([0.125, 0.25, 0.25], 4) * first, atol=1e-5)
+    np.testing.assert_allclose(
+        target, GO1.default_joints + np.tile([0.125, 0.25, 0.25], 4) * first, atol=1e-5
+    )
     _, memory = SKILL.targets(params, memory, command, still)
     np.testing.assert_array_equal(memory.previous_action, first)
 
@@ -244,7 +305,9 @@ def test_actions_are_clipped_and_remembered_as_such() -> None:
     params = walk_policy.init_params(jax.random.PRNGKey(0))
     params["body"]["6"]["bias"] = jnp.tile(jnp.array([50.0, -50.0]), 6)
     still = Proprioception(DOWN, jnp.asarray(GO1.default_joints), jnp.zeros(12))
-    target, memory = SKILL.targets(params, SKILL.init_memory(), jnp.asarray(SKILL.default_commands()), still)
+    target, memory = SKILL.targets(
+        params, SKILL.init_memory(), jnp.asarray(SKILL.default_commands()), still
+    )
     np.testing.assert_array_equal(memory.action, np.tile([10.0, -10.0], 6))
     np.testing.assert_allclose(target, GO1.joint_targets(memory.action))
 
@@ -260,22 +323,32 @@ def test_shipped_policy_walks() -> None:
 
     task = WalkTask(randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6)
     env = WalkEnv(GO1, task, impl="c", num_envs=4)
-    figures = measure(env, walk_policy.load_params(GO1), Scenario(duration=3.0, velocity=(0.8, 0.0, 0.0)), 4)
+    figures = measure(
+        env, walk_policy.load_params(GO1), Scenario(duration=3.0, velocity=(0.8, 0.0, 0.0)), 4
+    )
     assert figures["fall_rate"] == 0
-    assert figures["bias_vx"] == pytest.approx(0.0, abs=0.12) and 0.1 < figures["cost_of_transport"] < 2.0
+    assert (
+        figures["bias_vx"] == pytest.approx(0.0, abs=0.12)
+        and 0.1 < figures["cost_of_transport"] < 2.0
+    )
     assert figures["rms_vx"] < 0.15
 
 
 def test_actuator_network_computes_softsign_layers() -> None:
     random = np.random.default_rng(0)
-    shapes: dict[str, tuple[int, ...]] = {"0.weight": (32, 6), "2.weight": (32, 32), "4.weight": (1, 32)}
+    shapes: dict[str, tuple[int, ...]] = {
+        "0.weight": (32, 6),
+        "2.weight": (32, 32),
+        "4.weight": (1, 32),
+    }
     shapes |= {"0.bias": (32,), "2.bias": (32,), "4.bias": (1,)}
     flat = {name: random.normal(size=shape) for name, shape in shapes.items()}
     params: Any = {}
     for name, value in flat.items():
         layer, kind = name.split(".")
         params.setdefault(layer, {})[kind] = jnp.asarray(value, jnp.float32)
-    error, velocity = random.normal(size=(3, 12)), random.normal(size=(3, 12))
+    error = random.normal(size=(3, 12))
+    velocity = random.normal(size=(3, 12))
     x = np.concatenate([error, velocity]).T
     for layer in ("0", "2"):
         x = x @ flat[f"{layer}.weight"].T + flat[f"{layer}.bias"]
@@ -288,14 +361,18 @@ def test_actuator_network_computes_softsign_layers() -> None:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sliding:
-    """Physics without a model: joints move by 0.001 rad in a physics step, whatever their torques, which are kept."""
+    """Physics without a model: joints move by 0.001 rad in a physics step, whatever their torques,
+    which are kept.
+    """
 
     qpos: jax.Array
     qvel: jax.Array
     torque: jax.Array
 
 
-def test_an_actuator_network_gets_the_newest_error_first_and_keeps_two(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_actuator_network_gets_the_newest_error_first_and_keeps_two(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def slide(data: Sliding, torque: jax.Array, **_: Any) -> tuple[Sliding, jax.Array]:
         return Sliding(data.qpos + 1e-3, data.qvel + 1.0, torque), data.qvel[0] < 2.0
 
@@ -305,14 +382,20 @@ def test_an_actuator_network_gets_the_newest_error_first_and_keeps_two(monkeypat
 
     monkeypatch.setattr(actuators, "actuator_torque", torque)
     joints = np.arange(12)[None]
-    index: Any = SimpleNamespace(joint_qpos=joints, joint_qvel=joints, actuator=joints, num_robots=1)
+    index: Any = SimpleNamespace(
+        joint_qpos=joints, joint_qvel=joints, actuator=joints, num_robots=1
+    )
     physics: Any = SimpleNamespace(step=slide, num_substeps=3, model=SimpleNamespace(nu=12))
     network = actuators.NetworkActuators(physics, index, GO1, {})
     start = Sliding(jnp.full(12, 1e-3), jnp.ones(12), jnp.zeros(12))
-    data, memory, overflow = network.step(start, network.init_memory(), jnp.zeros((1, 12)), {}, None)
+    data, memory, overflow = network.step(
+        start, network.init_memory(), jnp.zeros((1, 12)), {}, None
+    )
     assert bool(overflow)  # of the first physics step
     np.testing.assert_allclose(data.torque, 0.003 + 0.02 + 0.1 + (3 + 20 + 100) / 100, rtol=1e-5)
     np.testing.assert_allclose(memory[0][:, 0, 0], [3e-3, 2e-3], rtol=1e-5)
     np.testing.assert_allclose(memory[1][:, 0, 0], [3.0, 2.0])
-    data, _, overflow = network.step(start, network.init_memory(), jnp.tile(jnp.array([-9.0, 9.0]), 6)[None], {}, None)
+    data, _, overflow = network.step(
+        start, network.init_memory(), jnp.tile(jnp.array([-9.0, 9.0]), 6)[None], {}, None
+    )
     np.testing.assert_allclose(data.torque, np.tile([1.0, -1.0], 6) * GO1.torque_limit, rtol=1e-6)

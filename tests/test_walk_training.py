@@ -1,4 +1,6 @@
-"""The skills' networks: the walk policy in training, and the agile skill at run time and in training."""
+"""The skills' networks: the walk policy in training, and the agile skill at run time and in
+training.
+"""
 
 import itertools
 import pathlib
@@ -33,13 +35,18 @@ DIMS = EnvDims(agents=1, observation=70, privileged=5, action=12, values=1)
 
 
 def test_windows_are_the_histories_kept_step_by_step() -> None:
-    """Over two chunks of 20 steps; environment 1 starts an episode at step 10, environment 2 with the second chunk."""
+    """Over two chunks of 20 steps; environment 1 starts an episode at step 10, environment 2 with
+    the second chunk.
+    """
     random = np.random.default_rng(0)
-    steps, envs = 40, 3
+    steps = 40
+    envs = 3
     obs = random.normal(size=(steps, envs, 70)).astype(np.float32)
     is_first = np.zeros((steps, envs), bool)
     is_first[0] = is_first[10, 1] = is_first[20, 2] = True
-    history, kept, starts = np.zeros((envs, 30, 70), np.float32), [], []
+    history = np.zeros((envs, 30, 70), np.float32)
+    kept = []
+    starts = []
     for t in range(steps):
         before = np.where(is_first[t][:, None, None], 0, history[:, 1:])
         history = np.concatenate([before, obs[t][:, None]], axis=1)
@@ -47,7 +54,9 @@ def test_windows_are_the_histories_kept_step_by_step() -> None:
         starts.append(before)
     for start in (0, 20):
         chunk = slice(start, start + 20)
-        found = windows(jnp.asarray(starts[start]), jnp.asarray(is_first[chunk]), jnp.asarray(obs[chunk]), ALL)
+        found = windows(
+            jnp.asarray(starts[start]), jnp.asarray(is_first[chunk]), jnp.asarray(obs[chunk]), ALL
+        )
         np.testing.assert_array_equal(found.reshape(20, envs, -1), np.stack(kept[chunk]))
 
 
@@ -56,23 +65,34 @@ def waves(hidden: jax.Array, step: jax.Array) -> jax.Array:
 
 
 def probe(num_envs: int = 4) -> Any:
-    """Observations that differ between steps; odd environments have longer episodes than even ones."""
+    """Observations that differ between steps; odd environments have longer episodes than even
+    ones.
+    """
 
     def pay(hidden: jax.Array, action: jax.Array) -> jax.Array:
         return -jnp.mean(jnp.square(action), axis=-1)
 
     sizes: Any = {"num_agents": 1, "action_size": 12, "features": 69}
-    return Probe(waves, pay, num_envs, **sizes, max_episode_steps=5, odd_episode_steps=31, teams=((0,),))
+    return Probe(
+        waves, pay, num_envs, **sizes, max_episode_steps=5, odd_episode_steps=31, teams=((0,),)
+    )
 
 
 def settings(**changes: Any) -> Any:
-    small = {"num_envs": 4, "rollout_steps": 12, "network": {"chunk_length": 6}, "stagger_episodes": False}
+    small = {
+        "num_envs": 4,
+        "rollout_steps": 12,
+        "network": {"chunk_length": 6},
+        "stagger_episodes": False,
+    }
     return override(WALK, {**small, "curriculum.assistance": 0.0, **changes})
 
 
 @pytest.fixture(scope="module")
 def history() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
-    """States and metrics of four updates of one gradient step, the first two of the critic alone."""
+    """States and metrics of four updates of one gradient step, the first two of the critic
+    alone.
+    """
     config = settings(total_steps=4 * 48, ppo={"epochs": 1, "minibatches": 1, "critic_warmup": 0.5})
     return updated(probe(), config, 4)
 
@@ -86,9 +106,12 @@ def test_a_chunk_repeats_the_rollout(history: Any) -> None:
 def test_only_the_critic_learns_at_first(history: Any) -> None:
     for number, (before, after) in enumerate(itertools.pairwise(history[0])):
         for name, moves in (("critic", True), ("policy", number >= 2)):
-            pairs = zip(*(jax.tree.leaves(state.params[name]) for state in (before, after)), strict=True)
+            pairs = zip(
+                *(jax.tree.leaves(state.params[name]) for state in (before, after)), strict=True
+            )
             assert any(np.any(a != b) for a, b in pairs) == moves
-    assert [int(state.optimizer.updates) for state in history[0]] == [0, 1, 2, 1, 2]  # Adam begins anew with the actor
+    # Adam begins anew with the actor
+    assert [int(state.optimizer.updates) for state in history[0]] == [0, 1, 2, 1, 2]
 
 
 def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> None:
@@ -96,7 +119,13 @@ def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> Non
     params = random_params(network)
     obs = jax.random.normal(jax.random.PRNGKey(1), (3, 2, 1, 70))
     privileged = jax.random.normal(jax.random.PRNGKey(2), (3, 2, 5))
-    rest = NetworkMemory(jnp.zeros((2, 29, 70)), ()), jnp.zeros((3, 2), bool), obs, privileged, jnp.zeros((3, 2, 1, 12))
+    rest = (
+        NetworkMemory(jnp.zeros((2, 29, 70)), ()),
+        jnp.zeros((3, 2), bool),
+        obs,
+        privileged,
+        jnp.zeros((3, 2, 1, 12)),
+    )
 
     @jax.jit
     def evaluated(params: Any) -> Any:
@@ -114,7 +143,8 @@ def test_the_adaptation_network_is_regressed_on_the_latent_target_alone() -> Non
     error = np.square(latent - privileged[..., -2:]).mean()
     loss, policy_gradient = evaluated(params)
     assert float(loss) == pytest.approx(float(error), rel=1e-5)
-    assert not any(np.any(leaf) for leaf in jax.tree.leaves(policy_gradient))  # the body's input has no gradient
+    # the body's input has no gradient
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(policy_gradient))
 
 
 def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
@@ -127,15 +157,37 @@ def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
 
 
 @pytest.mark.soak
-def test_a_run_is_resumed_and_its_weights_walk(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_resumed_and_its_weights_walk(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     weights = str(walk_policy.ASSETS / "walk_go1.safetensors")
-    train = ["walk", "train", "--run-dir", str(tmp_path), "--num-envs", "16", "--impl", "c", "--weights", weights]
+    train = [
+        "walk",
+        "train",
+        "--run-dir",
+        str(tmp_path),
+        "--num-envs",
+        "16",
+        "--impl",
+        "c",
+        "--weights",
+        weights,
+    ]
     train += ["--optimizer.learning-rate", "1e-5", "--network.log-std-init", "-2", "--total-steps"]
     assert cli.main([*train, str(16 * 24)]) == 0
     assert cli.main([*train, str(3 * 16 * 24), "--resume"]) == 0
     rows = (tmp_path / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[1] for row in rows] == ["updates", "1", "2", "3"]
-    evaluate = ["walk", "eval", "--weights", str(tmp_path / "walk.safetensors"), "--episodes", "4", "--impl", "c"]
+    evaluate = [
+        "walk",
+        "eval",
+        "--weights",
+        str(tmp_path / "walk.safetensors"),
+        "--episodes",
+        "4",
+        "--impl",
+        "c",
+    ]
     assert cli.main([*evaluate, "--scenario", "trot"]) == 0
     assert cli.main([*train, str(3 * 16 * 24), "--resume", "--robot", "go2"]) == 2
     assert "env.robot: 'go2' differs" in capsys.readouterr().err
@@ -145,17 +197,39 @@ SKILL = walk_policy.WalkPolicy(GO1)
 Y_AND_ROTATIONS = SKILL.index(("vy", "yaw_rate", "roll"))
 
 
-def observation(joints: np.ndarray, gravity: np.ndarray, commands: np.ndarray, gait: float) -> np.ndarray:
-    memory = WalkMemory(jnp.zeros((0, 70)), jnp.asarray(joints), jnp.asarray(0.5 * joints), jnp.float32(gait))
+def observation(
+    joints: np.ndarray, gravity: np.ndarray, commands: np.ndarray, gait: float
+) -> np.ndarray:
+    memory = WalkMemory(
+        jnp.zeros((0, 70)), jnp.asarray(joints), jnp.asarray(0.5 * joints), jnp.float32(gait)
+    )
     sensed = Proprioception(*(jnp.asarray(x) for x in (gravity, joints, 2.0 * joints)))
     return np.asarray(walk_policy.observe(GO1, memory, jnp.asarray(commands), sensed))
 
 
 def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
     random = np.random.default_rng(0)
-    joints, gravity = random.normal(size=12), np.array([0.1, 0.3, -0.9])
-    mirrored = np.array([joints[JOINT_NAMES.index(("FR" if n[:2] == "FL" else "FL" if n[:2] == "FR" else
-                         "RR" if n[:2] == "RL" else "RL") + n[2:])] for n in JOINT_NAMES])  # fmt: skip
+    joints = random.normal(size=12)
+    gravity = np.array([0.1, 0.3, -0.9])
+    mirrored = np.array(
+        [
+            joints[
+                JOINT_NAMES.index(
+                    (
+                        "FR"
+                        if n[:2] == "FL"
+                        else "FL"
+                        if n[:2] == "FR"
+                        else "RR"
+                        if n[:2] == "RL"
+                        else "RL"
+                    )
+                    + n[2:]
+                )
+            ]
+            for n in JOINT_NAMES
+        ]
+    )
     mirrored[0::3] *= -1.0
     for gait in ("trot", "pace"):
         commands = np.array(SKILL.default_commands(gait))
@@ -176,7 +250,9 @@ def test_descending_the_loss_makes_a_policy_symmetric() -> None:
         return WALK_FORM.symmetry_loss(params, flat, walk_policy.infer(params, flat)[0])
 
     before = float(loss(params))
-    descend = jax.jit(lambda params: jax.tree.map(lambda p, g: p - 0.5 * g, params, jax.grad(loss)(params)))
+    descend = jax.jit(
+        lambda params: jax.tree.map(lambda p, g: p - 0.5 * g, params, jax.grad(loss)(params))
+    )
     for _ in range(30):
         params = descend(params)
     assert before > 1e-6 and float(loss(params)) < 0.5 * before
@@ -194,16 +270,28 @@ def sensed(seed: int) -> Proprioception:
 
 def test_the_network_sees_frames_of_five_steps_the_commands_and_the_clock() -> None:
     assert sum(w.size for w in jax.tree.leaves(PARAMS)) <= 155_000
-    act, memory, action = jax.jit(AGILE.targets), AGILE.init_memory(), np.zeros(12, np.float32)
-    command, frames, gait = jnp.array([1.0, -0.5, 0.4]), [np.zeros(39)] * 8, 0.0
+    act = jax.jit(AGILE.targets)
+    memory = AGILE.init_memory()
+    action = np.zeros(12, np.float32)
+    command = jnp.array([1.0, -0.5, 0.4])
+    frames = [np.zeros(39)] * 8
+    gait = 0.0
     for step in range(10):
         now = sensed(step)
-        parts = (now.gravity_b, now.joint_position - GO1.default_joints, 0.05 * now.joint_velocity, action)
+        parts = (
+            now.gravity_b,
+            now.joint_position - GO1.default_joints,
+            0.05 * now.joint_velocity,
+            action,
+        )
         frames.append(np.concatenate(parts))
         x = np.concatenate(
-            [*(frames[-1 - back] for back in (8, 4, 2, 1, 0)), [2.0, -1.0, 0.4],
-             [np.sin(2 * np.pi * gait), np.cos(2 * np.pi * gait)]]
-        )  # fmt: skip
+            [
+                *(frames[-1 - back] for back in (8, 4, 2, 1, 0)),
+                [2.0, -1.0, 0.4],
+                [np.sin(2 * np.pi * gait), np.cos(2 * np.pi * gait)],
+            ]
+        )
         action = np.asarray(agile.infer(PARAMS, jnp.asarray(x, jnp.float32)))
         target, memory = act(PARAMS, memory, command, now)
         np.testing.assert_allclose(target, GO1.joint_targets(jnp.asarray(action)), atol=1e-5)
@@ -213,9 +301,16 @@ def test_the_network_sees_frames_of_five_steps_the_commands_and_the_clock() -> N
 
 @pytest.mark.parametrize(
     ("velocity", "hertz", "stands"),
-    [((0, 0, 0), 3.0, True), ((0.04, 0, 0), 3.0192, True), ((0.1, 0, 0), 3.048, False), ((-2.5, 1, 2), 4.2, False)],
+    [
+        ((0, 0, 0), 3.0, True),
+        ((0.04, 0, 0), 3.0192, True),
+        ((0.1, 0, 0), 3.048, False),
+        ((-2.5, 1, 2), 4.2, False),
+    ],
 )
-def test_the_trot_is_faster_with_the_velocity_and_rests_without_one(velocity: Any, hertz: float, stands: bool) -> None:
+def test_the_trot_is_faster_with_the_velocity_and_rests_without_one(
+    velocity: Any, hertz: float, stands: bool
+) -> None:
     velocity = jnp.array(velocity, jnp.float32)
     assert float(agile.frequency(velocity)) == pytest.approx(hertz, abs=0.01)
     expected = [0.25] * 4 if stands else [0.6, 0.1, 0.1, 0.6]
@@ -225,17 +320,23 @@ def test_the_trot_is_faster_with_the_velocity_and_rests_without_one(velocity: An
 
 def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
     """Half a cycle later: the trot's other feet."""
-    trainee, side = trainees.make("agile", GO1), jnp.array([1.0, -1.0, -1.0])
+    trainee = trainees.make("agile", GO1)
+    side = jnp.array([1.0, -1.0, -1.0])
 
     def inputs(mirror: bool) -> jax.Array:
         rows = []
         for step in range(5):
-            now, action = sensed(step), sensed(step + 9).joint_position
+            now = sensed(step)
+            action = sensed(step + 9).joint_position
             if mirror:
-                flip = lambda x: x[MIRRORED_JOINTS] * MIRRORED_SIGNS  # noqa: E731
+
+                def flip(x):
+                    return x[MIRRORED_JOINTS] * MIRRORED_SIGNS
+
                 gravity = now.gravity_b * jnp.array([1.0, -1.0, 1.0])
                 position = flip(now.joint_position - GO1.default_joints) + GO1.default_joints
-                now, action = Proprioception(gravity, position, flip(now.joint_velocity)), flip(action)
+                now = Proprioception(gravity, position, flip(now.joint_velocity))
+                action = flip(action)
             rows.append(agile.frame(GO1, now, action))
         velocity = jnp.array([1.0, 0.5, -2.0]) * (side if mirror else 1.0)
         return jnp.concatenate([*rows, agile.now(jnp.float32(0.7 if mirror else 0.2), velocity)])
@@ -248,13 +349,13 @@ def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
 
 def test_the_trained_network_acts_as_the_skill() -> None:
     env = WalkEnv(GO1, STILL, skill="agile", impl="c", num_envs=1)
-    network = AgileNetwork().build(EnvDims(1, env.observation_size, env.privileged_observation_size, 12, 1))
-    params = network.init(jax.random.PRNGKey(1))
-    state, seen, memory = (
-        jax.jit(env.reset)(jax.random.PRNGKey(2)),
-        network.initial_memory(1).actor,
-        AGILE.init_memory(),
+    network = AgileNetwork().build(
+        EnvDims(1, env.observation_size, env.privileged_observation_size, 12, 1)
     )
+    params = network.init(jax.random.PRNGKey(1))
+    state = jax.jit(env.reset)(jax.random.PRNGKey(2))
+    seen = network.initial_memory(1).actor
+    memory = AGILE.init_memory()
 
     @jax.jit
     def step(state: Any, seen: Any, memory: Any) -> Any:
@@ -270,7 +371,9 @@ def test_the_trained_network_acts_as_the_skill() -> None:
 
 
 @pytest.mark.parametrize(("assistance", "share"), [(1.0, 0.5), (0.0, 1.0)])
-def test_commands_fill_the_ranges_that_the_assistance_leaves(assistance: float, share: float) -> None:
+def test_commands_fill_the_ranges_that_the_assistance_leaves(
+    assistance: float, share: float
+) -> None:
     trainee = trainees.make("agile", GO1)
     keys = jax.random.split(jax.random.PRNGKey(0), 4000)
     spec = jax.jit(jax.vmap(lambda key: sample_spec(key, AGILE_TASK, trainee, assistance)))(keys)
@@ -284,9 +387,12 @@ def test_commands_fill_the_ranges_that_the_assistance_leaves(assistance: float, 
 
 
 def test_a_shove_acts_at_one_point_of_the_trunk_for_its_time() -> None:
-    task = override(STILL, {"shove_period": 0.02, "shove_length": (0.1, 0.1)})  # one after the other
+    # one after the other
+    task = override(STILL, {"shove_period": 0.02, "shove_length": (0.1, 0.1)})
     env = WalkEnv(GO1, task, skill="agile", impl="c", num_envs=1)
-    state, shoves, orientations = jax.jit(env.reset)(jax.random.PRNGKey(0)), [], []
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    shoves = []
+    orientations = []
     step = jax.jit(env.step)
     for _ in range(20):
         orientations.append(np.asarray(state.data.qpos[3:7]))
@@ -295,13 +401,16 @@ def test_a_shove_acts_at_one_point_of_the_trunk_for_its_time() -> None:
     starts = [i for i in range(20) if i == 0 or (shoves[i] != shoves[i - 1]).any()]
     assert starts == [0, 5, 10, 15]
     for i in starts:
-        force, torque = shoves[i][:3], shoves[i][3:]
+        force = shoves[i][:3]
+        torque = shoves[i][3:]
         assert 0.0 < np.linalg.norm(force[:2]) <= 100.0 and abs(force @ torque) < 1e-3
         assert np.linalg.norm(torque) <= np.linalg.norm(SHOVED) * np.linalg.norm(force)
 
 
 def test_errors_are_means_over_a_gait_cycle_a_second_after_a_change_of_command() -> None:
-    steps, hertz = 200, 5.0  # cycles of ten steps
+    # cycles of ten steps
+    steps = 200
+    hertz = 5.0
     errors = np.zeros((steps, 1, 3))
     errors[:, 0, 0] = np.where(np.arange(steps) % 10 < 5, 1.0, -1.0)
     errors[:, 0, 1] = 0.3
@@ -316,7 +425,12 @@ def test_errors_are_means_over_a_gait_cycle_a_second_after_a_change_of_command()
 @pytest.mark.parametrize("robot", ["go1", "go2"])
 def test_the_shipped_weights_run_as_commanded(robot: str) -> None:
     ranges = {"vx": (-1.5, 2.0), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
-    params: dict[str, Any] = {"robot": robot, "skill": "agile", "command_ranges": ranges, "num_agents": 1}
+    params: dict[str, Any] = {
+        "robot": robot,
+        "skill": "agile",
+        "command_ranges": ranges,
+        "num_agents": 1,
+    }
     env = make("go1plane", impl="c", num_envs=1, **params)
 
     def step(state: Any, _: None) -> Any:
@@ -324,4 +438,5 @@ def test_the_shipped_weights_run_as_commanded(robot: str) -> None:
         return state, env.read(state.data).position_w[0, :2]
 
     position = jax.lax.scan(step, jax.jit(env.reset)(jax.random.PRNGKey(0)), None, 151)[1]
-    assert float(jnp.linalg.norm(position[150] - position[100])) == pytest.approx(2.0, abs=0.2)  # m in 1 s
+    # m in 1 s
+    assert float(jnp.linalg.norm(position[150] - position[100])) == pytest.approx(2.0, abs=0.2)

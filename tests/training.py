@@ -1,7 +1,9 @@
-"""For tests of training: physics-free environments with known solutions, settings, comparisons of trees and of runs.
+"""For tests of training: physics-free environments with known solutions, settings, comparisons of
+trees and of runs.
 
-`python -m tests.training RUN_A RUN_B` compares two runs bit for bit: every metric but times, and every array of policy
-and last checkpoint. It exits with 1 and names the first difference of each kind.
+`python -m tests.training RUN_A RUN_B` compares two runs bit for bit: every metric but times, and
+every array of policy and last checkpoint. It exits with 1 and names the first difference of each
+kind.
 """
 
 import argparse
@@ -31,7 +33,10 @@ from mqe_jax.train.networks import Network
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ProbeState:
-    """The fields that the learner reads; leading axis N. `hidden` (N, 1) is the task's own state."""
+    """The fields that the learner reads; leading axis N.
+
+    `hidden` (N, 1) is the task's own state.
+    """
 
     hidden: jax.Array
     obs: jax.Array
@@ -52,11 +57,12 @@ class ProbeState:
 class Probe:
     """N environments with one random sign `hidden` per episode.
 
-    `show(hidden (N,), step (N,)) -> (N, F)` is observed besides the agent's id. `pay(hidden, action (N, A, D))` is the
-    reward of the first team (N,), and its negative that of a second one; or each agent's own (N, A). Episodes of even
-    environments end after `max_episode_steps`, those of odd ones after `odd_episode_steps` where given; `terminates`
-    says whether that is a termination (with `even_truncate` only in odd environments). The shorter kind is a success.
-    Every step of an odd environment overflows.
+    `show(hidden (N,), step (N,)) -> (N, F)` is observed besides the agent's id. `pay(hidden, action
+    (N, A, D))` is the reward of the first team (N,), and its negative that of a second one; or each
+    agent's own (N, A). Episodes of even environments end after `max_episode_steps`, those of odd
+    ones after `odd_episode_steps` where given; `terminates` says whether that is a termination
+    (with `even_truncate` only in odd environments). The shorter kind is a success. Every step of an
+    odd environment overflows.
     """
 
     show: Callable[[jax.Array, jax.Array], jax.Array]
@@ -82,7 +88,9 @@ class Probe:
 
     def _observe(self, hidden: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
         seen = self.show(hidden, step)
-        ids = jnp.broadcast_to(jnp.eye(self.num_agents), (self.num_envs, self.num_agents, self.num_agents))
+        ids = jnp.broadcast_to(
+            jnp.eye(self.num_agents), (self.num_envs, self.num_agents, self.num_agents)
+        )
         spread = jnp.broadcast_to(seen[:, None], (self.num_envs, self.num_agents, self.features))
         return jnp.concatenate([ids, spread], axis=-1), seen
 
@@ -92,19 +100,25 @@ class Probe:
         hidden = jax.random.rademacher(draw, (n,), jnp.float32)
         step = jnp.zeros((n,), jnp.int32)
         obs, privileged = self._observe(hidden, step)
-        zero, reward = jnp.zeros((n,)), jnp.zeros((n, self.num_agents))
+        zero = jnp.zeros((n,))
+        reward = jnp.zeros((n, self.num_agents))
         names = ("reward/pay", "average_step_reward", "diverged", "overflow")
         metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
         rest = Outcome(zero[:, None]), metrics, key, step
-        return ProbeState(hidden, obs, privileged, obs, privileged, reward, zero > 0, zero > 0, *rest)
+        return ProbeState(
+            hidden, obs, privileged, obs, privileged, reward, zero > 0, zero > 0, *rest
+        )
 
     def step(self, state: ProbeState, action: jax.Array) -> ProbeState:
         key, draw = jax.random.split(state.key)
         pay = self.pay(state.hidden, action)
         if pay.ndim == 2:
-            reward, pay = pay, jnp.mean(pay, axis=-1)
+            reward = pay
+            pay = jnp.mean(pay, axis=-1)
         else:
-            reward = pay[:, None] * jnp.array([1.0 if agent in self.teams[0] else -1.0 for agent in range(2)])
+            reward = pay[:, None] * jnp.array(
+                [1.0 if agent in self.teams[0] else -1.0 for agent in range(2)]
+            )
         step = state.step + 1
         odd = self.odd_episode_steps or self.max_episode_steps
         limit = jnp.where(jnp.arange(self.num_envs) % 2, odd, self.max_episode_steps)
@@ -118,7 +132,10 @@ class Probe:
             terminates &= jnp.arange(self.num_envs) % 2 == 1
         short = (done & (limit == jnp.minimum(odd, self.max_episode_steps))).astype(jnp.float32)
         metrics = {"reward/pay": pay, "average_step_reward": pay}
-        metrics |= {"diverged": jnp.zeros(done.shape), "overflow": (jnp.arange(self.num_envs) % 2).astype(jnp.float32)}
+        metrics |= {
+            "diverged": jnp.zeros(done.shape),
+            "overflow": (jnp.arange(self.num_envs) % 2).astype(jnp.float32),
+        }
         seen = hidden, obs, privileged, final_obs, final_privileged
         rest = Outcome(short[:, None]), metrics, key, step
         return ProbeState(*seen, reward, done & terminates, done & ~terminates, *rest)
@@ -143,22 +160,25 @@ def pay_near_hidden(hidden: jax.Array, action: jax.Array) -> jax.Array:
 
 def pay_sum_and_difference(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Reward maximal if agent 0's action is half the sign and agent 1's the opposite."""
-    first, second = action[:, 0, 0], action[:, 1, 0]
+    first = action[:, 0, 0]
+    second = action[:, 1, 0]
     return -jnp.square(first + second) - 0.25 * jnp.square(first - second - hidden)
 
 
 def pay_public_good(hidden: jax.Array, action: jax.Array) -> jax.Array:
     """Public-goods game: 0.75 times the sum of all contributions in [-1, 1], minus the agent's own.
 
-    A contribution of 1 costs the agent 0.25 and raises the team's sum by 0.5: +0.5 each if both contribute 1, -0.5 each
-    in the Nash equilibrium.
+    A contribution of 1 costs the agent 0.25 and raises the team's sum by 0.5: +0.5 each if both
+    contribute 1, -0.5 each in the Nash equilibrium.
     """
     given = jnp.clip(action[..., 0], -1.0, 1.0)
     return 0.75 * jnp.sum(given, axis=-1, keepdims=True) - given
 
 
 def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
-    """Reward maximal for equal actions: -2 variances if sampled independently, -1 if one depends on the other."""
+    """Reward maximal for equal actions: -2 variances if sampled independently, -1 if one depends on
+    the other.
+    """
     return -jnp.square(action[:, 0, 0] - action[:, 1, 0])
 
 
@@ -186,19 +206,28 @@ FAST = {
 
 def settings(defaults: Mapping[str, Any] = SHORT, **values: Any) -> TrainConfig:
     """Returns settings of a training; in a name a double underscore is a dot: `ppo__clip=0.1`."""
-    return override(build(TrainConfig, defaults), {name.replace("__", "."): value for name, value in values.items()})
+    return override(
+        build(TrainConfig, defaults),
+        {name.replace("__", "."): value for name, value in values.items()},
+    )
 
 
-def updated(env: Any, config: TrainConfig, count: int, seed: int = 0, **options: Any) -> tuple[list[Any], list[Any]]:
-    """Returns the states of a training from the first one on, and the metrics of its updates; one trace, no effects."""
-    learner, traces = make_learner(env, config, **options), []
+def updated(
+    env: Any, config: TrainConfig, count: int, seed: int = 0, **options: Any
+) -> tuple[list[Any], list[Any]]:
+    """Returns the states of a training from the first one on, and the metrics of its updates; one
+    trace, no effects.
+    """
+    learner = make_learner(env, config, **options)
+    traces = []
 
     @jax.jit
     def update(state: Any) -> Any:
         traces.append(state)
         return learner.update(state)
 
-    states, metrics = [jax.jit(learner.init)(jax.random.PRNGKey(seed))], []
+    states = [jax.jit(learner.init)(jax.random.PRNGKey(seed))]
+    metrics = []
     first = update(states[0])[1]
     for _ in range(count):
         state, row = update(states[-1])
@@ -211,7 +240,9 @@ def updated(env: Any, config: TrainConfig, count: int, seed: int = 0, **options:
 
 @contextlib.contextmanager
 def largest_file(size: int) -> Iterator[None]:
-    """Writes beyond `size` bytes of any file fail, as on a full disk, with EFBIG in place of ENOSPC."""
+    """Writes beyond `size` bytes of any file fail, as on a full disk, with EFBIG in place of
+    ENOSPC.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -225,7 +256,9 @@ class Stop(Exception):
 
 
 def stop_after(updates: int) -> Callable[[Any, dict[str, float]], None]:
-    """Returns a callback that stops a training in the next update, after its row and before its checkpoint."""
+    """Returns a callback that stops a training in the next update, after its row and before its
+    checkpoint.
+    """
 
     def on_update(state: Any, row: dict[str, float]) -> None:
         if row["updates"] > updates:
@@ -235,21 +268,33 @@ def stop_after(updates: int) -> Callable[[Any, dict[str, float]], None]:
 
 
 def random_params(network: Network, seed: int = 0) -> Params:
-    """Parameters of a network drawn by NumPy, matrices of gain 1; the network's `init` takes long to compile."""
+    """Parameters of a network drawn by NumPy, matrices of gain 1; the network's `init` takes long
+    to compile.
+    """
     random = np.random.default_rng(seed)
-    scale = lambda x: x.shape[-2] ** -0.5 if x.ndim > 1 else 0.1  # noqa: E731
+
+    def scale(x):
+        return x.shape[-2] ** -0.5 if x.ndim > 1 else 0.1
+
     shapes = jax.eval_shape(network.init, jax.random.PRNGKey(0))
-    return jax.tree.map(lambda x: jnp.asarray(scale(x) * random.normal(size=x.shape), x.dtype), shapes)
+    return jax.tree.map(
+        lambda x: jnp.asarray(scale(x) * random.normal(size=x.shape), x.dtype), shapes
+    )
 
 
 def export_error(policy: Any, env: Any) -> float:
-    """Returns the largest error of the graph of a policy, for random inputs of five environments at once."""
+    """Returns the largest error of the graph of a policy, for random inputs of five environments at
+    once.
+    """
     from mqe_jax.export import translate
     from mqe_jax.export.check import errors
     from mqe_jax.export.policy import input_shapes, policy_step
 
-    random, shapes = np.random.default_rng(0), input_shapes(policy, env)
-    inputs = {name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()}
+    random = np.random.default_rng(0)
+    shapes = input_shapes(policy, env)
+    inputs = {
+        name: random.normal(size=(5, *shape)).astype(np.float32) for name, shape in shapes.items()
+    }
     step = functools.partial(policy_step, policy, env)
     expected = jax.device_get(jax.jit(jax.vmap(step))(inputs))
     found = errors(translate.translate(step, shapes, "test"), inputs, expected)
@@ -269,7 +314,10 @@ def assert_same(one: Any, other: Any) -> None:
 def rows(run: Path) -> list[dict[str, str]]:
     """Returns the rows of a run's metrics.csv without the columns of times."""
     with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
-        return [{k: v for k, v in row.items() if k not in ("seconds", "fps")} for row in csv.DictReader(file)]
+        return [
+            {k: v for k, v in row.items() if k not in ("seconds", "fps")}
+            for row in csv.DictReader(file)
+        ]
 
 
 def without_progress(lines: Iterable[str]) -> Iterator[str]:
@@ -279,26 +327,39 @@ def without_progress(lines: Iterable[str]) -> Iterator[str]:
 
 
 def content(run: Path) -> dict[str, np.ndarray]:
-    """Returns these columns, and the arrays of the policy and of the last checkpoint, where there is one."""
-    table, checkpoint = rows(run), latest(run)
+    """Returns these columns, and the arrays of the policy and of the last checkpoint, where there
+    is one.
+    """
+    table = rows(run)
+    checkpoint = latest(run)
     arrays = load_file(checkpoint) if checkpoint is not None else {}
     columns = {name: np.array([float(row[name]) for row in table]) for name in table[0]}
-    policy = {f"policy/{name}": array for name, array in load_file(run / "policy.safetensors").items()}
+    policy = {
+        f"policy/{name}": array for name, array in load_file(run / "policy.safetensors").items()
+    }
     return columns | policy | {f"checkpoint/{name}": array for name, array in arrays.items()}
 
 
-def differences(first: dict[str, np.ndarray], second: dict[str, np.ndarray], tolerance: float = 0.0) -> list[str]:
-    """Returns a line for each entry that differs by more than a share of 1 or of its largest number."""
+def differences(
+    first: dict[str, np.ndarray], second: dict[str, np.ndarray], tolerance: float = 0.0
+) -> list[str]:
+    """Returns a line for each entry that differs by more than a share of 1 or of its largest
+    number.
+    """
     found = [f"{name}: only in one run" for name in first.keys() ^ second.keys()]
     for name in first.keys() & second.keys():
-        a, b = first[name], second[name]
+        a = first[name]
+        b = second[name]
         if a.shape != b.shape:
             found.append(f"{name}: {a.shape} and {b.shape}")
             continue
         unequal = ~((a == b) | ((a != a) & (b != b)))
         if tolerance:
-            wide, other = a.astype(float), b.astype(float)
-            unequal &= ~(np.abs(wide - other) <= tolerance * max(1.0, np.nanmax(np.abs(wide), initial=0.0)))
+            wide = a.astype(float)
+            other = b.astype(float)
+            unequal &= ~(
+                np.abs(wide - other) <= tolerance * max(1.0, np.nanmax(np.abs(wide), initial=0.0))
+            )
         if unequal.any():
             place = tuple(np.argwhere(unequal)[0].tolist())
             found.append(f"{name}: at {place} {a[place]} and {b[place]}")
@@ -306,10 +367,15 @@ def differences(first: dict[str, np.ndarray], second: dict[str, np.ndarray], tol
 
 
 def assert_same_run(one: Path, other: Path, tolerance: float = 0.0) -> None:
-    """Asserts that two runs are the same, within a tolerance in what is learned; the second has no unfinished files."""
-    first, second = content(one), content(other)
+    """Asserts that two runs are the same, within a tolerance in what is learned; the second has no
+    unfinished files.
+    """
+    first = content(one)
+    second = content(other)
     if tolerance:
-        first, second = ({k: v for k, v in x.items() if "/rollout/" not in k} for x in (first, second))
+        first, second = (
+            {k: v for k, v in x.items() if "/rollout/" not in k} for x in (first, second)
+        )
     assert differences(first, second, tolerance) == []
     assert not [path for path in other.rglob(".*")]
 

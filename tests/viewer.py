@@ -22,10 +22,17 @@ from mqe_jax.skills.control import Controller
 from mqe_jax.view.session import Session
 
 CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [3.0, 0.0, 2.0],
-    "fov": 0.87, "near": 0.01, "far": 1000.0, "image_height": 480, "image_width": 640,
-    "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
-}  # fmt: skip
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [3.0, 0.0, 2.0],
+    "fov": 0.87,
+    "near": 0.01,
+    "far": 1000.0,
+    "image_height": 480,
+    "image_width": 640,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
 """Message that a browser sends first, with its camera's pose; viser ignores widgets before it."""
 
 
@@ -35,7 +42,9 @@ class Driven(FakeEnv):
     control = "command"
     params = SimpleNamespace(commands=("vx", "vy", "yaw_rate"))
     skill = skills.make("walk", GO1)
-    controller = Controller(skill, params.commands, np.zeros(15, np.float32), {}, "command", GO1, 2, 2, ())
+    controller = Controller(
+        skill, params.commands, np.zeros(15, np.float32), {}, "command", GO1, 2, 2, ()
+    )
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
         return action * jnp.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]])
@@ -58,7 +67,8 @@ class Panel:
     widgets: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Message that created each widget, by label; the first HTML as `state`."""
     commands: dict[str, str] = field(default_factory=dict)  # uuid of each command, by label
-    values: dict[str, Any] = field(default_factory=dict)  # values by label that differ from the initial ones
+    # values by label that differ from the initial ones
+    values: dict[str, Any] = field(default_factory=dict)
 
     def uuid(self, label: str) -> str:
         return self.widgets[label]["uuid"]
@@ -76,7 +86,12 @@ class Client:
         import viser
         from websockets.sync.client import connect
 
-        options = {"proxy": None, "max_size": None, "subprotocols": [f"viser-v{viser.__version__}"], **options}
+        options = {
+            "proxy": None,
+            "max_size": None,
+            "subprotocols": [f"viser-v{viser.__version__}"],
+            **options,
+        }
         self.socket = connect(f"ws://127.0.0.1:{port}", **options)
         self.socket.send(msgspec.msgpack.encode(CAMERA))
 
@@ -105,7 +120,8 @@ class Client:
         panel = Panel()
         labels: dict[str, str] = {}
         for message in self._messages():
-            kind, uuid = message["type"], message.get("uuid", "")
+            kind = message["type"]
+            uuid = message.get("uuid", "")
             if kind == "ReplayDoneMessage":
                 return panel
             if kind == "RegisterCommandMessage":
@@ -122,15 +138,20 @@ class Client:
         raise AssertionError("no end of the replay")
 
     def _messages(self) -> Iterator[dict[str, Any]]:
-        """Messages from the server: length, compressed length (uint64 each), zstd of msgpack, arrays."""
+        """Messages from the server: length, compressed length (uint64 each), zstd of msgpack,
+        arrays.
+        """
         import msgspec
         import zstandard
 
         while True:
             frame = self.socket.recv(timeout=60.0)
             assert isinstance(frame, bytes)
-            size, packed = (int.from_bytes(frame[i : i + 8], "little") for i in (0, 8))
-            window = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + packed], max_output_size=size)
+            size = int.from_bytes(frame[0 : 0 + 8], "little")
+            packed = int.from_bytes(frame[8 : 8 + 8], "little")
+            window = zstandard.ZstdDecompressor().decompress(
+                frame[16 : 16 + packed], max_output_size=size
+            )
             yield from msgspec.msgpack.decode(window)["messages"]
 
 
@@ -140,12 +161,16 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 @contextlib.contextmanager
 def open_page(width: int, height: int, *, touch: bool = False) -> Iterator[Any]:
-    """Opens an empty page of width x height pixels, of a phone with `touch`; skips without Chromium or playwright."""
+    """Opens an empty page of width x height pixels, of a phone with `touch`; skips without Chromium
+    or playwright.
+    """
     program = os.environ.get("MQE_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip("no Chromium here (tools/install.sh chromium installs Debian's)")
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=FLAGS)
-        yield browser.new_page(viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch)
+        yield browser.new_page(
+            viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch
+        )
         browser.close()

@@ -1,10 +1,13 @@
-"""Compares the throughput of checkouts or parameters on one machine: medians and ratios of interleaved timings.
+"""Compares the throughput of checkouts or parameters on one machine: medians and ratios of
+interleaved timings.
 
-    python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv FILE
+    python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv
+    FILE
 
-starts one process per checkout and case, waits for compilation, and times them in turn: drifts of the machine's speed
-affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few
-calls of 50 environment steps, whole step and bare physics. `PATH,senses=onboard` is a checkout with a task parameter.
+starts one process per checkout and case, waits for compilation, and times them in turn: drifts of
+the machine's speed affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of
+`mqe bench`: the median of a few calls of 50 environment steps, whole step and bare physics.
+`PATH,senses=onboard` is a checkout with a task parameter.
 """
 
 import argparse
@@ -24,7 +27,9 @@ RATES = ("env_steps_per_s", "bare_env_steps_per_s")
 
 
 def work(case: str, *, steps: int, repeats: int, cpu_time: bool, params: dict[str, Any]) -> None:
-    """Process of one checkout and case: compiles, then answers each line on standard input with one timing."""
+    """Process of one checkout and case: compiles, then answers each line on standard input with one
+    timing.
+    """
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print
 
@@ -41,7 +46,8 @@ def work(case: str, *, steps: int, repeats: int, cpu_time: bool, params: dict[st
     if getattr(env.params, "senses", ()):
         vector = vector.with_groups(["onboard"])
     scan, bare_scan = programs(env, vector, steps, lambda state: ())
-    whole, bare = jax.jit(lambda carry: scan(carry)[0]), jax.jit(bare_scan)
+    whole = jax.jit(lambda carry: scan(carry)[0])
+    bare = jax.jit(bare_scan)
 
     def rate(run: Any, start: Any) -> float:
         seconds = []
@@ -58,14 +64,21 @@ def work(case: str, *, steps: int, repeats: int, cpu_time: bool, params: dict[st
     print(json.dumps({"ready": mqe_jax.__file__}), file=output, flush=True)
     for _ in sys.stdin:
         figures = {RATES[0]: round(rate(whole, carry), 1), RATES[1]: round(rate(bare, data), 1)}
-        print(json.dumps({**figures, "device": device, "jax": jax.__version__}), file=output, flush=True)
+        print(
+            json.dumps({**figures, "device": device, "jax": jax.__version__}),
+            file=output,
+            flush=True,
+        )
 
 
 def start(place: str, case: str, **options: Any) -> subprocess.Popen[str]:
     """Starts the process that times one case in one checkout, PATH or PATH,PARAMETER=VALUE,..."""
     folder, *pairs = place.split(",")
-    tree, params = Path(folder), {name: yaml.safe_load(value) for name, value in (pair.split("=") for pair in pairs)}
-    path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    tree = Path(folder)
+    params = {name: yaml.safe_load(value) for name, value in (pair.split("=") for pair in pairs)}
+    path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(
+        os.pathsep
+    )
     command = [sys.executable, str(Path(__file__).resolve()), "--work", case]
     command.append(json.dumps({**options, "params": params}))
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -73,7 +86,9 @@ def start(place: str, case: str, **options: Any) -> subprocess.Popen[str]:
 
 
 def answer(worker: subprocess.Popen[str], ask: bool = True) -> dict[str, Any]:
-    """Waits for the next answer of a process, a timing if it is asked for one; exits if the process died."""
+    """Waits for the next answer of a process, a timing if it is asked for one; exits if the process
+    died.
+    """
     assert worker.stdin is not None and worker.stdout is not None
     if ask:
         worker.stdin.write("\n")
@@ -87,13 +102,18 @@ def main() -> int:
     """Runs the pairs and prints one JSON object per case."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
-        "--trees", nargs="+", metavar="NAME=PATH[,PARAMETER=VALUE...]", help="ratios are to the first one"
+        "--trees",
+        nargs="+",
+        metavar="NAME=PATH[,PARAMETER=VALUE...]",
+        help="ratios are to the first one",
     )
     parser.add_argument("--cases", nargs="+", metavar="TASK:ENGINE:ENVS")
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cpu-time", action="store_true", help="count CPU time: for CPUs that others use too")
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="count CPU time: for CPUs that others use too"
+    )
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--work", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -102,7 +122,11 @@ def main() -> int:
         return 0
     trees = dict(pair.split("=", 1) for pair in arguments.trees)
     options = {name: getattr(arguments, name) for name in ("steps", "repeats", "cpu_time")}
-    workers = {(case, name): start(tree, case, **options) for case in arguments.cases for name, tree in trees.items()}
+    workers = {
+        (case, name): start(tree, case, **options)
+        for case in arguments.cases
+        for name, tree in trees.items()
+    }
     for worker in workers.values():
         answer(worker, ask=False)
     rows: list[dict[str, Any]] = []
@@ -119,10 +143,15 @@ def main() -> int:
     for case in arguments.cases:
         result: dict[str, Any] = {"case": case}
         for rate in RATES:
-            values = {name: [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)] for name in trees}
+            values = {
+                name: [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)]
+                for name in trees
+            }
             first = next(iter(values.values()))
             result[rate] = {name: median(found) for name, found in values.items()}
-            ratios = {name: [a / b for a, b in zip(x, first, strict=True)] for name, x in values.items()}
+            ratios = {
+                name: [a / b for a, b in zip(x, first, strict=True)] for name, x in values.items()
+            }
             result[f"{rate}/ratio"] = {name: round(median(x), 4) for name, x in ratios.items()}
         print(json.dumps(result), flush=True)
     return 0

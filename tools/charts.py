@@ -11,8 +11,14 @@ from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).parents[1] / "results"
 WIDTH = 640  # px, of every drawing; a phone shows it at half the size
-INK, FAINT, LINE = "#23252b", "#5f6672", "#8a93a3"
-BLUE, ORANGE, GREEN, VIOLET, GREY = "#2f7fd6", "#d9731a", "#2e8b57", "#7a55c7", "#6b7280"
+INK = "#23252b"
+FAINT = "#5f6672"
+LINE = "#8a93a3"
+BLUE = "#2f7fd6"
+ORANGE = "#d9731a"
+GREEN = "#2e8b57"
+VIOLET = "#7a55c7"
+GREY = "#6b7280"
 TITLES = {
     "go1gate": "Narrow Gate",
     "go1seesaw": "Seesaw",
@@ -39,19 +45,30 @@ def curves() -> Figure:
 
 
 def students() -> Figure:
-    """Success of training episodes while teams with sensors imitate the shipped ones: results/students.csv."""
+    """Success of training episodes while teams with sensors imitate the shipped ones:
+    results/students.csv.
+    """
     return _curves(read_rows("students.csv"), [*TITLES], 4.6, (70, 101))
 
 
-def _curves(rows: Sequence[dict[str, str]], tasks: Sequence[str], height: float, limits: tuple[float, float]) -> Figure:
+def _curves(
+    rows: Sequence[dict[str, str]], tasks: Sequence[str], height: float, limits: tuple[float, float]
+) -> Figure:
     """Draws the success of each task over its environment steps: each seed and their mean."""
-    figure, columns = Figure((WIDTH / 100, height), layout="constrained"), min(3, len(tasks))
-    panels = figure.subplots(-(-len(tasks) // columns), columns, sharex=True, sharey=True, squeeze=False)
+    figure = Figure((WIDTH / 100, height), layout="constrained")
+    columns = min(3, len(tasks))
+    panels = figure.subplots(
+        -(-len(tasks) // columns), columns, sharex=True, sharey=True, squeeze=False
+    )
     for axes, task in zip(panels.flat, tasks, strict=True):
         own = [row for row in rows if row["task"] == task]
         table: dict[float, list[float]] = {}
         for seed in sorted({row["seed"] for row in own}):
-            points = [(float(x["env_steps"]) / 1e6, 100 * float(x["success"])) for x in own if x["seed"] == seed]
+            points = [
+                (float(x["env_steps"]) / 1e6, 100 * float(x["success"]))
+                for x in own
+                if x["seed"] == seed
+            ]
             axes.plot(*zip(*points, strict=True), color=BLUE, alpha=0.35, lw=1.2)
             for step, success in points:
                 table.setdefault(step, []).append(success)
@@ -81,7 +98,15 @@ def levers() -> Figure:
         axes.text(-2, place - 0.22, f"{TITLES[task]}: {change}", fontsize=10.5, color=INK)
         for name, color, shift in (("", BLUE, 0.0), (change, ORANGE, 0.24)):
             values = seeds[task, name]
-            axes.plot(values, [place + shift] * len(values), "o", color=color, ms=7, alpha=0.65, mec="none")
+            axes.plot(
+                values,
+                [place + shift] * len(values),
+                "o",
+                color=color,
+                ms=7,
+                alpha=0.65,
+                mec="none",
+            )
     axes.set(xlim=(-3, 103), ylim=(len(changes) - 0.55, -0.6), yticks=[])
     axes.set_xlabel("success, %; a dot is a seed, dots may coincide", fontsize=10.5)
     axes.grid(axis="x", alpha=0.3)
@@ -93,14 +118,21 @@ def levers() -> Figure:
 
 
 def sizes() -> Figure:
-    """Robot steps/s: by engine against the number of robots, and on Warp against the number of environments."""
+    """Robot steps/s: by engine against the number of robots, and on Warp against the number of
+    environments.
+    """
     entries = read_measurements()
-    rates: dict[tuple[str, int, int], list[float]] = {}  # by engine and task, number of robots, number of environments
+    # by engine and task, number of robots, number of environments
+    rates: dict[tuple[str, int, int], list[float]] = {}
     for row in (row for name in ("c", "mjx", "warp") for row in entries[f"sizes/{name}"]["rows"]):
-        kind, robots, sparse = f"{row['impl']} {row['task']}", row["num_agents"], row.get("sparse_solver", False)
+        kind = f"{row['impl']} {row['task']}"
+        robots = row["num_agents"]
+        sparse = row.get("sparse_solver", False)
         default = sparse == (row["impl"] == "warp" and robots > 4)
         for case in [kind] * default + [f"{kind} false"] * (row.get("sparse_solver") is False):
-            rates.setdefault((case, robots, row["num_envs"]), []).append(robots * row["env_steps_per_s"])
+            rates.setdefault((case, robots, row["num_envs"]), []).append(
+                robots * row["env_steps_per_s"]
+            )
     football = "go1football-1vs1"
     engines = {
         (f"warp {football}", 2048): ("Warp, football", VIOLET),
@@ -109,18 +141,30 @@ def sizes() -> Figure:
         (f"jax {football}", 4): ("MJX, football", ORANGE),
     }
     colors = {2: GREY, 16: VIOLET, 64: INK}
-    sized = {(f"warp {football}", number): (f"{number} robots", color) for number, color in colors.items()}
+    sized = {
+        (f"warp {football}", number): (f"{number} robots", color)
+        for number, color in colors.items()
+    }
     figure = Figure((WIDTH / 100, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    for axes, varied, title, lines in ((left, 1, "robots", engines), (right, 2, "environments on Warp", sized)):
+    for axes, varied, title, lines in (
+        (left, 1, "robots", engines),
+        (right, 2, "environments on Warp", sized),
+    ):
         for (kind, fixed), (label, color) in lines.items():
             for case, style in ((f"{kind} false", "o--"), (kind, "o-")):
-                own = {x[varied]: rate for x, rate in sorted(rates.items()) if (x[0], x[3 - varied]) == (case, fixed)}
+                own = {
+                    x[varied]: rate
+                    for x, rate in sorted(rates.items())
+                    if (x[0], x[3 - varied]) == (case, fixed)
+                }
                 look = {"color": color, "ms": 4, "label": label if case == kind else None}
                 axes.plot([*own], [np.median(values) for values in own.values()], style, **look)
         axes.set(xscale="log", yscale="log")
         axes.set_xlabel(title, fontsize=10.5)
-        ticks = sorted({x[varied] for x in rates if varied == 1 or x[:2] == (f"warp {football}", 2)})
+        ticks = sorted(
+            {x[varied] for x in rates if varied == 1 or x[:2] == (f"warp {football}", 2)}
+        )
         axes.set_xticks(ticks, [str(tick) for tick in ticks], fontsize=9)
         axes.minorticks_off()
         axes.grid(alpha=0.3)
@@ -133,10 +177,14 @@ def sizes() -> Figure:
 
 
 def performance() -> Figure:
-    """Environment steps/s of Narrow Gate by hardware and engine, with the slowest and the fastest call."""
+    """Environment steps/s of Narrow Gate by hardware and engine, with the slowest and the fastest
+    call.
+    """
     entries = read_measurements()
     walk = [row for row in entries["bench_idle"]["rows"] if row["skill"] == "walk"]
-    warp = sorted(tuple(row[x] for x in ("num_envs", "env_steps_per_s", "slowest", "fastest")) for row in walk)
+    warp = sorted(
+        tuple(row[x] for x in ("num_envs", "env_steps_per_s", "slowest", "fastest")) for row in walk
+    )
     rows = [row for row in entries["bench_h100"] if row["impl"] == "jax"]
     mjx = sorted((int(row["num_envs"]), *[float(row["env_steps_per_s"])] * 3) for row in rows)
     cores = [(environments, *[rate] * 3) for environments, rate, _ in entries["bench_c16"]["sizes"]]
@@ -158,8 +206,12 @@ def performance() -> Figure:
         look = {"ha": side, "va": "center", "weight": "bold", "fontsize": 14, "color": color}
         axes.annotate(label, at, shift, textcoords="offset points", **look)
     axes.set(xscale="log", yscale="log", xlim=(215, 5000), ylim=(9e3, 1.6e6))
-    axes.set_xticks(ticks := [256, 512, 1024, 2048, 4096], [str(tick) for tick in ticks], fontsize=14)
-    axes.set_yticks(ticks := [10_000, 100_000, 1_000_000], [f"{tick:,}" for tick in ticks], fontsize=14)
+    axes.set_xticks(
+        ticks := [256, 512, 1024, 2048, 4096], [str(tick) for tick in ticks], fontsize=14
+    )
+    axes.set_yticks(
+        ticks := [10_000, 100_000, 1_000_000], [f"{tick:,}" for tick in ticks], fontsize=14
+    )
     axes.minorticks_off()
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

@@ -1,8 +1,9 @@
-"""Renders the clips of the documentation: typical episodes of the shipped policies, and of scripted teams of any size.
+"""Renders the clips of the documentation: typical episodes of the shipped policies, and of scripted
+teams of any size.
 
-`python tools/clips.py [NAME ...]` writes docs/clips/NAME.webp of each task or entry of `SIZES` (without names, of all),
-and docs/teams.webp from all clips, side by side. Each shows how the median successful one of 48 episodes succeeds, in
-matches against the scripted policy.
+`python tools/clips.py [NAME ...]` writes docs/clips/NAME.webp of each task or entry of `SIZES`
+(without names, of all), and docs/teams.webp from all clips, side by side. Each shows how the median
+successful one of 48 episodes succeeds, in matches against the scripted policy.
 """
 
 import sys
@@ -24,8 +25,16 @@ from mqe_jax.viz.recording import record_episodes, typical
 from mqe_jax.viz.render import render_frames
 
 DOCS = Path(__file__).parents[1] / "docs"
-EPISODES, SECONDS, AFTER, FPS = 48, 4.4, 1.2, 10.0  # AFTER: duration shown after the success, s
-SIZE, SMALL, TILE, COLUMNS = (640, 360), (480, 270), (240, 135), 4  # SMALL: of clips with many moving bodies
+# AFTER: duration shown after the success, s
+EPISODES = 48
+SECONDS = 4.4
+AFTER = 1.2
+FPS = 10.0
+# SMALL: of clips with many moving bodies
+SIZE = (640, 360)
+SMALL = (480, 270)
+TILE = (240, 135)
+COLUMNS = 4
 SIZES: dict[str, tuple[str, dict[str, Any]]] = {
     "gate-8": ("go1gate", {"num_agents": 8, "episode_length": 60.0}),
     "sheep-30": ("go1sheep-hard", {"num_agents": 4, "num_sheep": 30, "episode_length": 25.0}),
@@ -43,24 +52,37 @@ def write(name: str) -> None:
     policy = scripted if name in SIZES else load_policy(task, env)
     policy = all_agents(env, policy, scripted if len(env.teams) > 1 else None)
     limit = env.params.episode_length
-    episode = typical(record_episodes(env, policy, jax.random.PRNGKey(0), episodes=EPISODES, seconds=limit))
+    episode = typical(
+        record_episodes(env, policy, jax.random.PRNGKey(0), episodes=EPISODES, seconds=limit)
+    )
     end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
-    shown = episode.cut(slice(max(0, end - round(SECONDS / episode.dt)), end, round(1 / (FPS * episode.dt))))
+    shown = episode.cut(
+        slice(max(0, end - round(SECONDS / episode.dt)), end, round(1 / (FPS * episode.dt)))
+    )
     size = SMALL if name in SIZES else SIZE
     views = cameras(rendering_model(env.mj_model, shown), shown, "near", size[0] / size[1])
-    write_clip(DOCS / "clips" / f"{name}.webp", map(legend(env, size), render_frames(env, shown, views, size)), FPS)
+    write_clip(
+        DOCS / "clips" / f"{name}.webp",
+        map(legend(env, size), render_frames(env, shown, views, size)),
+        FPS,
+    )
 
 
 def tiles(name: str) -> list[np.ndarray]:
     """Returns the frames of a clip as tiles, with the task's title in place of the legend."""
     task, settings = SIZES.get(name, (name, {}))
-    title, font = make(task, impl="c", **settings).heading, ImageFont.load_default(11)
+    title = make(task, impl="c", **settings).heading
+    font = ImageFont.load_default(11)
     found = []
     with Image.open(DOCS / "clips" / f"{name}.webp") as clip:
         for frame in ImageSequence.Iterator(clip):
             tile = frame.convert("RGB").resize(TILE, Image.Resampling.LANCZOS)
-            ImageDraw.Draw(tile).rectangle((0, TILE[1] - 17, font.getlength(title) + 9, TILE[1]), fill=(28, 32, 40))
-            ImageDraw.Draw(tile).text((5, TILE[1] - 9), title, fill=(246, 246, 242), font=font, anchor="lm")
+            ImageDraw.Draw(tile).rectangle(
+                (0, TILE[1] - 17, font.getlength(title) + 9, TILE[1]), fill=(28, 32, 40)
+            )
+            ImageDraw.Draw(tile).text(
+                (5, TILE[1] - 9), title, fill=(246, 246, 242), font=font, anchor="lm"
+            )
             found.append(np.asarray(tile))
     return found
 
@@ -71,6 +93,9 @@ if __name__ == "__main__":
         write(name)
     TILES = list(map(tiles, [*SHOWN[: len(SHOWN) // COLUMNS * COLUMNS], *SIZES]))
     length = max(map(len, TILES))  # a tile that ends early keeps its last frame
-    still = np.array([tile + tile[-1:] * (length - len(tile)) for tile in TILES])  # (tasks, T, height, width, 3)
-    rows = [np.concatenate(list(still[i : i + COLUMNS]), axis=2) for i in range(0, len(still), COLUMNS)]
+    # (tasks, T, height, width, 3)
+    still = np.array([tile + tile[-1:] * (length - len(tile)) for tile in TILES])
+    rows = [
+        np.concatenate(list(still[i : i + COLUMNS]), axis=2) for i in range(0, len(still), COLUMNS)
+    ]
     write_clip(DOCS / "teams.webp", iter(np.concatenate(rows, axis=1)), FPS)

@@ -1,10 +1,11 @@
 """MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
 
-Generated: the pages `FILES`, one page per task (clip, sizes, observation, rewards, parameters) with an overview, and
-the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes MathML. Links to files outside docs/
-lead to the repository's address, `[project.urls]` in pyproject.toml. If it is not set they become paths: the built site
-then needs neither the repository nor another host. The page of `mqe play-site` is part of the site if it is in
-build/play; otherwise the site says how to build it.
+Generated: the pages `FILES`, one page per task (clip, sizes, observation, rewards, parameters) with
+an overview, and the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes
+MathML. Links to files outside docs/ lead to the repository's address, `[project.urls]` in
+pyproject.toml. If it is not set they become paths: the built site then needs neither the repository
+nor another host. The page of `mqe play-site` is part of the site if it is in build/play; otherwise
+the site says how to build it.
 """
 
 import contextlib
@@ -30,17 +31,27 @@ PLAY = ROOT / "build" / "play"
 """Folder of the page of `mqe play-site`."""
 FILES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md"}
 """Files of the repository that are pages of the site."""
-SETTINGS = {"index.md": "hide: [toc]", "tasks/": "search: {boost: 0.3}", "reference/": "search: {boost: 0.3}"}
+SETTINGS = {
+    "index.md": "hide: [toc]",
+    "tasks/": "search: {boost: 0.3}",
+    "reference/": "search: {boost: 0.3}",
+}
 """Settings of generated pages by the start of their path. The search lists the guides first."""
 
 
 def on_files(files: Any, config: Any) -> Any:
     """Adds the generated pages, and the files of the page of `mqe play-site`."""
-    (reference,) = (section["API reference"] for section in config["nav"] if "API reference" in section)
+    (reference,) = (
+        section["API reference"] for section in config["nav"] if "API reference" in section
+    )
     modules = {path: f"mqe_jax.{Path(path).stem}" for path in reference}
-    references = {path: reference_page(module, {*modules.values()}) for path, module in modules.items()}
+    references = {
+        path: reference_page(module, {*modules.values()}) for path, module in modules.items()
+    }
     for path, content in (pages() | references).items():
-        head = "".join(f"---\n{text}\n---\n" for start, text in SETTINGS.items() if path.startswith(start))
+        head = "".join(
+            f"---\n{text}\n---\n" for start, text in SETTINGS.items() if path.startswith(start)
+        )
         files.append(File.generated(config, path, content=head + content))
     for file in filter(Path.is_file, PLAY.rglob("*") if _playable() else ()):
         path = f"play/{file.relative_to(PLAY).as_posix()}"
@@ -49,7 +60,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def repository() -> str:
-    """Returns the repository's address, `[project.urls]` in pyproject.toml; empty if it is not set."""
+    """Returns the repository's address, `[project.urls]` in pyproject.toml; empty if it is not
+    set.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return project.get("urls", {}).get("Repository", "").rstrip("/")
 
@@ -57,22 +70,26 @@ def repository() -> str:
 def on_config(config: Any) -> Any:
     """Sets the repository's address, from which the theme makes the link in the header."""
     if address := repository():
-        config["repo_url"], config["repo_name"] = address, "/".join(address.split("/")[-2:])
+        config["repo_url"] = address
+        config["repo_name"] = "/".join(address.split("/")[-2:])
     return config
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Converts links and formulas of a page; the one about playing leads to the page of `mqe play-site`."""
+    """Converts links and formulas of a page; the one about playing leads to the page of `mqe
+    play-site`.
+    """
     if page.file.src_uri == "play.md":
         markdown = play_link(markdown, _playable())
     return formulas(links(markdown, repository(), posixpath.dirname(page.file.src_uri)))
 
 
 def links(markdown: str, address: str = "", folder: str = "") -> str:
-    """Leads links to files outside docs/, from a page in a folder of it, to the repository's address.
+    """Leads links to files outside docs/, from a page in a folder of it, to the repository's
+    address.
 
-    Notebooks get links to Colab and Kaggle too, if the address is on GitHub. Without an address links become the
-    file's name and path.
+    Notebooks get links to Colab and Kaggle too, if the address is on GitHub. Without an address
+    links become the file's name and path.
     """
 
     def resolve(match: re.Match[str]) -> str:
@@ -84,7 +101,9 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
         if name in FILES:
             return f"[{text}]({posixpath.relpath(FILES[name], folder or '.')}{mark}{heading})"
         if not address:
-            return text if path.endswith(text.replace("\\", "").rstrip("/")) else f"{text} (`{path}`)"
+            return (
+                text if path.endswith(text.replace("\\", "").rstrip("/")) else f"{text} (`{path}`)"
+            )
         link = f"[{text}]({address}/blob/main/{path})"
         hub = address.partition("https://github.com/")[2]
         colab = f"https://colab.research.google.com/github/{hub}/blob/main/{path}"
@@ -96,8 +115,13 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
 
 
 def play_link(markdown: str, present: bool) -> str:
-    """Puts the link to the page of `mqe play-site` below the title, or how to build it if it is missing."""
-    absent = "This copy of the documentation was built without the page: run `make docs`, or the commands below."
+    """Puts the link to the page of `mqe play-site` below the title, or how to build it if it is
+    missing.
+    """
+    absent = (
+        "This copy of the documentation was built without the page: run `make docs`, or the "
+        "commands below."
+    )
     title, _, rest = markdown.partition("\n")
     return f"{title}\n\n{'**[Open the page](play/index.html)**' if present else absent}\n{rest}"
 
@@ -110,7 +134,11 @@ def formulas(markdown: str) -> str:
     """Replaces $$...$$ and $...$ outside of code by MathML."""
 
     def block(match: re.Match[str]) -> str:
-        return "\n" + latex2mathml.converter.convert(match.group(1).replace("\n", " "), display="block") + "\n"
+        return (
+            "\n"
+            + latex2mathml.converter.convert(match.group(1).replace("\n", " "), display="block")
+            + "\n"
+        )
 
     def inline(match: re.Match[str]) -> str:
         return latex2mathml.converter.convert(match.group(1))
@@ -135,15 +163,21 @@ def pages() -> dict[str, str]:
 def reference_page(module: str, pages: set[str]) -> str:
     """Returns the page of a module, without what it only exports from modules that have pages."""
     members = _package()[module.partition(".")[2]].members.values()
-    elsewhere = [x.name for x in members if x.is_alias and x.target_path.rpartition(".")[0] in pages]
+    elsewhere = [
+        x.name for x in members if x.is_alias and x.target_path.rpartition(".")[0] in pages
+    ]
     filters = ["!^_", f"!^({'|'.join(elsewhere)})$"]
     return f"# {module}\n\n::: {module}\n    options:\n      filters: {filters}\n"
 
 
 def front(readme: str) -> str:
-    """Returns a file of the repository as a page: its links as from docs/, tasks linked to their pages."""
+    """Returns a file of the repository as a page: its links as from docs/, tasks linked to their
+    pages.
+    """
     page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
-    return re.sub(r"^(\| .*) `(go1[\w-]+)` \|", r"\1 [`\2`](tasks/\2.md) |", page, flags=re.MULTILINE)
+    return re.sub(
+        r"^(\| .*) `(go1[\w-]+)` \|", r"\1 [`\2`](tasks/\2.md) |", page, flags=re.MULTILINE
+    )
 
 
 def overview(tasks: Mapping[str, Any]) -> str:
@@ -151,14 +185,31 @@ def overview(tasks: Mapping[str, Any]) -> str:
     kinds: dict[str, list[str]] = {"Cooperative": [], "Competitive": [], "For tests": []}
     for name, task in tasks.items():
         env = task(num_envs=1, impl="c")
-        kind = "Competitive" if len(env.teams) > 1 else "For tests" if name == "go1plane" else "Cooperative"
-        image = f"[![{task.title}: {task.aim}]({_clip(name)})]({name}.md)<br>" if _clip(name) else ""
+        kind = (
+            "Competitive"
+            if len(env.teams) > 1
+            else "For tests"
+            if name == "go1plane"
+            else "Cooperative"
+        )
+        image = (
+            f"[![{task.title}: {task.aim}]({_clip(name)})]({name}.md)<br>" if _clip(name) else ""
+        )
         robots = " vs ".join(str(len(team)) for team in env.teams)
-        sizes = f"{robots} robots, {env.observation_size} numbers observed by each, {env.params.episode_length:g} s"
+        sizes = (
+            f"{robots} robots, {env.observation_size} numbers observed by each, "
+            f"{env.params.episode_length:g} s"
+        )
         kinds[kind].append(f"- {image}[**{task.title}**]({name}.md) `{name}`: {sizes}")
     galleries = [(kind, "\n".join(items)) for kind, items in kinds.items()]
-    parts = [f'## {kind}\n\n<div class="gallery" markdown>\n\n{items}\n\n</div>' for kind, items in galleries]
-    head = "# Tasks\n\nEach page has a task's observation, rewards and parameters, which are read from the code."
+    parts = [
+        f'## {kind}\n\n<div class="gallery" markdown>\n\n{items}\n\n</div>'
+        for kind, items in galleries
+    ]
+    head = (
+        "# Tasks\n\nEach page has a task's observation, rewards and parameters, which are read "
+        "from the code."
+    )
     return "\n\n".join([head, *parts]) + "\n"
 
 
@@ -166,13 +217,21 @@ def task_page(task: Any) -> str:
     """Returns the page of a task."""
     from mqe_jax.envs import SCRIPTED, TaskParams
 
-    env, name = task(num_envs=1, impl="c"), task.name
-    bodies = (inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__)
+    env = task(num_envs=1, impl="c")
+    name = task.name
+    bodies = (
+        inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__
+    )
     body = next(filter(None, bodies))  # that of a base class if the task's is one line
     body = re.sub(r"see `\w+Rewards`", "the terms below", body)
     policy = "shipped" if name in zoo.names() else "scripted" if name in SCRIPTED else "forward"
-    flags, against = (" --opponent scripted", " against the scripted one") if len(env.teams) > 1 else ("", "")
-    caption = f"A typical success of the {policy} policy{against}: [how good it is](../results/strength.md)."
+    flags, against = (
+        (" --opponent scripted", " against the scripted one") if len(env.teams) > 1 else ("", "")
+    )
+    caption = (
+        f"A typical success of the {policy} policy{against}: [how good it "
+        "is](../results/strength.md)."
+    )
     media = [f"![{task.title}: {task.aim}]({_clip(name)})", caption] if _clip(name) else []
     commands = {
         f"mqe render {name}{flags} -o clip.webp": f"a clip of the {policy} policy",
@@ -180,7 +239,10 @@ def task_page(task: Any) -> str:
         f"mqe train {name}": "train a policy",
     }
     units = {command.name: command.unit for command in env.controller.skill.commands}
-    ranges = [f"`{name}` {low:g} to {high:g} {units[name]}" for name, (low, high) in env.params.action_ranges().items()]
+    ranges = [
+        f"`{name}` {low:g} to {high:g} {units[name]}"
+        for name, (low, high) in env.params.action_ranges().items()
+    ]
     width = max(map(len, commands))
     lines = "\n".join(f"{command:{width}}  # {text}" for command, text in commands.items())
     facts = [
@@ -188,7 +250,9 @@ def task_page(task: Any) -> str:
         f"- Action: commands of the skill `{env.params.skill}` ({', '.join(ranges)}). "
         "With control `position` or `torque`, 12 numbers.",
     ]
-    rows = [f"| `{b.name}` | {b.width} | {b.meaning or ''} |" for b in env.observation_layout.blocks]
+    rows = [
+        f"| `{b.name}` | {b.width} | {b.meaning or ''} |" for b in env.observation_layout.blocks
+    ]
     sections = [
         f"# {task.title} (`{name}`)",
         task.aim,
@@ -198,10 +262,13 @@ def task_page(task: Any) -> str:
         "\n".join([*facts, body]),
         f"## Observation of an agent\n\n{env.observation_size} numbers:",
         "| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),
-        f"A critic may also see the privileged observation, {env.privileged_observation_size} numbers.",
-        "## Reward terms\n\n" + _fields(type(env.params.rewards), "weight", given=vars(env.params.rewards)),
+        f"A critic may also see the privileged observation, {env.privileged_observation_size} "
+        "numbers.",
+        "## Reward terms\n\n"
+        + _fields(type(env.params.rewards), "weight", given=vars(env.params.rewards)),
         "Set a weight with `--set rewards.NAME=VALUE` or `make(task, rewards={...})`.",
-        "## Parameters\n\n" + _fields(type(env.params), "default", skip=_shared(type(env.params), TaskParams)),
+        "## Parameters\n\n"
+        + _fields(type(env.params), "default", skip=_shared(type(env.params), TaskParams)),
         "Set one with `--set NAME=VALUE` or `make(task, NAME=VALUE)`. "
         "All tasks share [further parameters](../reference/envs.params.md).",
     ]
@@ -218,20 +285,29 @@ def _meanings(cls: type[Any]) -> dict[str, str]:
     return {name: x.docstring.value for name, x in members.items() if x.docstring}
 
 
-def _fields(kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None) -> str:
-    """Returns a table of a settings class's fields, those of its base last, with the meanings that docstrings give.
+def _fields(
+    kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None
+) -> str:
+    """Returns a table of a settings class's fields, those of its base last, with the meanings that
+    docstrings give.
 
     Values are defaults, or those `given`.
     """
     meanings = [_meanings(cls) for cls in kind.__mro__ if cls is not object]
-    values: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(kind) if f.name not in skip}
+    values: dict[str, Any] = {
+        f.name: f.default for f in dataclasses.fields(kind) if f.name not in skip
+    }
     values |= given or {}
     rows = []
     for name in sorted(values, key=lambda name: name in meanings[-1]):
         parts = {name: (values[name], next((own[name] for own in meanings if name in own), ""))}
         if dataclasses.is_dataclass(values[name]):  # an object of the scene
-            inner, texts = values[name], _meanings(type(values[name]))
-            parts = {f"{name}.{f.name}": (getattr(inner, f.name), texts[f.name]) for f in dataclasses.fields(inner)}
+            inner = values[name]
+            texts = _meanings(type(values[name]))
+            parts = {
+                f"{name}.{f.name}": (getattr(inner, f.name), texts[f.name])
+                for f in dataclasses.fields(inner)
+            }
         for part, (value, text) in parts.items():
             meaning = " ".join(text.split()).replace("|", "\\|")
             rows.append(f"| `{part}` | {_shown(value)} | {meaning} |")
@@ -239,9 +315,13 @@ def _fields(kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Map
 
 
 def _shared(kind: type[Any], base: type[Any]) -> tuple[str, ...]:
-    """Returns the fields that a settings class has from another one, with the same default, and groups of settings."""
+    """Returns the fields that a settings class has from another one, with the same default, and
+    groups of settings.
+    """
     known = {field.name: field.default for field in dataclasses.fields(base)}
-    same = [f.name for f in dataclasses.fields(kind) if f.name in known and f.default == known[f.name]]
+    same = [
+        f.name for f in dataclasses.fields(kind) if f.name in known and f.default == known[f.name]
+    ]
     return ("rewards", "randomization", *same)
 
 

@@ -1,7 +1,7 @@
 """Draws the pictures of docs/drawings from the code, the settings and results/.
 
-`python tools/drawings.py [FOLDER [png]]` draws all of them. The same versions of the package and of matplotlib write
-the same bytes.
+`python tools/drawings.py [FOLDER [png]]` draws all of them. The same versions of the package and of
+matplotlib write the same bytes.
 """
 
 import sys
@@ -52,32 +52,60 @@ def canvas(height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def write(axes: Axes, at: Point, text: str, size: float = 11, color: str = INK, **look: object) -> None:
+def write(
+    axes: Axes, at: Point, text: str, size: float = 11, color: str = INK, **look: object
+) -> None:
     """Writes a text, by default centred on a point."""
     style = {"ha": "center", "va": "center", "linespacing": 1.35} | look
     axes.text(at[0], at[1], text, fontsize=size, color=color, **style)  # pyright: ignore[reportArgumentType]
 
 
-def box(axes: Axes, corner: Size, size: Size, title: str, body: str, color: str, room: str = "") -> None:
+def box(
+    axes: Axes, corner: Size, size: Size, title: str, body: str, color: str, room: str = ""
+) -> None:
     """Draws a box with a title, what it does, and the folder of its code."""
-    (x, y), (width, height) = corner, size
-    style = FancyBboxPatch((x, y), width, height, "round,pad=0,rounding_size=8", fc=f"{color}18", ec=color, lw=1.6)
+    (x, y) = corner
+    (width, height) = size
+    style = FancyBboxPatch(
+        (x, y), width, height, "round,pad=0,rounding_size=8", fc=f"{color}18", ec=color, lw=1.6
+    )
     axes.add_patch(style)
-    write(axes, (x + 12, y + height - 24), title, 14, color, ha="left", va="baseline", weight="bold")
+    write(
+        axes, (x + 12, y + height - 24), title, 14, color, ha="left", va="baseline", weight="bold"
+    )
     write(axes, (x + 12, y + height - 38), body, 10.5, ha="left", va="top")
-    write(axes, (x + width - 10, y + height - 24), room, 9.5, FAINT, ha="right", va="baseline", family="monospace")
+    write(
+        axes,
+        (x + width - 10, y + height - 24),
+        room,
+        9.5,
+        FAINT,
+        ha="right",
+        va="baseline",
+        family="monospace",
+    )
 
 
 def arrow(axes: Axes, start: Point, end: Point, color: str = INK, **look: object) -> None:
     """Draws an arrow."""
-    style = {"arrowstyle": "-|>", "mutation_scale": 15, "lw": 1.8, "shrinkA": 0, "shrinkB": 0} | look
+    style = {
+        "arrowstyle": "-|>",
+        "mutation_scale": 15,
+        "lw": 1.8,
+        "shrinkA": 0,
+        "shrinkB": 0,
+    } | look
     axes.add_patch(FancyArrowPatch(start, end, color=color, **style))  # pyright: ignore[reportArgumentType]
 
 
-def robot(axes: Axes, pose: tuple[float, float, float], color: str, scale: float, name: str = "") -> None:
+def robot(
+    axes: Axes, pose: tuple[float, float, float], color: str, scale: float, name: str = ""
+) -> None:
     """Draws a robot from above, at x, y and yaw; `scale` is the length of its trunk."""
     x, y, yaw = pose
-    outline = np.array([[-0.5, -0.25], [0.25, -0.25], [0.55, 0], [0.25, 0.25], [-0.5, 0.25]]) * scale
+    outline = (
+        np.array([[-0.5, -0.25], [0.25, -0.25], [0.55, 0], [0.25, 0.25], [-0.5, 0.25]]) * scale
+    )
     turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     axes.add_patch(Polygon(outline @ turn + (x, y), fc=color, ec="white", lw=1.2, zorder=4))
     if name:
@@ -87,10 +115,21 @@ def robot(axes: Axes, pose: tuple[float, float, float], color: str, scale: float
 def architecture() -> Figure:
     """The loop of an environment step through four of the six boxes, and what training adds."""
     figure, axes = canvas(560)
-    left, right, size = 40, 414, (216, 112)
-    top, middle, bottom = 436, 256, 76
+    left = 40
+    right = 414
+    size = (216, 112)
+    top = 436
+    middle = 256
+    bottom = 76
     boxes = (
-        (left, top, "Learner", "train/", VIOLET, "PPO: improves the policy.\nKnows no task, no robot,\nno physics."),
+        (
+            left,
+            top,
+            "Learner",
+            "train/",
+            VIOLET,
+            "PPO: improves the policy.\nKnows no task, no robot,\nno physics.",
+        ),
         (
             right,
             top,
@@ -99,7 +138,14 @@ def architecture() -> Figure:
             VIOLET,
             "Act for the other team:\nscripted, trained, or\nearlier versions.",
         ),
-        (left, middle, "Policy", "train/", BLUE, "Maps each robot's\nobservation to its action,\nin [-1, 1]."),
+        (
+            left,
+            middle,
+            "Policy",
+            "train/",
+            BLUE,
+            "Maps each robot's\nobservation to its action,\nin [-1, 1].",
+        ),
         (
             right,
             middle,
@@ -108,27 +154,92 @@ def architecture() -> Figure:
             BLUE,
             "Turns an action into a\nvelocity command, then\ninto joint targets.",
         ),
-        (left, bottom, "Task", "envs/", GREEN, "Sets the scene, observes,\nrewards, ends episodes."),
+        (
+            left,
+            bottom,
+            "Task",
+            "envs/",
+            GREEN,
+            "Sets the scene, observes,\nrewards, ends episodes.",
+        ),
         (right, bottom, "Engine", "physics/", GREEN, "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."),
     )
     for x, y, title, room, color, body in boxes:
         box(axes, (x, y), size, title, body, color, room)
-    inner, mid, down = left + size[0], WIDTH / 2, right + 70
-    arrows = (  # from, to, what, where that is written, whether to the left, the middle or the right
-        ((inner, middle + 56), (right, middle + 56), BLUE, "actions", (mid + 12, middle + 70), "center"),
+    inner = left + size[0]
+    mid = WIDTH / 2
+    down = right + 70
+    # from, to, what, where that is written, whether to the left, the middle or the right
+    arrows = (
+        (
+            (inner, middle + 56),
+            (right, middle + 56),
+            BLUE,
+            "actions",
+            (mid + 12, middle + 70),
+            "center",
+        ),
         ((down, middle), (down, bottom + 112), BLUE, "joint targets", (down + 10, 222), "left"),
-        ((right, bottom + 56), (inner, bottom + 56), GREEN, "poses,\nvelocities,\ncontacts", (mid + 12, 164), "center"),
-        ((left + 150, bottom + 112), (left + 150, middle), GREEN, "observations", (left + 140, 222), "right"),
-        ((left + 40, middle + 112), (left + 40, top), VIOLET, "observations,\nactions", (left + 50, 402), "left"),
-        ((left + 190, top), (left + 190, middle + 112), VIOLET, "weights", (left + 200, 402), "left"),
-        ((inner, top + 56), (right, top + 56), VIOLET, "copies of\nthe policy", (mid + 12, top + 78), "center"),
-        ((down, top), (down, middle + 112), VIOLET, "actions of the\nother team", (down + 10, 402), "left"),
+        (
+            (right, bottom + 56),
+            (inner, bottom + 56),
+            GREEN,
+            "poses,\nvelocities,\ncontacts",
+            (mid + 12, 164),
+            "center",
+        ),
+        (
+            (left + 150, bottom + 112),
+            (left + 150, middle),
+            GREEN,
+            "observations",
+            (left + 140, 222),
+            "right",
+        ),
+        (
+            (left + 40, middle + 112),
+            (left + 40, top),
+            VIOLET,
+            "observations,\nactions",
+            (left + 50, 402),
+            "left",
+        ),
+        (
+            (left + 190, top),
+            (left + 190, middle + 112),
+            VIOLET,
+            "weights",
+            (left + 200, 402),
+            "left",
+        ),
+        (
+            (inner, top + 56),
+            (right, top + 56),
+            VIOLET,
+            "copies of\nthe policy",
+            (mid + 12, top + 78),
+            "center",
+        ),
+        (
+            (down, top),
+            (down, middle + 112),
+            VIOLET,
+            "actions of the\nother team",
+            (down + 10, 402),
+            "left",
+        ),
     )
     for start, end, color, text, at, side in arrows:
         loop = color != VIOLET
         arrow(axes, start, end, color, lw=2.6 if loop else 1.8)
         write(axes, at, text, 11, color, ha=side, weight="bold" if loop else "normal")
-    axes.plot([left, 16, 16], [bottom + 56, bottom + 56, top + 56], color=VIOLET, lw=1.8, solid_joinstyle="round")
+    axes.plot(
+        [left, 16, 16],
+        [bottom + 56, bottom + 56, top + 56],
+        color=VIOLET,
+        lw=1.8,
+        solid_joinstyle="round",
+    )
     arrow(axes, (16, top + 56), (left, top + 56), VIOLET)
     write(axes, (29, middle + 56), "rewards", 11, VIOLET, rotation=90)
     write(axes, (mid + 12, 228), "one round:\n20 ms", 11.5, INK, weight="bold")
@@ -142,19 +253,32 @@ def observation() -> Figure:
     """What agent 0 of Narrow Gate observes: the scene with its frame, and the numbers by block."""
     env = mqe_jax.make("go1gate", impl="c")
     figure, axes = canvas(480)
-    scale, origin = 100, (24, 310)
-    at = lambda x, y: (origin[0] + scale * x, origin[1] + scale * y)  # noqa: E731
+    scale = 100
+    origin = (24, 310)
+
+    def at(x, y):
+        return (origin[0] + scale * x, origin[1] + scale * y)
+
     colors = {"one_hot": GREY, "base": BLUE, "teammate": ORANGE, "gate": GREEN}
     width = env.params.track_width
-    axes.add_patch(Rectangle(at(0, -width / 2), 6 * scale - 8, width * scale, fc="#f4f5f7", ec=LINE, lw=1))
+    axes.add_patch(
+        Rectangle(at(0, -width / 2), 6 * scale - 8, width * scale, fc="#f4f5f7", ec=LINE, lw=1)
+    )
     gate = (3.5, 0.3)
     for wall in env.compiled.layout.walls:
         x, y, _ = np.add(wall.center, (*gate, 0))
-        low, high = max(y - wall.size[1] / 2, -width / 2), min(y + wall.size[1] / 2, width / 2)
+        low = max(y - wall.size[1] / 2, -width / 2)
+        high = min(y + wall.size[1] / 2, width / 2)
         axes.add_patch(
-            Rectangle(at(x - wall.size[0] / 2, low), wall.size[0] * scale, (high - low) * scale, fc="#c9ced6")
+            Rectangle(
+                at(x - wall.size[0] / 2, low),
+                wall.size[0] * scale,
+                (high - low) * scale,
+                fc="#c9ced6",
+            )
         )
-    own, mate = (1.3, -0.65, 0.35), (1.9, 0.75, -0.1)
+    own = (1.3, -0.65, 0.35)
+    mate = (1.9, 0.75, -0.1)
     for pose, color, name in ((own, BLUE, "0"), (mate, ORANGE, "1")):
         robot(axes, (*at(*pose[:2]), pose[2]), color, 60, name)
     axes.plot(*at(*gate), "o", color=GREEN, ms=9)
@@ -175,11 +299,22 @@ def observation() -> Figure:
         "gate": ["x", "y"],
     }
     blocks = env.observation_layout.blocks
-    assert {block.name: block.width for block in blocks} == {name: len(cells) for name, cells in names.items()}
-    cell, x = 37, 24
+    assert {block.name: block.width for block in blocks} == {
+        name: len(cells) for name, cells in names.items()
+    }
+    cell = 37
+    x = 24
     for block in blocks:
         color = colors[block.name]
-        write(axes, (x + cell * block.width / 2, 116), block.name, 11, color, family="monospace", weight="bold")
+        write(
+            axes,
+            (x + cell * block.width / 2, 116),
+            block.name,
+            11,
+            color,
+            family="monospace",
+            weight="bold",
+        )
         for text in names[block.name]:
             axes.add_patch(Rectangle((x, 66), cell, 38, fc=f"{color}22", ec=color, lw=1.2))
             write(axes, (x + cell / 2, 82), text, 9.5, va="baseline")
@@ -191,12 +326,29 @@ def observation() -> Figure:
 
 
 def match_frames() -> Figure:
-    """One moment of two matches, as each team observes it: after a half turn, and after a reflection."""
+    """One moment of two matches, as each team observes it: after a half turn, and after a
+    reflection.
+    """
     figure, axes = canvas(590)
-    football, door = ((4.6, 1.9, -0.5), (10.2, -0.6, 2.9)), ((1.4, -0.55, 0.5), (0.95, 0.85, 0.1))
+    football = ((4.6, 1.9, -0.5), (10.2, -0.6, 2.9))
+    door = ((1.4, -0.55, 0.5), (0.95, 0.85, 0.1))
     rows = (
-        ("go1football-1vs1", "Football: team 1 sees the field after a half turn", 572, 350, 22.0, football),
-        ("go1revolvingdoor", "Revolving Door: team 1 sees the field reflected", 280, 76, 51.0, door),
+        (
+            "go1football-1vs1",
+            "Football: team 1 sees the field after a half turn",
+            572,
+            350,
+            22.0,
+            football,
+        ),
+        (
+            "go1revolvingdoor",
+            "Revolving Door: team 1 sees the field reflected",
+            280,
+            76,
+            51.0,
+            door,
+        ),
     )
     for name, title, top, bottom, scale, poses in rows:
         env = mqe_jax.make(name, impl="c")
@@ -204,24 +356,44 @@ def match_frames() -> Figure:
         write(axes, (WIDTH / 2, top), title, 12, weight="bold")
         for team in (0, 1):
             _seen_by(axes, env, team, poses, (16 + team * 316, bottom), scale)
-    write(axes, (WIDTH / 2, 26), "Each team finds itself on the same side, so one policy can play both.", 11, FAINT)
+    write(
+        axes,
+        (WIDTH / 2, 26),
+        "Each team finds itself on the same side, so one policy can play both.",
+        11,
+        FAINT,
+    )
     return figure
 
 
-def _seen_by(axes: Axes, env: Match, team: int, poses: Sequence[Sequence[float]], corner: Size, scale: float) -> None:
-    """Draws a match for two from above in the frame of a team; `poses` are x, y, yaw in the frame of team 0."""
-    (length, width) = (float(np.ptp([x.point[i] for x in env.compiled.layout.barriers])) for i in (0, 1))
-    at = lambda point: (corner[0] + scale * point[0], corner[1] + scale * (point[1] + width / 2))  # noqa: E731
-    seen = lambda x, y: np.asarray(env.view_points(jnp.array([x, y, 0.0])))[team, :2]  # noqa: E731
+def _seen_by(
+    axes: Axes, env: Match, team: int, poses: Sequence[Sequence[float]], corner: Size, scale: float
+) -> None:
+    """Draws a match for two from above in the frame of a team; `poses` are x, y, yaw in the frame
+    of team 0.
+    """
+    (length, width) = (
+        float(np.ptp([x.point[i] for x in env.compiled.layout.barriers])) for i in (0, 1)
+    )
+
+    def at(point):
+        return (corner[0] + scale * point[0], corner[1] + scale * (point[1] + width / 2))
+
+    def seen(x, y):
+        return np.asarray(env.view_points(jnp.array([x, y, 0.0])))[team, :2]
+
     axes.add_patch(Rectangle(corner, length * scale, width * scale, fc="#eef2ee", ec=LINE, lw=1))
     for wall in env.compiled.layout.walls:
         x, y = np.add(wall.center[:2], env.compiled.layout.anchors[wall.anchor or 0].position)
-        middle, size = at(seen(x, y)), np.array(wall.size[:2]) * scale
+        middle = at(seen(x, y))
+        size = np.array(wall.size[:2]) * scale
         axes.add_patch(Rectangle((middle - size / 2).tolist(), *size, fc="#c9ced6"))
     if "ball" in env.objects:
         axes.plot(*at(seen(6.6, 1.2)), "o", color="white", mec=INK, ms=8, zorder=5)
     if "door" in env.objects:
-        tips = [at(seen(2.6 + 0.97 * np.sin(0.5) * sign, 0.97 * np.cos(0.5) * sign)) for sign in (-1, 1)]
+        tips = [
+            at(seen(2.6 + 0.97 * np.sin(0.5) * sign, 0.97 * np.cos(0.5) * sign)) for sign in (-1, 1)
+        ]
         axes.plot(*zip(*tips, strict=True), color=INK, lw=4, solid_capstyle="round")
     info = jnp.array([(x, y, 0.3, 0.0, 0.0, yaw) for x, y, yaw in poses])
     for number, (x, y, _, _, _, yaw) in enumerate(np.asarray(env.views(info))[team]):
@@ -233,29 +405,54 @@ def _seen_by(axes: Axes, env: Match, team: int, poses: Sequence[Sequence[float]]
     for along, name in ((np.array([34, 0]), "x"), (np.array([0, 34]), "y")):
         arrow(axes, start, start + along, mutation_scale=10)
         write(axes, start + 1.3 * along, name, 10, weight="bold")
-    write(axes, np.add(corner, (length * scale / 2, -15)), f"as team {team} observes it", 11, color, weight="bold")
+    write(
+        axes,
+        np.add(corner, (length * scale / 2, -15)),
+        f"as team {team} observes it",
+        11,
+        color,
+        weight="bold",
+    )
 
 
 def league() -> Figure:
-    """Whom a policy meets in a league: itself, its earlier versions, and fixed opponents, in equal shares."""
+    """Whom a policy meets in a league: itself, its earlier versions, and fixed opponents, in equal
+    shares.
+    """
     config = base_config("go1tug", "league")
-    steps, quarter = (share * config.league.snapshot_steps / 1e6 for share in (1, 0.25))
+    steps = 1 * config.league.snapshot_steps / 1e6
+    quarter = 0.25 * config.league.snapshot_steps / 1e6
     own = {"newest": BLUE, "older": VIOLET, "uniform": VIOLET}
     names = sorted(config.opponents, key=lambda name: [*own].index(name) if name in own else -1)
     figure, axes = canvas(450)
-    row, top, left, width = 34, 392, 226, 150
-    write(axes, (left + width / 2, top + 22), f"{config.num_envs} matches at once", 12, weight="bold")
+    row = 34
+    top = 392
+    left = 226
+    width = 150
+    write(
+        axes, (left + width / 2, top + 22), f"{config.num_envs} matches at once", 12, weight="bold"
+    )
     for number, name in enumerate(names):
-        color, y = own.get(name, GREEN), top - row * (number + 1)
+        color = own.get(name, GREEN)
+        y = top - row * (number + 1)
         axes.add_patch(Rectangle((left, y + 3), width, row - 6, fc=f"{color}22", ec=color, lw=1.2))
         write(axes, (left + width / 2, y + row / 2), f"against {name}", 10.5, color)
     box(axes, (16, 40), (150, 346), "Policy", "plays team 0\nand learns", BLUE)
     right = 424
-    pool = f"{config.league.members} earlier versions.\nolder: one that it beats\nless often than others\n"
+    pool = (
+        f"{config.league.members} earlier versions.\nolder: one that it beats\nless often than "
+        "others\n"
+    )
     pool += "uniform: any of them"
     count = sum(name not in own for name in names)
     ends = {
-        GREEN: ("Fixed opponents", "scripted, idle, random,\nor a trained team\nfrom a file", 252, 134, range(count)),
+        GREEN: (
+            "Fixed opponents",
+            "scripted, idle, random,\nor a trained team\nfrom a file",
+            252,
+            134,
+            range(count),
+        ),
         BLUE: ("The policy itself", "as it is now", 184, 60, [count]),
         VIOLET: ("Pool", pool, 26, 150, range(count + 1, len(names))),
     }
@@ -263,7 +460,14 @@ def league() -> Figure:
         box(axes, (right, bottom), (200, height), title, body, color)
         for number in rows:
             y = top - row * (number + 0.5)
-            arrow(axes, (right, min(y, bottom + height - 10)), (left + width, y), color, lw=1.3, mutation_scale=10)
+            arrow(
+                axes,
+                (right, min(y, bottom + height - 10)),
+                (left + width, y),
+                color,
+                lw=1.3,
+                mutation_scale=10,
+            )
     arrow(axes, (166, 270), (left, 270), BLUE)
     write(axes, (196, 284), "acts", 10.5, BLUE)
     arrow(axes, (left, 210), (166, 210), BLUE)
@@ -277,7 +481,17 @@ def league() -> Figure:
 
 DRAWINGS: dict[str, Callable[[], Figure]] = {
     each.__name__: each
-    for each in (architecture, observation, match_frames, league, curves, students, levers, sizes, performance)
+    for each in (
+        architecture,
+        observation,
+        match_frames,
+        league,
+        curves,
+        students,
+        levers,
+        sizes,
+        performance,
+    )
 }
 
 
@@ -285,7 +499,10 @@ def main(folder: Path = FOLDER, form: str = "svg") -> None:
     """Writes all drawings into a folder, as svg or png files."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, draw in DRAWINGS.items():
-        with matplotlib.rc_context({"svg.hashsalt": name}), replacing(folder / f"{name}.{form}") as temporary:
+        with (
+            matplotlib.rc_context({"svg.hashsalt": name}),
+            replacing(folder / f"{name}.{form}") as temporary,
+        ):
             draw().savefig(temporary, format=form, metadata={"Date": None} if form == "svg" else {})
 
 

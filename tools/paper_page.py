@@ -1,6 +1,8 @@
-"""Draws the figure and fills the table of docs/results/paper.md from published runs; called by tools/publish.py.
+"""Draws the figure and fills the table of docs/results/paper.md from published runs; called by
+tools/publish.py.
 
-The text between `<!-- begin NAME -->` and `<!-- end NAME -->` is replaced; NAME is one of those in `sections`.
+The text between `<!-- begin NAME -->` and `<!-- end NAME -->` is replaced; NAME is one of those in
+`sections`.
 """
 
 import io
@@ -51,25 +53,36 @@ def of(cells: Cells, variants: Container[str]) -> Cells:
 def reduced(png: bytes) -> bytes:
     """Returns a PNG with a palette, a quarter of the size."""
     small = io.BytesIO()
-    Image.open(io.BytesIO(png)).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(small, "png", optimize=True)
+    Image.open(io.BytesIO(png)).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(
+        small, "png", optimize=True
+    )
     return small.getvalue()
 
 
 def filled(text: str, contents: Mapping[str, str]) -> str:
-    """Returns the text of a page with its sections filled; InputError if the page lacks a section."""
+    """Returns the text of a page with its sections filled; InputError if the page lacks a
+    section.
+    """
     for name, body in contents.items():
         pattern = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-        text, count = pattern.subn(lambda match, body=body: f"{match[1]}\n{body}\n\n{match[2]}", text)
+        text, count = pattern.subn(
+            lambda match, body=body: f"{match[1]}\n{body}\n\n{match[2]}", text
+        )
         if count != 1:
             raise InputError(f"page: has {count} sections {name!r}; it must have one")
     return text
 
 
 def estimated(cells: Cells, reference: Reference) -> Rows:
-    """Returns final values of all cells: those of `final_rows`, success with mean actions, and the verdict."""
+    """Returns final values of all cells: those of `final_rows`, success with mean actions, and the
+    verdict.
+    """
     rows = final_rows(cells, reference)
     for row, runs in zip(rows, cells.values(), strict=True):
-        values = [(run.absolute or {"deterministic": {}})["deterministic"].get("success_rate") for run in runs]
+        values = [
+            (run.absolute or {"deterministic": {}})["deterministic"].get("success_rate")
+            for run in runs
+        ]
         known = np.array(values, np.float64)[:, None]
         three = estimate(interquartile_mean, known) if np.isfinite(known).all() else (math.nan,) * 3
         row |= dict(zip(("mean", "mean_low", "mean_high"), map(float, three), strict=True))
@@ -78,9 +91,11 @@ def estimated(cells: Cells, reference: Reference) -> Rows:
 
 
 def sections(estimates: Rows) -> dict[str, str]:
-    """Returns the generated section of the page by name: a Markdown table of rewards, a line per task.
+    """Returns the generated section of the page by name: a Markdown table of rewards, a line per
+    task.
 
-    Two columns per algorithm: ours with its interval, bold if it lies above the paper's value, and the paper's.
+    Two columns per algorithm: ours with its interval, bold if it lies above the paper's value, and
+    the paper's.
     """
     rows = [row for row in estimates if row["variant"] == PAPER]
     names = [name.upper() for name in dict.fromkeys(row["algorithm"] for row in rows)]
@@ -99,8 +114,13 @@ def ours(row: Mapping[str, Any]) -> str:
 
 
 def verdict(row: Mapping[str, Any]) -> str:
-    """Returns where the reward and its interval lie relative to the paper's value; empty for too few seeds."""
-    middle, low, high, value = row["training"], row["training_low"], row["training_high"], row["reference"]
+    """Returns where the reward and its interval lie relative to the paper's value; empty for too
+    few seeds.
+    """
+    middle = row["training"]
+    low = row["training_low"]
+    high = row["training_high"]
+    value = row["reference"]
     if row["seeds"] < MIN_SEEDS or not math.isfinite(value):
         return ""
     if middle > value:

@@ -1,8 +1,8 @@
 """Writes an earlier policy of a league's run, a member of its pool, as a policy file.
 
-`python tools/pool_member.py RUN SHARE FILE` writes the member whose steps are nearest to this share of the run's steps,
-and prints its steps. `mqe eval RUN --opponent FILE` then plays against it. The pool is that of the newest checkpoint;
-it lacks the members that the learner beat most.
+`python tools/pool_member.py RUN SHARE FILE` writes the member whose steps are nearest to this share
+of the run's steps, and prints its steps. `mqe eval RUN --opponent FILE` then plays against it. The
+pool is that of the newest checkpoint; it lacks the members that the learner beat most.
 """
 
 import argparse
@@ -19,8 +19,11 @@ from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 
 
 def member(run: Path, share: float) -> TrainedPolicy:
-    """Returns the member of a run's pool nearest to a share of its steps; InputError for a run without a pool."""
-    policy, checkpoint = read_policy(run), latest(run)
+    """Returns the member of a run's pool nearest to a share of its steps; InputError for a run
+    without a pool.
+    """
+    policy = read_policy(run)
+    checkpoint = latest(run)
     if checkpoint is None:
         raise InputError(f"{run}: has no checkpoint")
     template = jax.eval_shape(lambda: pool.new_pool(policy.arrays, policy.config.league.members))
@@ -30,11 +33,15 @@ def member(run: Path, share: float) -> TrainedPolicy:
     place = int(np.where(steps < 0, np.inf, apart).argmin())
     arrays = jax.tree.map(lambda x: x[place], members.arrays)
     metadata = {**policy.metadata, "env_steps": int(steps[place])}
-    return dataclasses.replace(policy, params=arrays.params, normalizer=arrays.normalizer, metadata=metadata)
+    return dataclasses.replace(
+        policy, params=arrays.params, normalizer=arrays.normalizer, metadata=metadata
+    )
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run", type=Path)
     parser.add_argument("share", type=float)
     parser.add_argument("file", type=Path)

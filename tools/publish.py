@@ -1,10 +1,13 @@
-"""Publishes sweeps: curves and evaluations as two compressed tables, and the page with their figure.
+"""Publishes sweeps: curves and evaluations as two compressed tables, and the page with their
+figure.
 
-`python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and evaluations.csv.gz in
-results/paper, thinned. It then regenerates the figure and the table of docs/results/paper.md, and the estimates in
-results/paper, from results/ alone; without a SWEEP only this.
+`python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and
+evaluations.csv.gz in results/paper, thinned. It then regenerates the figure and the table of
+docs/results/paper.md, and the estimates in results/paper, from results/ alone; without a SWEEP only
+this.
 
-`python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into results/measurements.json under NAME.
+`python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into
+results/measurements.json under NAME.
 """
 
 import argparse
@@ -30,9 +33,11 @@ from mqe_jax.train.logs import number
 
 ROOT = Path(__file__).parents[1]
 MEASUREMENTS = ROOT / "results" / "measurements.json"
-CURVES, EVALUATIONS = "curves.csv.gz", "evaluations.csv.gz"
+CURVES = "curves.csv.gz"
+EVALUATIONS = "evaluations.csv.gz"
 IDENTITY = ("task", "algorithm", "variant", "seed")
-ROWS, DIGITS = 50, 5
+ROWS = 50
+DIGITS = 5
 """Rows of a published curve, and significant digits."""
 COLUMNS = ("env_steps", REWARD, "success", "episode_length")
 """Columns of a published curve, beside the terms of the reward that are not zero."""
@@ -44,13 +49,16 @@ Key = tuple[Cell, int]
 
 
 def thin(curve: Curve) -> Curve:
-    """Returns a curve of at most `ROWS` rows: means over groups of consecutive rows of about equal size.
+    """Returns a curve of at most `ROWS` rows: means over groups of consecutive rows of about equal
+    size.
 
     `env_steps` are those at the end of a group; means ignore NaN.
     """
     count = len(curve["env_steps"])
     ends = np.unique(np.linspace(0, count, min(count, ROWS) + 1).round().astype(int))
-    terms = sorted(name for name in curve if name.startswith("reward/") and np.nan_to_num(curve[name]).any())
+    terms = sorted(
+        name for name in curve if name.startswith("reward/") and np.nan_to_num(curve[name]).any()
+    )
     thinned: Curve = {}
     for name in [*(name for name in COLUMNS if name in curve), *terms]:
         parts = [curve[name][a:b] for a, b in itertools.pairwise(ends)]
@@ -60,12 +68,18 @@ def thin(curve: Curve) -> Curve:
 
 
 def read_tables(folder: Path) -> list[Run]:
-    """Reads the published runs of a folder, by path and seed; InputError for a missing or damaged table."""
+    """Reads the published runs of a folder, by path and seed; InputError for a missing or damaged
+    table.
+    """
     evaluations: dict[Key, dict[str, list[dict[str, Any]]]] = {}
     for key, row in _read(folder / EVALUATIONS):
-        point: dict[str, Any] = {name: int(row[name]) for name in ("env_steps", "episodes") if row[name]}
+        point: dict[str, Any] = {
+            name: int(row[name]) for name in ("env_steps", "episodes") if row[name]
+        }
         for mode in MODES:
-            columns = {name.removeprefix(f"{mode}/"): x for name, x in row.items() if name.startswith(mode)}
+            columns = {
+                name.removeprefix(f"{mode}/"): x for name, x in row.items() if name.startswith(mode)
+            }
             point[mode] = {name: float(x) for name, x in columns.items() if x}
         evaluations.setdefault(key, {"training": [], "absolute": []})[row["kind"]].append(point)
     curves: dict[Key, list[dict[str, str]]] = {}
@@ -73,7 +87,9 @@ def read_tables(folder: Path) -> list[Run]:
         curves.setdefault(key, []).append(row)
     runs = []
     for key, rows in curves.items():
-        curve = {name: np.array([float(row[name]) for row in rows]) for name, x in rows[0].items() if x}
+        curve = {
+            name: np.array([float(row[name]) for row in rows]) for name, x in rows[0].items() if x
+        }
         own = evaluations.get(key, {"training": [], "absolute": []})
         runs.append(Run(*key, curve, own["training"], next(iter(own["absolute"]), None)))
     return sorted(runs, key=_order)
@@ -89,42 +105,67 @@ def _read(path: Path) -> Iterable[tuple[Key, dict[str, str]]]:
 
 
 def write_tables(folder: Path, runs: Sequence[Run]) -> None:
-    """Writes both tables of a folder where their content changes; the same runs give the same bytes."""
-    curves, evaluations = [], []
+    """Writes both tables of a folder where their content changes; the same runs give the same
+    bytes.
+    """
+    curves = []
+    evaluations = []
     for run in runs:
         identity = {**dataclasses.asdict(run.cell), "seed": run.seed}
         curve = thin(run.curve)
-        curves += [{**identity, **dict(zip(curve, row, strict=True))} for row in zip(*curve.values(), strict=True)]
+        curves += [
+            {**identity, **dict(zip(curve, row, strict=True))}
+            for row in zip(*curve.values(), strict=True)
+        ]
         for point in run.evaluations:
             evaluations.append({**identity, "kind": "training", **_numbers(point, EVALUATED)})
         if run.absolute is not None:
             evaluations.append({**identity, "kind": "absolute", **_numbers(run.absolute)})
     folder.mkdir(parents=True, exist_ok=True)
-    for name, rows, first in ((CURVES, curves, COLUMNS), (EVALUATIONS, evaluations, ("kind", "env_steps", "episodes"))):
+    for name, rows, first in (
+        (CURVES, curves, COLUMNS),
+        (EVALUATIONS, evaluations, ("kind", "env_steps", "episodes")),
+    ):
         others = sorted({column for row in rows for column in row} - {*IDENTITY, *first})
-        content, path = table(rows, [*IDENTITY, *first, *others], DIGITS).encode(), folder / name
+        content = table(rows, [*IDENTITY, *first, *others], DIGITS).encode()
+        path = folder / name
         if not path.is_file() or gzip.decompress(path.read_bytes()) != content:
             write_atomically(path, gzip.compress(content, mtime=0))
 
 
 def _numbers(point: Mapping[str, Any], names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Returns the numbers of an evaluation as columns: env_steps, episodes, and MODE/NAME for `names` or all."""
+    """Returns the numbers of an evaluation as columns: env_steps, episodes, and MODE/NAME for
+    `names` or all.
+    """
     columns = {name: point[name] for name in ("env_steps", "episodes") if name in point}
     for mode in MODES:
         values = point.get(mode, {})
-        columns |= {f"{mode}/{k}": x for k, x in values.items() if x is not None and (names is None or k in names)}
+        columns |= {
+            f"{mode}/{k}": x
+            for k, x in values.items()
+            if x is not None and (names is None or k in names)
+        }
     return columns
 
 
 def publish(sweeps: Sequence[Path], target: Path) -> None:
-    """Adds finished runs to the tables below `target`; InputError for other results of a run that is published."""
-    runs = {(run.cell, run.seed): run for run in read_tables(target)} if (target / CURVES).is_file() else {}
+    """Adds finished runs to the tables below `target`; InputError for other results of a run that
+    is published.
+    """
+    runs = (
+        {(run.cell, run.seed): run for run in read_tables(target)}
+        if (target / CURVES).is_file()
+        else {}
+    )
     for sweep in sweeps:
         for run in read_runs(sweep):
             key = run.cell, run.seed
             other = runs.setdefault(key, run)
             if number(absolute(other, REWARD), DIGITS) != number(absolute(run, REWARD), DIGITS):
-                raise InputError(f"{sweep}: {_name(run)} differs from the one that is published; remove one of them")
+                raise InputError(
+                    f"{sweep}: {_name(run)} differs from the one that is published; remove one of "
+                    "them"
+                )
     if sweeps:
         write_tables(target, sorted(runs.values(), key=_order))
 
@@ -158,7 +199,9 @@ def _entries(entries: Mapping[str, Any]) -> str:
 
 def main() -> int:
     """Publishes sweeps and regenerates the page; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("sweeps", nargs="*", type=Path, metavar="SWEEP")
     parser.add_argument("--target", type=Path, default=ROOT / "results" / "paper")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results" / "paper.md")

@@ -1,7 +1,9 @@
-"""Builds the wheel and its bill of materials, and tries the README and the quickstart with it, in an empty environment.
+"""Builds the wheel and its bill of materials, and tries the README and the quickstart with it, in
+an empty environment.
 
-`python tools/release.py [--tag TAG]` writes into dist/. All files must name the same version, and with a tag that of
-the tag. The commands run in another folder, from which the source tree cannot be imported.
+`python tools/release.py [--tag TAG]` writes into dist/. All files must name the same version, and
+with a tag that of the tag. The commands run in another folder, from which the source tree cannot be
+imported.
 """
 
 import argparse
@@ -36,7 +38,9 @@ def run(*command: object, folder: Path = ROOT) -> None:
     print("$", *command, flush=True)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment["MQE_NOTEBOOK_SMALL"] = "1"  # which shortens notebooks
-    subprocess.run([str(word) for word in command], cwd=folder, env=environment, check=True, timeout=600)
+    subprocess.run(
+        [str(word) for word in command], cwd=folder, env=environment, check=True, timeout=600
+    )
 
 
 def new_environment(folder: Path, *arguments: object) -> Path:
@@ -55,7 +59,9 @@ def main() -> None:
     for name, pattern in VERSIONS.items():
         found = re.search(pattern, (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE)
         if found is None or found[1] != project["version"]:
-            sys.exit(f"release: {name} has {found and found[1]}; pyproject.toml has {project['version']}")
+            sys.exit(
+                f"release: {name} has {found and found[1]}; pyproject.toml has {project['version']}"
+            )
     if tag not in ("", f"v{project['version']}"):
         sys.exit(f"release: the tag is {tag}; pyproject.toml has {project['version']}")
     shutil.rmtree(DIST, ignore_errors=True)
@@ -63,13 +69,26 @@ def main() -> None:
     (wheel,) = DIST.glob("*.whl")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        programs = new_environment(folder / "venv", "-c", ROOT / "constraints.txt", f"{wheel}[render,notebook]")
+        programs = new_environment(
+            folder / "venv", "-c", ROOT / "constraints.txt", f"{wheel}[render,notebook]"
+        )
         tools = new_environment(folder / "tools", *project["optional-dependencies"]["release"])
-        run(tools / "cyclonedx-py", "environment", programs / "python", "--output-file", wheel.with_suffix(".cdx.json"))
+        run(
+            tools / "cyclonedx-py",
+            "environment",
+            programs / "python",
+            "--output-file",
+            wheel.with_suffix(".cdx.json"),
+        )
         readme = (ROOT / "README.md").read_text(encoding="utf-8")
         for program in re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE):
             run(programs / "python", "-c", program, folder=folder)
-        run(programs / "jupyter", "execute", ROOT / "examples" / "notebooks" / "quickstart.ipynb", folder=folder)
+        run(
+            programs / "jupyter",
+            "execute",
+            ROOT / "examples" / "notebooks" / "quickstart.ipynb",
+            folder=folder,
+        )
         for block in re.findall(r"^```bash\n(.*?)^```", readme, re.DOTALL | re.MULTILINE):
             for words in (shlex.split(line, comments=True) for line in block.splitlines()):
                 if words[:1] == ["mqe"]:

@@ -1,10 +1,11 @@
-"""Ships the policy of a run for its task: measures it with the float16 weights that it ships, writes it with its card.
+"""Ships the policy of a run for its task: measures it with the float16 weights that it ships,
+writes it with its card.
 
-`python tools/ship.py RUN --mode deterministic --command "mqe train go1gate --seed 3" --date 2026-11-27 --note "The best
-of five seeds, after 40.0 M steps. It trained on one H100."`
+`python tools/ship.py RUN --mode deterministic --command "mqe train go1gate --seed 3" --date
+2026-11-27 --note "The best of five seeds, after 40.0 M steps. It trained on one H100."`
 
-In a match, the card holds the rates on both sides against the scripted, an idle and a random team, and how episodes
-against the scripted team end.
+In a match, the card holds the rates on both sides against the scripted, an idle and a random team,
+and how episodes against the scripted team end.
 """
 
 import argparse
@@ -22,23 +23,38 @@ DIGITS = 4
 
 def measure(run: str, task: str, episodes: int, deterministic: bool) -> dict[str, Any]:
     """Returns the entries `results` and `endings` of a policy's card."""
-    results, endings = {}, {}
+    results = {}
+    endings = {}
     match = issubclass(TASKS[task], Match)
     sides = "both" if match else None
     for opponent in ("random", "idle", "scripted") if match else (None,):
-        options = {"episodes": episodes, "deterministic": deterministic, "impl": "c", "sides": sides or "first"}
+        options = {
+            "episodes": episodes,
+            "deterministic": deterministic,
+            "impl": "c",
+            "sides": sides or "first",
+        }
         found = evaluate(run, opponent=opponent, **options).to_dict()
-        rates = {f"win/{opponent}": found["win_rate"]} if match else {"success": found["success_rate"]}
+        rates = (
+            {f"win/{opponent}": found["win_rate"]} if match else {"success": found["success_rate"]}
+        )
         rates |= {"loss/scripted": found["loss_rate"]} if opponent == "scripted" else {}
         results |= {
-            x: {"value": round(rate, DIGITS), "episodes": episodes, "sides": sides} for x, rate in rates.items()
+            x: {"value": round(rate, DIGITS), "episodes": episodes, "sides": sides}
+            for x, rate in rates.items()
         }
-        endings = {x.removeprefix("ending/"): round(found[x], DIGITS) for x in found if x.startswith("ending/")}
+        endings = {
+            x.removeprefix("ending/"): round(found[x], DIGITS)
+            for x in found
+            if x.startswith("ending/")
+        }
     return {"results": results, "endings": endings}
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run")
     parser.add_argument("--mode", choices=("deterministic", "sampled"), required=True)
     for option in ("--command", "--date", "--note"):
@@ -49,5 +65,7 @@ if __name__ == "__main__":
     policy = load_policy(given.pop("run"))
     with TemporaryDirectory() as folder:
         rounded = str(mixture.save(folder, policy, half=True))
-        given |= measure(rounded, policy.task, given.pop("episodes"), given["mode"] == "deterministic")
+        given |= measure(
+            rounded, policy.task, given.pop("episodes"), given["mode"] == "deterministic"
+        )
     print(zoo.ship(policy, build(zoo.Card, given)))

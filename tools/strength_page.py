@@ -1,10 +1,11 @@
 """Fills tables of pages in docs/results and draws their pictures from results/strength.
 
-`python tools/strength_page.py` reads the rates that `mqe sweep configs/strength.yaml --part PART` measured, as
-results/strength/PART.csv, mixed teams in crossplay_TASK.json and pool_TASK.json, best responses in exploitability.csv
-and double oracles in oracle.json. `python tools/strength_page.py --rates FOLDER` first copies the results of every part
-that is below FOLDER; best responses, double oracles and mixed teams of tasks that it lacks stay. The table of other
-conditions has a row for each task that is measured under all of them.
+`python tools/strength_page.py` reads the rates that `mqe sweep configs/strength.yaml --part PART`
+measured, as results/strength/PART.csv, mixed teams in crossplay_TASK.json and pool_TASK.json, best
+responses in exploitability.csv and double oracles in oracle.json. `python tools/strength_page.py
+--rates FOLDER` first copies the results of every part that is below FOLDER; best responses, double
+oracles and mixed teams of tasks that it lacks stay. The table of other conditions has a row for
+each task that is measured under all of them.
 """
 
 import argparse
@@ -24,7 +25,8 @@ from mqe_jax.study import runs
 from mqe_jax.train.evaluate import Rate
 
 ROOT = Path(__file__).parents[1]
-DATA, PAGES = ROOT / "results" / "strength", ROOT / "docs" / "results"
+DATA = ROOT / "results" / "strength"
+PAGES = ROOT / "docs" / "results"
 SECTIONS = {
     "strength.md": ("strength",),
     "population.md": ("population",),
@@ -35,8 +37,22 @@ SECTIONS = {
     "skills.md": ("walk",),
 }
 """Filled sections of each page."""
-COOPERATIVE = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1pushbox", "go1football-defender")
-MATCHES = ("go1tug", "go1revolvingdoor", "go1wrestling", "go1bridge", "go1football-1vs1", "go1football-2vs2")
+COOPERATIVE = (
+    "go1gate",
+    "go1seesaw",
+    "go1sheep-easy",
+    "go1sheep-hard",
+    "go1pushbox",
+    "go1football-defender",
+)
+MATCHES = (
+    "go1tug",
+    "go1revolvingdoor",
+    "go1wrestling",
+    "go1bridge",
+    "go1football-1vs1",
+    "go1football-2vs2",
+)
 POOLS = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1football-defender")
 PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
 MEMBER_EPISODES = 256
@@ -49,7 +65,10 @@ CONDITIONS = {
     "noise": "noise",
     "go2": "Go2",
 }
-INK, BLUE, RED, GREY = "#23252b", "#4f86e0", "#b5316f", "#e3e5ea"
+INK = "#23252b"
+BLUE = "#4f86e0"
+RED = "#b5316f"
+GREY = "#e3e5ea"
 
 Rates = dict[tuple[str, str, str], Rate]
 """Rates by task, variant and name."""
@@ -92,12 +111,20 @@ def against(found: Rates, task: str, opponent: str) -> tuple[Rate, Rate]:
 
 
 def strength(alone: Rates, met: Rates) -> str:
-    """Returns the table of success, in matches of wins against each other, of shipped and scripted teams."""
+    """Returns the table of success, in matches of wins against each other, of shipped and scripted
+    teams.
+    """
     body = [
-        [f"`{task}`", *(alone[task, each, "success_rate"].percent for each in ("shipped", "scripted"))]
+        [
+            f"`{task}`",
+            *(alone[task, each, "success_rate"].percent for each in ("shipped", "scripted")),
+        ]
         for task in COOPERATIVE
     ]
-    body += [[f"`{task}`", *(each.percent for each in against(met, task, "scripted"))] for task in MATCHES]
+    body += [
+        [f"`{task}`", *(each.percent for each in against(met, task, "scripted"))]
+        for task in MATCHES
+    ]
     return table(("task", "shipped team, %", "scripted team, %"), body)
 
 
@@ -124,15 +151,23 @@ def population(found: Rates) -> str:
         every = members(found, task)
         leads = {name: lead(win, loss, MEMBER_EPISODES) for name, (win, loss) in every.items()}
         worst = min(leads, key=lambda name: leads[name].value)
-        body.append([f"`{task}`", found[task, "plain", "win_rate"].percent, leads[worst].percent, worst])
+        body.append(
+            [f"`{task}`", found[task, "plain", "win_rate"].percent, leads[worst].percent, worst]
+        )
     return table(("match", "wins, %", "smallest lead, points", "against"), body)
 
 
 def exploitability() -> str:
-    """Returns the table of the largest lead of the best responses to each shipped team, and to a mixture if any."""
-    body, oracles = [], published("oracle")
+    """Returns the table of the largest lead of the best responses to each shipped team, and to a
+    mixture if any.
+    """
+    body = []
+    oracles = published("oracle")
     for task in MATCHES:
-        leads = [max(rate(row) for row in rows("exploitability") if row["task"] == task).percent, ""]
+        leads = [
+            max(rate(row) for row in rows("exploitability") if row["task"] == task).percent,
+            "",
+        ]
         last = oracles[task]["rounds"][-1] if task in oracles else {"weights": {}}
         if len(last["weights"]) > 1:
             leads[1] = Rate(**last["exploitability_lower_bound"]).percent
@@ -163,13 +198,22 @@ def robust(found: Rates, task: str, condition: str) -> Rate:
 def robust_tasks(found: Rates) -> list[str]:
     """Returns the tasks that are measured under all conditions."""
     measured = {(task, condition) for task, condition, _ in found}
-    return [task for task in (*COOPERATIVE, *MATCHES) if all((task, name) in measured for name in CONDITIONS)]
+    return [
+        task
+        for task in (*COOPERATIVE, *MATCHES)
+        if all((task, name) in measured for name in CONDITIONS)
+    ]
 
 
 def walk(found: Rates) -> str:
-    """Returns the table of wins against the scripted team by teams with the walking and with the agile skill."""
+    """Returns the table of wins against the scripted team by teams with the walking and with the
+    agile skill.
+    """
     variants = ("walk", "scripted")
-    body = [[f"`{task}`", *(against(found, task, each)[0].percent for each in variants)] for task in MATCHES]
+    body = [
+        [f"`{task}`", *(against(found, task, each)[0].percent for each in variants)]
+        for task in MATCHES
+    ]
     return table(("match", "walking team", "agile team"), body)
 
 
@@ -179,7 +223,9 @@ def published(name: str) -> dict[str, Any]:
 
 
 def mates(task: str) -> dict[str, Rate]:
-    """Returns means over mixed teams by name, the `worst` pair, and `gap`, by which teams of one seed are better."""
+    """Returns means over mixed teams by name, the `worst` pair, and `gap`, by which teams of one
+    seed are better.
+    """
     data = published(f"crossplay_{task}")
     names = ("same", "cross", "gap", "worst", *data["references"])
     return {name: Rate(*(data[name][key] for key in Rate._fields)) for name in names}
@@ -189,7 +235,8 @@ def team(task: str, first: str, second: str) -> Rate:
     """Returns the success of a team whose agent 0 follows one policy, the others another one."""
     for data in (published(f"pool_{task}"), published(f"crossplay_{task}")):
         if {first, second} <= {*data["policies"]}:
-            i, j = (data["policies"].index(name) for name in (first, second))
+            i = data["policies"].index(first)
+            j = data["policies"].index(second)
             return Rate(*(data["success"][key][i][j] for key in Rate._fields))
     raise InputError(f"results/strength: has no team of {first} and {second}")
 
@@ -210,10 +257,17 @@ def mixed() -> str:
 
 
 def pool(task: str) -> list[Rate]:
-    """Returns a team's success before and after it trained with a pool: of its robots together, with a new mate."""
+    """Returns a team's success before and after it trained with a pool: of its robots together,
+    with a new mate.
+    """
     data = published(f"pool_{task}")
-    before, after, new = data["start"], data["policies"][0], data["policies"][-1]
-    return [team(task, *pair) for pair in ((before, before), (after, after), (new, before), (new, after))]
+    before = data["start"]
+    after = data["policies"][0]
+    new = data["policies"][-1]
+    return [
+        team(task, *pair)
+        for pair in ((before, before), (after, after), (new, before), (new, after))
+    ]
 
 
 def pools() -> str:
@@ -231,7 +285,8 @@ def drawn_pool(task: str) -> dict[str, tuple[Rate]]:
 def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -> bytes:
     """Returns a picture with a panel for each group, and a row for each of its entries.
 
-    The first rate of an entry is a bar from the left, the second, losses, one from the right. Lines are intervals.
+    The first rate of an entry is a bar from the left, the second, losses, one from the right. Lines
+    are intervals.
     """
     figure = Figure((7.6, 1.0 + 1.15 * -(-len(groups) // 2)), dpi=105, layout="constrained")
     axes = figure.subplots(-(-len(groups) // 2), 2, sharex=True, squeeze=False)
@@ -242,7 +297,9 @@ def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -
     for each, (title, values) in zip(axes.ravel(), groups.items(), strict=False):
         for i, pair in enumerate(values.values()):
             each.barh(i, 100 * (len(pair) > 1), height=0.62, color=GREY)
-            for value, start, way, color in zip(pair, (0, 100), (100, -100), (BLUE, RED), strict=False):
+            for value, start, way, color in zip(
+                pair, (0, 100), (100, -100), (BLUE, RED), strict=False
+            ):
                 each.barh(i, way * value.value, left=start, height=0.62, color=color)
                 ends = [start + way * bound for bound in (value.low, value.high)]
                 each.plot(ends, [i, i], color=INK, lw=1.5, solid_capstyle="butt")
@@ -257,7 +314,9 @@ def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -
 
 
 def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
-    """Returns a picture of each best response's wins minus losses, with sampled and with mean actions."""
+    """Returns a picture of each best response's wins minus losses, with sampled and with mean
+    actions.
+    """
     figure = Figure((7.6, 3.8), dpi=105, layout="constrained")
     axes = figure.subplots()
     for place, task in enumerate(MATCHES):
@@ -265,7 +324,9 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
         for i, row in enumerate(own):
             y = place + 0.7 * (i / max(len(own) - 1, 1) - 0.5)
             color = BLUE if row["from"] == "scratch" else RED
-            axes.plot([100 * float(row["low"]), 100 * float(row["high"])], [y, y], color=color, lw=2)
+            axes.plot(
+                [100 * float(row["low"]), 100 * float(row["high"])], [y, y], color=color, lw=2
+            )
             face = "white" if row["actions"] == "mean" else color
             axes.plot([100 * float(row["value"])], [y], "o", color=color, mfc=face, ms=4)
     axes.axvline(0, color=INK, lw=0.8)
@@ -314,8 +375,11 @@ def tables() -> dict[str, str]:
 
 def pictures() -> dict[str, bytes]:
     """Returns the pictures by file name."""
-    met, fixed = rates("matches"), rates("population")
-    teams = {t: {x: against(met, t, x) for x in ("scripted", "idle", "random", "copy")} for t in MATCHES}
+    met = rates("matches")
+    fixed = rates("population")
+    teams = {
+        t: {x: against(met, t, x) for x in ("scripted", "idle", "random", "copy")} for t in MATCHES
+    }
     label = "wins (blue), draws (grey) and losses (red), %"
     return {
         "strength.png": draw_rates(teams, label),
@@ -328,16 +392,35 @@ def pictures() -> dict[str, bytes]:
 
 
 def leads(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Returns rows of how all best responses fare in the episodes that choose one, from results of `mqe exploit`."""
+    """Returns rows of how all best responses fare in the episodes that choose one, from results of
+    `mqe exploit`.
+    """
     body: list[dict[str, Any]] = []
     for result in found:
         for run, by_actions in result["selection"].items():
-            (cell, seed), episodes = Path(run).parts[-2:], result["episodes"]
-            own = {"task": result["task"], "from": cell.split("+")[1], "seed": seed.removeprefix("seed")}
+            (cell, seed) = Path(run).parts[-2:]
+            episodes = result["episodes"]
+            own = {
+                "task": result["task"],
+                "from": cell.split("+")[1],
+                "seed": seed.removeprefix("seed"),
+            }
             for actions, rates in by_actions.items():
-                win, draw, loss = (rates[name]["value"] for name in ("win", "draw", "loss"))
-                counts = {"actions": actions, "episodes": episodes, "wins": win, "draws": draw, "losses": loss}
-                body.append(own | counts | lead(Rate.of(win, episodes), Rate.of(loss, episodes), episodes)._asdict())
+                win = rates["win"]["value"]
+                draw = rates["draw"]["value"]
+                loss = rates["loss"]["value"]
+                counts = {
+                    "actions": actions,
+                    "episodes": episodes,
+                    "wins": win,
+                    "draws": draw,
+                    "losses": loss,
+                }
+                body.append(
+                    own
+                    | counts
+                    | lead(Rate.of(win, episodes), Rate.of(loss, episodes), episodes)._asdict()
+                )
     return body
 
 
@@ -372,7 +455,10 @@ def copy_rates(folder: Path) -> None:
 def update() -> None:
     """Writes the pages and their pictures."""
     found = tables()
-    pages = {PAGES / name: {each: found[each] for each in sections} for name, sections in SECTIONS.items()}
+    pages = {
+        PAGES / name: {each: found[each] for each in sections}
+        for name, sections in SECTIONS.items()
+    }
     texts = {page: filled(page.read_text("utf-8"), contents) for page, contents in pages.items()}
     for name, content in pictures().items():
         write_atomically(PAGES / name, content)
@@ -381,7 +467,9 @@ def update() -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rates", type=Path, help="folder of the measured parts")
     if folder := parser.parse_args().rates:
         copy_rates(folder)

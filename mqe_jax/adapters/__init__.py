@@ -1,7 +1,8 @@
 """Adapters to the interfaces of other libraries: Gymnasium, PettingZoo, Brax, JaxMARL.
 
-Each module needs the library of the same name; without that library, importing it raises an InputError that names the
-extra to install. `python -m mqe_jax.adapters SCRIPT` runs a script of such a library, which knows the tasks by name.
+Each module needs the library of the same name; without that library, importing it raises an
+InputError that names the extra to install. `python -m mqe_jax.adapters SCRIPT` runs a script of
+such a library, which knows the tasks by name.
 """
 
 import dataclasses
@@ -40,8 +41,8 @@ def task_env(
 
     Args:
         task: id, or an environment.
-        opponent: policy of team 1, or what `mqe_jax.load_policy` accepts. The task of an id gets its skill and command
-            ranges.
+        opponent: policy of team 1, or what `mqe_jax.load_policy` accepts. The task of an id gets
+            its skill and command ranges.
         max_steps: time limit in environment steps, in place of the task's.
         limit: name of `max_steps` in errors.
         overrides: arguments of `make`, for an id only.
@@ -71,13 +72,23 @@ def agent_names(env: TaskEnv) -> list[str]:
 
 
 def team_reward(env: TaskEnv, reward: Any) -> Any:
-    """Returns the mean reward (...) of team 0 from rewards (..., A): of all agents in cooperative tasks."""
+    """Returns the mean reward (...) of team 0 from rewards (..., A): of all agents in cooperative
+    tasks.
+    """
     return reward[..., np.array(env.teams[0])].mean(-1)
 
 
-def select(env: TaskEnv, choose: jax.Array, first: State, second: State, kept: tuple[str, ...] = ()) -> State:
-    """Returns `first` where `choose` () is true, else `second`, whose fields `kept` and shared buffers stay."""
+def select(
+    env: TaskEnv, choose: jax.Array, first: State, second: State, kept: tuple[str, ...] = ()
+) -> State:
+    """Returns `first` where `choose` () is true, else `second`, whose fields `kept` and shared
+    buffers stay.
+    """
     names = {field.name for field in dataclasses.fields(second)}.difference(kept, ("data",))
     fields = {name: (getattr(first, name), getattr(second, name)) for name in names}
-    merged = {n: jax.tree.map(lambda a, b: jnp.where(choose, a, b), *pair) for n, pair in fields.items()}
-    return dataclasses.replace(second, data=env.physics.merge(choose, first.data, second.data), **merged)
+    merged = {
+        n: jax.tree.map(lambda a, b: jnp.where(choose, a, b), *pair) for n, pair in fields.items()
+    }
+    return dataclasses.replace(
+        second, data=env.physics.merge(choose, first.data, second.data), **merged
+    )

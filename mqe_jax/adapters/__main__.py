@@ -1,6 +1,8 @@
-"""`python -m mqe_jax.adapters SCRIPT [ARGUMENT...]` runs a script of another library in which the tasks are registered.
+"""`python -m mqe_jax.adapters SCRIPT [ARGUMENT...]` runs a script of another library in which the
+tasks are registered.
 
-The script creates a task by the `make` of its library: `ENV_NAME=go1gate` for the baselines of JaxMARL.
+The script creates a task by the `make` of its library: `ENV_NAME=go1gate` for the baselines of
+JaxMARL.
 """
 
 import contextlib
@@ -13,7 +15,9 @@ from mqe_jax.core.errors import InputError
 
 if __name__ == "__main__":
     if not sys.argv[1:] or not Path(sys.argv[1]).is_file():
-        sys.exit(f"{sys.argv[1:2]}: SCRIPT must be a Python file: python -m mqe_jax.adapters SCRIPT ...")
+        sys.exit(
+            f"{sys.argv[1:2]}: SCRIPT must be a Python file: python -m mqe_jax.adapters SCRIPT ..."
+        )
     for library in ("gymnasium", "pettingzoo", "brax", "jaxmarl"):
         with contextlib.suppress(InputError):  # not installed
             importlib.import_module(f"mqe_jax.adapters.{library}")

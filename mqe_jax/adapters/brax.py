@@ -1,9 +1,12 @@
-"""Brax: `Env` over the joint observations and actions of all agents, flattened, and a wrapper for training.
+"""Brax: `Env` over the joint observations and actions of all agents, flattened, and a wrapper for
+training.
 
-Importing this module registers every task under its id, for `brax.envs.get_environment` and `brax.envs.create`.
+Importing this module registers every task under its id, for `brax.envs.get_environment` and
+`brax.envs.create`.
 
-`ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length)` trains with automatic resets to new
-episodes. Brax's own wrapper also works, except on Warp, but restarts an environment from the same initial state.
+`ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length)` trains with
+automatic resets to new episodes. Brax's own wrapper also works, except on Warp, but restarts an
+environment from the same initial state.
 """
 
 import dataclasses
@@ -46,15 +49,19 @@ def register() -> None:
 
 
 class Env(BraxEnv):
-    """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after agent.
+    """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after
+    agent.
 
-    With an `opponent`, A counts the agents of team 0 and the reward is their mean. `done` is 1 on termination; time
-    limits are left to Brax's EpisodeWrapper. `info["truncation"]` is 1 in the step that reaches the time limit,
-    `info[FINAL_OBS]` the observation at the end of the step. `pipeline_state` is the task's `State`.
+    With an `opponent`, A counts the agents of team 0 and the reward is their mean. `done` is 1 on
+    termination; time limits are left to Brax's EpisodeWrapper. `info["truncation"]` is 1 in the
+    step that reaches the time limit, `info[FINAL_OBS]` the observation at the end of the step.
+    `pipeline_state` is the task's `State`.
     """
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
-        """Creates the environment from a task id or an environment; see `task_env` for the overrides."""
+        """Creates the environment from a task id or an environment; see `task_env` for the
+        overrides.
+        """
         self.env: TaskEnv = task_env(task, **overrides)
         self.episode_length: int = self.env.max_steps
 
@@ -65,14 +72,24 @@ class Env(BraxEnv):
         info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
         pipeline: Any = state  # any pytree, although Brax's annotation is narrower
         zero = jnp.zeros(())
-        return State(pipeline_state=pipeline, obs=obs, reward=zero, done=zero, metrics=info_of(state), info=info)
+        return State(
+            pipeline_state=pipeline,
+            obs=obs,
+            reward=zero,
+            done=zero,
+            metrics=info_of(state),
+            info=info,
+        )
 
     @single
     def step(self, state: State, action: jax.Array) -> State:
         """Advances by one environment step; raises an InputError for an action of another size."""
         check("state", state, State)
         if jnp.shape(action) != (self.action_size,):
-            raise InputError(f"action: shape {jnp.shape(action)}; expected ({self.action_size},), agents * action size")
+            raise InputError(
+                f"action: shape {jnp.shape(action)}; expected ({self.action_size},), agents * "
+                "action size"
+            )
         before: Any = state.pipeline_state
         after = self.env.step(before, action.reshape(self.env.num_agents, self.env.action_size))
         obs = after.obs.reshape(-1)
@@ -103,7 +120,8 @@ class Env(BraxEnv):
 class AutoReset(Wrapper):
     """Resets ended environments to new episodes; wraps a batch of `Env` with EpisodeWrapper.
 
-    `info["truncation"]` and `info[FINAL_OBS]` belong to the step, `obs` and `pipeline_state` to the new episode.
+    `info["truncation"]` and `info[FINAL_OBS]` belong to the step, `obs` and `pipeline_state` to the
+    new episode.
     """
 
     @single
@@ -116,7 +134,9 @@ class AutoReset(Wrapper):
         """Steps the batch, then resets the environments whose episodes ended."""
         shape = (*jnp.shape(check("state", state, State).done), self.action_size)
         if jnp.shape(action) != shape:
-            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape}, environments and all actions")
+            raise InputError(
+                f"action: shape {jnp.shape(action)}; expected {shape}, environments and all actions"
+            )
         info = {**state.info, "steps": jnp.where(state.done, 0.0, state.info["steps"])}
         cleared = state.replace(done=jnp.zeros_like(state.done), info=info)  # pyright: ignore[reportAttributeAccessIssue]
         after = self.env.step(cleared, action)
@@ -124,7 +144,9 @@ class AutoReset(Wrapper):
 
         def restart(own: TaskState, done: jax.Array) -> TaskState:
             # EpisodeWrapper may end an episode earlier than the task's time limit.
-            return autoreset(task, dataclasses.replace(own, truncated=done.astype(bool) & ~own.terminated))
+            return autoreset(
+                task, dataclasses.replace(own, truncated=done.astype(bool) & ~own.terminated)
+            )
 
         reached: Any = after.pipeline_state
         own = jax.vmap(restart)(reached, after.done)
@@ -134,18 +156,29 @@ class AutoReset(Wrapper):
 
 @check_arguments(episode_length=PositiveInt, action_repeat=PositiveInt)
 def wrap(
-    env: BraxEnv, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable[..., Any] | None = None
+    env: BraxEnv,
+    episode_length: int = 1000,
+    action_repeat: int = 1,
+    randomization_fn: Callable[..., Any] | None = None,
 ) -> Wrapper:
-    """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, automatic reset to new episodes."""
+    """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, automatic reset to
+    new episodes.
+    """
     if not isinstance(getattr(env, "unwrapped", env), Env):
-        raise InputError(f"env: {type(getattr(env, 'unwrapped', env)).__name__} is not a mqe_jax.adapters.brax.Env")
+        raise InputError(
+            f"env: {type(getattr(env, 'unwrapped', env)).__name__} is not a "
+            "mqe_jax.adapters.brax.Env"
+        )
     if randomization_fn is not None:
-        raise InputError("randomization_fn: not supported; pass randomization=... to the Env instead")
+        raise InputError(
+            "randomization_fn: not supported; pass randomization=... to the Env instead"
+        )
     return AutoReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 
 register()
-if not hasattr(jax, "device_put_replicated"):  # trainers of Brax 0.14.2 call what jax 0.10 has removed
+# trainers of Brax 0.14.2 call what jax 0.10 has removed
+if not hasattr(jax, "device_put_replicated"):
     jax.device_put_replicated = lambda tree, devices: jax.tree.map(  # pyright: ignore[reportAttributeAccessIssue]
         lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree
     )

@@ -1,10 +1,11 @@
 """Gymnasium: `Env` and `VectorEnv` over the joint observations and actions of all agents.
 
-Importing this module registers every task as `mqe/TASK-v0`, for `gymnasium.make` and `gymnasium.make_vec`. Gymnasium
-1.x does not load plug-ins; `gymnasium.make_vec("mqe_jax.adapters.gymnasium:mqe/go1gate-v0")` also imports this module.
+Importing this module registers every task as `mqe/TASK-v0`, for `gymnasium.make` and
+`gymnasium.make_vec`. Gymnasium 1.x does not load plug-ins;
+`gymnasium.make_vec("mqe_jax.adapters.gymnasium:mqe/go1gate-v0")` also imports this module.
 
-The reward is the mean over the agents of team 0: all agents in cooperative tasks. `info` holds the metrics of the step
-and, as `info["agent_rewards"]`, the rewards of all agents (A,).
+The reward is the mean over the agents of team 0: all agents in cooperative tasks. `info` holds the
+metrics of the step and, as `info["agent_rewards"]`, the rewards of all agents (A,).
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +41,8 @@ def register() -> None:
 class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment: observations (A, O), actions (A, action_size) in [-1, 1].
 
-    Episodes are truncated at the task's time limit. The first reset with seed s is `env.reset(jax.random.PRNGKey(s))`.
+    Episodes are truncated at the task's time limit. The first reset with seed s is
+    `env.reset(jax.random.PRNGKey(s))`.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012
@@ -55,8 +57,8 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> None:
         """Creates the environment of a task's id, or adapts a given one.
 
-        `render_mode` is None or 'rgb_array', `render_size` width and height, pixels; `overrides` are `opponent` of
-        `task_env`, and arguments of `mqe_jax.make`.
+        `render_mode` is None or 'rgb_array', `render_size` width and height, pixels; `overrides`
+        are `opponent` of `task_env`, and arguments of `mqe_jax.make`.
         """
         self.render_mode = render_mode
         self.env = task_env(task, **overrides)
@@ -85,9 +87,11 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """N environments stepped in one compiled call: observations (N, A, O), actions (N, A, action_size).
+    """N environments stepped in one compiled call: observations (N, A, O), actions (N, A,
+    action_size).
 
-    Environment i of `reset(seed=s)` equals the single environment reset with seed s + i, through automatic resets too.
+    Environment i of `reset(seed=s)` equals the single environment reset with seed s + i, through
+    automatic resets too.
     """
 
     def __init__(
@@ -103,19 +107,25 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> None:
         """Creates N environments; other arguments as those of `SingleEnv`.
 
-        `autoreset_mode` is Gymnasium's convention for environments whose episodes have ended: NEXT_STEP, SAME_STEP,
-        which stores the last observation in `infos["final_obs"]`, or DISABLED. `max_episode_steps` is a time limit
-        instead of the task's.
+        `autoreset_mode` is Gymnasium's convention for environments whose episodes have ended:
+        NEXT_STEP, SAME_STEP, which stores the last observation in `infos["final_obs"]`, or
+        DISABLED. `max_episode_steps` is a time limit instead of the task's.
         """
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except Exception:  # also of the `repr` of a value, which Gymnasium writes
-            fail("autoreset_mode", autoreset_mode, f"one of {', '.join(mode.value for mode in AutoresetMode)}")
+            fail(
+                "autoreset_mode",
+                autoreset_mode,
+                f"one of {', '.join(mode.value for mode in AutoresetMode)}",
+            )
         self.render_mode = render_mode
         num_envs = check("num_envs", num_envs, Environments)
         if not isinstance(task, QuadrupedEnv):
             overrides = {"num_envs": num_envs, **overrides}
-        self.env = task_env(task, max_steps=max_episode_steps, limit="max_episode_steps", **overrides)
+        self.env = task_env(
+            task, max_steps=max_episode_steps, limit="max_episode_steps", **overrides
+        )
         self.num_envs = num_envs
         self.metadata = {**SingleEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = self.env.action_space
@@ -127,29 +137,44 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @check_arguments(options=Mapping | None)
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts episodes, of the environments that `options["reset_mask"]` (N,) bool selects.
 
-        `seed` is that of environment 0 (environment i: seed + i), or one per environment; None continues the stream.
+        `seed` is that of environment 0 (environment i: seed + i), or one per environment; None
+        continues the stream.
         """
-        super().reset(seed=check("seed", seed, Seed) if isinstance(seed, int | np.integer) else None)
+        super().reset(
+            seed=check("seed", seed, Seed) if isinstance(seed, int | np.integer) else None
+        )
         mask = _reset_mask(options, self.num_envs)
         seeds: list[int | None]
         if isinstance(seed, int | np.integer):
             seeds = [int(seed) + i for i in range(self.num_envs)]
         elif seed is None:
             seeds = [None] * self.num_envs
-        elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str) and len(seed) == self.num_envs:
+        elif (
+            isinstance(seed, Sequence | np.ndarray)
+            and not isinstance(seed, str)
+            and len(seed) == self.num_envs
+        ):
             seeds = list(seed)
         else:
             fail("seed", seed, f"an integer, {self.num_envs} integers or None")
         self._ended &= ~mask
         return self._host.reset(seeds, self.np_random, mask), {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
-            raise InputError(f"step: reset environments {np.flatnonzero(self._ended)} first, with options reset_mask")
+            raise InputError(
+                f"step: reset environments {np.flatnonzero(self._ended)} first, with options "
+                "reset_mask"
+            )
         out = self._host.step(actions, self.autoreset_mode)
         ended = out.terminated | out.truncated
         metrics = {**out.info, "agent_rewards": out.reward}
@@ -164,7 +189,13 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             infos = _mask_infos(metrics, ~self._ended)
         self._ended = ended.copy()
-        return out.obs, team_reward(self.env, out.reward.astype(float)), out.terminated, out.truncated, infos
+        return (
+            out.obs,
+            team_reward(self.env, out.reward.astype(float)),
+            out.terminated,
+            out.truncated,
+            infos,
+        )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns an image (H, W, 3) uint8 of each environment, or None without a render mode."""
@@ -173,7 +204,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def _mask_infos(values: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
-    """Returns infos in Gymnasium's form: arrays, zero outside of the mask, and the mask under `_name`."""
+    """Returns infos in Gymnasium's form: arrays, zero outside of the mask, and the mask under
+    `_name`.
+    """
     if not mask.any():
         return {}
     infos: dict[str, Any] = {}

@@ -1,4 +1,6 @@
-"""A batch of environments stepped from the host with numpy arrays, for the Gymnasium and PettingZoo adapters."""
+"""A batch of environments stepped from the host with numpy arrays, for the Gymnasium and PettingZoo
+adapters.
+"""
 
 import dataclasses
 import functools
@@ -29,7 +31,9 @@ RENDER_MODES = ("rgb_array",)
 
 
 class Step(NamedTuple):
-    """Output of one step of N environments, before any reset but for `obs`; the arrays are writable copies."""
+    """Output of one step of N environments, before any reset but for `obs`; the arrays are writable
+    copies.
+    """
 
     obs: np.ndarray  # (N, A, O)
     final_obs: np.ndarray  # (N, A, O)
@@ -48,13 +52,20 @@ class _Kind:
 
 
 class HostEnvs:
-    """N environments of one task. Environment i, reset with seed s, starts as `env.reset(jax.random.PRNGKey(s))`.
+    """N environments of one task.
 
-    A reset without a seed continues the environment's PRNG stream and starts the same episode as an automatic reset.
+    Environment i, reset with seed s, starts as `env.reset(jax.random.PRNGKey(s))`.
+
+    A reset without a seed continues the environment's PRNG stream and starts the same episode as an
+    automatic reset.
     """
 
     def __init__(
-        self, env: TaskEnv, num_envs: int, render_mode: str | None = None, render_size: tuple[int, int] = RENDER_SIZE
+        self,
+        env: TaskEnv,
+        num_envs: int,
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = RENDER_SIZE,
     ) -> None:
         num_envs = check("num_envs", num_envs, Environments)
         width, height = check("render_size", render_size, tuple[Pixels, Pixels])
@@ -62,11 +73,19 @@ class HostEnvs:
         self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.state: State | None = None
-        self._mode, self._size = render_mode, (width, height)
+        self._mode = render_mode
+        self._size = (width, height)
         self._camera: Camera | None = None
         self._task = match = self.env.match if isinstance(self.env, TeamEnv) else self.env
         opponent = self.env.identity if isinstance(self.env, TeamEnv) else None
-        self._key = (type(match), match.params, match.impl, match.control, match.physics.num_envs, opponent)
+        self._key = (
+            type(match),
+            match.params,
+            match.impl,
+            match.control,
+            match.physics.num_envs,
+            opponent,
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns what a copy has: all but the compiled functions."""
@@ -77,9 +96,14 @@ class HostEnvs:
         return _compile(_Kind(self._key, self.env))
 
     def reset(
-        self, seeds: Sequence[int | None], generator: np.random.Generator, mask: np.ndarray | None = None
+        self,
+        seeds: Sequence[int | None],
+        generator: np.random.Generator,
+        mask: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Resets the masked environments (N,) bool and returns observations; None as seed continues the PRNG stream."""
+        """Resets the masked environments (N,) bool and returns observations; None as seed continues
+        the PRNG stream.
+        """
         if self.state is None:
             seeds = [int(generator.integers(2**31)) if seed is None else seed for seed in seeds]
         seeded = np.array([seed is not None for seed in seeds])
@@ -91,8 +115,9 @@ class HostEnvs:
     def step(self, action: ArrayLike, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
         """Steps all environments with actions (N, A, action_size), clipped to [-1, 1].
 
-        SAME_STEP resets an environment in the call that ends its episode. NEXT_STEP resets it in the next call, which
-        ignores its action and returns a reward of zero. DISABLED does not reset.
+        SAME_STEP resets an environment in the call that ends its episode. NEXT_STEP resets it in
+        the next call, which ignores its action and returns a reward of zero. DISABLED does not
+        reset.
         """
         if self.state is None:
             raise InputError("step: reset the environment first")
@@ -104,7 +129,10 @@ class HostEnvs:
         except (TypeError, ValueError, OverflowError, np.exceptions.ComplexWarning):
             fail("action", action, "an array of numbers")
         if action.shape != shape:
-            raise InputError(f"action: shape {action.shape}; expected {shape} (environments, agents, action size)")
+            raise InputError(
+                f"action: shape {action.shape}; expected {shape} (environments, agents, action "
+                "size)"
+            )
         if not np.isfinite(action).all():
             raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
         self.state, out = self._programs[1](self.state, action, reset)
@@ -117,7 +145,9 @@ class HostEnvs:
         if self.state is None:
             raise InputError("render: reset the environment first")
         data = self.state.data
-        pose = (np.asarray(x)[index : index + 1] for x in (data.qpos, data.mocap_pos, data.mocap_quat))
+        pose = (
+            np.asarray(x)[index : index + 1] for x in (data.qpos, data.mocap_pos, data.mocap_quat)
+        )
         episode = Episode(*pose, dt=self._task.dt)
         if self._camera is None:
             model = rendering_model(self._task.mj_model, episode)
@@ -132,7 +162,9 @@ def info_of(state: State) -> dict[str, jax.Array]:
 
 @functools.lru_cache(maxsize=16)
 def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[State, Step]]]:
-    """Returns the compiled reset, and the step with the resets that its last argument names, for any batch size."""
+    """Returns the compiled reset, and the step with the resets that its last argument names, for
+    any batch size.
+    """
     env = kind.env
 
     def begin(seed: jax.Array, seeded: jax.Array, chosen: jax.Array, state: State | None) -> State:
@@ -153,7 +185,14 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
             ended = shown if same else state
             after = select(env, ended.terminated | ended.truncated, fresh, shown)
             shown = shown if same else after
-        out: Any = (after.obs, shown.final_obs, shown.reward, shown.terminated, shown.truncated, info_of(shown))
+        out: Any = (
+            after.obs,
+            shown.final_obs,
+            shown.reward,
+            shown.terminated,
+            shown.truncated,
+            info_of(shown),
+        )
         return after, Step(*out)
 
     def steps(state: State, action: jax.Array, reset: AutoresetMode) -> tuple[State, Step]:

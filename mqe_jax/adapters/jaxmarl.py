@@ -1,6 +1,7 @@
 """JaxMARL: `MultiAgentEnv` over the agents `robot_0`, `robot_1`, ...
 
-Importing this module adds every task, under its id, to `jaxmarl.make` and `jaxmarl.registered_envs`.
+Importing this module adds every task, under its id, to `jaxmarl.make` and
+`jaxmarl.registered_envs`.
 """
 
 import contextlib
@@ -36,46 +37,60 @@ Arrays = dict[str, jax.Array]
 
 
 def register() -> None:
-    """Makes every task known to `jaxmarl.make`, which has no registry for others' environments, under its id.
+    """Makes every task known to `jaxmarl.make`, which has no registry for others' environments,
+    under its id.
 
-    Replaces that function by one that creates an `Env` for a task and calls the original for other ids.
+    Replaces that function by one that creates an `Env` for a task and calls the original for other
+    ids.
     """
-    jaxmarl.registered_envs.extend(task for task in envs.tasks() if task not in jaxmarl.registered_envs)
+    jaxmarl.registered_envs.extend(
+        task for task in envs.tasks() if task not in jaxmarl.registered_envs
+    )
     if getattr(jaxmarl.make, "knows_tasks", False):
         return
     original = jaxmarl.make
 
     @functools.wraps(original)
     def make(env_id: str, **env_kwargs: Any) -> MultiAgentEnv:
-        return Env(env_id, **env_kwargs) if env_id in envs.tasks() else original(env_id, **env_kwargs)
+        return (
+            Env(env_id, **env_kwargs) if env_id in envs.tasks() else original(env_id, **env_kwargs)
+        )
 
     make.__dict__["knows_tasks"] = True
     jaxmarl.make = registration.make = make
 
 
 class Env(MultiAgentEnv):
-    """One environment; batch with `jax.vmap`. Its state is the task's `State`, whose `final_obs` is kept by a reset.
+    """One environment; batch with `jax.vmap`.
 
-    Infos have one value per agent (A,), the shape that JaxMARL's baselines expect: `truncation`, and the metrics. Dones
-    are true on termination and on truncation.
+    Its state is the task's `State`, whose `final_obs` is kept by a reset.
+
+    Infos have one value per agent (A,), the shape that JaxMARL's baselines expect: `truncation`,
+    and the metrics. Dones are true on termination and on truncation.
     """
 
     @check_arguments(discrete=bool)
-    def __init__(self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any) -> None:
-        """Creates the environment of a task's id, or adapts a given one; `overrides` are those of `task_env`.
+    def __init__(
+        self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any
+    ) -> None:
+        """Creates the environment of a task's id, or adapts a given one; `overrides` are those of
+        `task_env`.
 
-        With `discrete`, actions are integers, as JaxMARL's MAPPO and Q-learning need. 0 is the zero action. 2 i + 1 is
-        +1 and 2 i + 2 is -1 in dimension i, with zero in all others.
+        With `discrete`, actions are integers, as JaxMARL's MAPPO and Q-learning need. 0 is the zero
+        action. 2 i + 1 is +1 and 2 i + 2 is -1 in dimension i, with zero in all others.
         """
         self.env: TaskEnv = task_env(task, **overrides)
         super().__init__(self.env.num_agents)
         size = self.env.action_size
         self.agents = agent_names(self.env)
-        self.observation_spaces = {a: Box(-jnp.inf, jnp.inf, (self.env.observation_size,)) for a in self.agents}
+        self.observation_spaces = {
+            a: Box(-jnp.inf, jnp.inf, (self.env.observation_size,)) for a in self.agents
+        }
         self.action_table: np.ndarray | None = None  # the action of each integer
         if discrete:
             self.action_table = np.zeros((1 + 2 * size, size), np.float32)
-            self.action_table[1::2], self.action_table[2::2] = np.eye(size), -np.eye(size)
+            self.action_table[1::2] = np.eye(size)
+            self.action_table[2::2] = -np.eye(size)
         space = Discrete(1 + 2 * size) if discrete else Box(-1.0, 1.0, (size,))
         self.action_spaces = dict.fromkeys(self.agents, space)
 
@@ -94,11 +109,17 @@ class Env(MultiAgentEnv):
 
     @check_arguments(key=RandomKey, actions=Mapping)
     def step(  # pyright: ignore[reportIncompatibleVariableOverride]
-        self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None = None
+        self,
+        key: jax.Array,
+        state: State,
+        actions: Mapping[str, jax.Array],
+        reset_state: State | None = None,
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
-        """Advances by one environment step and resets an ended environment, to `reset_state` if passed.
+        """Advances by one environment step and resets an ended environment, to `reset_state` if
+        passed.
 
-        The base class selects between whole states; contact buffers of Warp are shared by all environments.
+        The base class selects between whole states; contact buffers of Warp are shared by all
+        environments.
         """
         for one in (state, reset_state):
             if one is not None:
@@ -107,7 +128,13 @@ class Env(MultiAgentEnv):
 
     @functools.partial(jax.jit, static_argnums=0)
     @single
-    def _step(self, key: jax.Array, state: State, actions: Mapping[str, jax.Array], reset_state: State | None) -> Any:
+    def _step(
+        self,
+        key: jax.Array,
+        state: State,
+        actions: Mapping[str, jax.Array],
+        reset_state: State | None,
+    ) -> Any:
         _, after, rewards, dones, infos = self.step_env(key, state, actions)
         task: Any = self.env
         if reset_state is None:
@@ -121,14 +148,24 @@ class Env(MultiAgentEnv):
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
-        """Advances by one environment step without a reset; the key replaces the state's own random key."""
+        """Advances by one environment step without a reset; the key replaces the state's own random
+        key.
+        """
         action = jnp.stack([self._continuous(action) for action in self._checked(actions).values()])
         after = self.env.step(dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated
         values = {"truncation": after.truncated.astype(jnp.float32), **info_of(after)}
-        infos = {name: jnp.broadcast_to(value, (self.num_agents,)) for name, value in values.items()}
+        infos = {
+            name: jnp.broadcast_to(value, (self.num_agents,)) for name, value in values.items()
+        }
         rewards = {agent: after.reward[i] for i, agent in enumerate(self.agents)}
-        return self.get_obs(after), after, rewards, {**dict.fromkeys(self.agents, done), "__all__": done}, infos
+        return (
+            self.get_obs(after),
+            after,
+            rewards,
+            {**dict.fromkeys(self.agents, done), "__all__": done},
+            infos,
+        )
 
     def get_obs(self, state: State) -> Arrays:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Returns the agents' observations (O,)."""
@@ -140,7 +177,9 @@ class Env(MultiAgentEnv):
     def get_avail_actions(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, state: State
     ) -> Arrays:
-        """Returns all true, (action_size,) bool or one per discrete action: all are always available."""
+        """Returns all true, (action_size,) bool or one per discrete action: all are always
+        available.
+        """
         size = self.env.action_size if self.action_table is None else len(self.action_table)
         return {agent: jnp.ones(size, bool) for agent in self.agents}
 
@@ -161,27 +200,42 @@ class Env(MultiAgentEnv):
         return self.action_spaces[check("agent", agent, Literal[tuple(self.agents)])]
 
     def _checked(self, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the agents' actions in their order; InputError if one is missing or of another kind."""
+        """Returns the agents' actions in their order; InputError if one is missing or of another
+        kind.
+        """
         if not set(self.agents) <= set(actions):
             raise InputError(
-                f"actions: for {short_repr(list(actions))}; expected one for each of {', '.join(self.agents)}"
+                f"actions: for {short_repr(list(actions))}; expected one for each of "
+                f"{', '.join(self.agents)}"
             )
-        count, size = len(self.action_table) if self.action_table is not None else 0, self.env.action_size
+        count = len(self.action_table) if self.action_table is not None else 0
+        size = self.env.action_size
         shapes, kind = ([(), (1,)], jnp.integer) if count else ([(size,)], jnp.number)
         arrays = {}
         for agent in self.agents:
             with contextlib.suppress(Exception):  # of the `repr` of a value too
                 arrays[agent] = action = jnp.asarray(actions[agent])
-                known = isinstance(actions[agent], int | np.integer | np.ndarray)  # without waiting for a device
+                # without waiting for a device
+                known = isinstance(actions[agent], int | np.integer | np.ndarray)
                 outside = count and known and not 0 <= int(actions[agent]) < count
                 if action.shape in shapes and jnp.issubdtype(action.dtype, kind) and not outside:
                     continue
-            fail(f"actions.{agent}", actions[agent], f"an integer below {count}" if count else f"{size} numbers")
+            fail(
+                f"actions.{agent}",
+                actions[agent],
+                f"an integer below {count}" if count else f"{size} numbers",
+            )
         return arrays
 
     def _continuous(self, action: jax.Array) -> jax.Array:
-        """Returns the action (action_size,) of an integer () or (1,), or a continuous action unchanged."""
-        return action if self.action_table is None else jnp.asarray(self.action_table)[jnp.reshape(action, ())]
+        """Returns the action (action_size,) of an integer () or (1,), or a continuous action
+        unchanged.
+        """
+        return (
+            action
+            if self.action_table is None
+            else jnp.asarray(self.action_table)[jnp.reshape(action, ())]
+        )
 
 
 register()

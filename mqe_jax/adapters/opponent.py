@@ -1,4 +1,6 @@
-"""A match against a fixed opponent as an environment of team 0; `opponents.Versus` is its batched form."""
+"""A match against a fixed opponent as an environment of team 0; `opponents.Versus` is its batched
+form.
+"""
 
 import dataclasses
 import hashlib
@@ -25,7 +27,9 @@ from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TeamEnvState(State):
-    """State of a match as seen by team 0, with T agents; observations, rewards and metrics are those of team 0."""
+    """State of a match as seen by team 0, with T agents; observations, rewards and metrics are
+    those of team 0.
+    """
 
     rival_obs: jax.Array  # observations of the opponent's agents (T, O)
     rival_memory: Memory  # recurrent state of the opponent, leading axis 1
@@ -34,19 +38,24 @@ class TeamEnvState(State):
 class TeamEnv:
     """One match as an environment of team 0, in which the opponent controls team 1.
 
-    It has what the adapters use of `QuadrupedEnv`: sizes and spaces are those of team 0, everything else the match's.
+    It has what the adapters use of `QuadrupedEnv`: sizes and spaces are those of team 0, everything
+    else the match's.
     """
 
     @check_arguments(match=AnySingle)
     def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
-        """Creates the environment; `opponent` is a policy, which samples if it does, or what `load_policy` accepts."""
+        """Creates the environment; `opponent` is a policy, which samples if it does, or what
+        `load_policy` accepts.
+        """
         if len(match.teams) != 2:
             raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
         self.match = match
         self.opponent: Policy = load_as("opponent", opponent, match)
         self.num_agents = len(match.teams[0])
         if further := groups_of(self.opponent) - {"policy"}:
-            raise InputError(f"opponent: sees the groups {sorted(further)}; here it must see the group 'policy'")
+            raise InputError(
+                f"opponent: sees the groups {sorted(further)}; here it must see the group 'policy'"
+            )
         self._source = str(opponent) if isinstance(opponent, str | Path) else None
 
     def __repr__(self) -> str:
@@ -74,7 +83,9 @@ class TeamEnv:
 
     @property
     def identity(self) -> Hashable:
-        """A value that is equal for opponents that act alike; compared where compiled functions are shared."""
+        """A value that is equal for opponents that act alike; compared where compiled functions are
+        shared.
+        """
         if isinstance(self.opponent, TrainedPolicy):
             digest = hashlib.sha256()
             for leaf in jax.tree.leaves(self.opponent.arrays):
@@ -84,7 +95,9 @@ class TeamEnv:
         return self._source if named else id(self.opponent)
 
     def with_num_envs(self, num_envs: int) -> "TeamEnv":
-        """Returns an environment whose engine holds `num_envs` environments; see `QuadrupedEnv.with_num_envs`."""
+        """Returns an environment whose engine holds `num_envs` environments; see
+        `QuadrupedEnv.with_num_envs`.
+        """
         match = self.match.with_num_envs(num_envs)
         if match is self.match:
             return self
@@ -112,18 +125,26 @@ class TeamEnv:
         check("state", state, TeamEnvState)
         shape = (self.num_agents, self.match.action_size)
         if jnp.shape(action) != shape:
-            raise InputError(f"action: shape {jnp.shape(action)}; expected {shape} (agents, action size)")
+            raise InputError(
+                f"action: shape {jnp.shape(action)}; expected {shape} (agents, action size)"
+            )
         own: Any = state  # a `TeamEnvState`; the match's step keeps its further fields
         key = jax.random.fold_in(own.key, 1)
         rival, memory = self.opponent.act(own.rival_obs[None], own.rival_memory, key)
-        both = jnp.concatenate([jnp.asarray(action, jnp.float32), jnp.asarray(rival[0], jnp.float32)])
+        both = jnp.concatenate(
+            [jnp.asarray(action, jnp.float32), jnp.asarray(rival[0], jnp.float32)]
+        )
         after: Any = self.match.advance(own, both)
-        return with_final(self.with_observations(self._of_team(dataclasses.replace(after, rival_memory=memory))))
+        return with_final(
+            self.with_observations(self._of_team(dataclasses.replace(after, rival_memory=memory)))
+        )
 
     def with_observations(self, state: TeamEnvState, groups: Sequence[str] = ()) -> TeamEnvState:
         """Returns the state with the observations of both teams that belong to it."""
         seen: Any = self.match.with_observations(state, groups)
-        return dataclasses.replace(seen, obs=seen.obs[: self.num_agents], rival_obs=seen.obs[self.num_agents :])
+        return dataclasses.replace(
+            seen, obs=seen.obs[: self.num_agents], rival_obs=seen.obs[self.num_agents :]
+        )
 
     def _of_team(self, state: TeamEnvState) -> TeamEnvState:
         """Reduces rewards, outcome and metrics of all agents to those of team 0."""
@@ -131,7 +152,11 @@ class TeamEnv:
             state,
             reward=state.reward[: self.num_agents],
             outcome=state.outcome.by_team(lambda x: x[:1]),
-            metrics={name: value for name, value in state.metrics.items() if not name.startswith("team1/")},
+            metrics={
+                name: value
+                for name, value in state.metrics.items()
+                if not name.startswith("team1/")
+            },
         )
 
 

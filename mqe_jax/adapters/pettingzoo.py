@@ -1,7 +1,8 @@
 """PettingZoo: `ParallelEnv` over the agents `robot_0`, `robot_1`, ...
 
-`parallel_env(task)` creates the parallel environment, `env(task)` its turn-based form (AEC). Importing this module
-registers every task as `mqe/TASK-v0`, for `pettingzoo.make("parallel", id)` and `pettingzoo.make("aec", id)`.
+`parallel_env(task)` creates the parallel environment, `env(task)` its turn-based form (AEC).
+Importing this module registers every task as `mqe/TASK-v0`, for `pettingzoo.make("parallel", id)`
+and `pettingzoo.make("aec", id)`.
 """
 
 from collections.abc import Mapping
@@ -30,24 +31,31 @@ def register() -> None:
     """Registers every task as `mqe/TASK-v0`; call it again after `mqe_jax.envs.register_task`."""
     for task in envs.tasks():
         if f"mqe/{task}-v0" not in pettingzoo.parallel_registry:
-            pettingzoo.register("parallel", f"mqe/{task}-v0", f"{__name__}:parallel_env", kwargs={"task": task})
+            pettingzoo.register(
+                "parallel", f"mqe/{task}-v0", f"{__name__}:parallel_env", kwargs={"task": task}
+            )
             pettingzoo.register("aec", f"mqe/{task}-v0", f"{__name__}:env", kwargs={"task": task})
 
 
 def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> "QuadrupedParallelEnv":
-    """Returns the parallel environment of a task; the settings are those of `QuadrupedParallelEnv`."""
+    """Returns the parallel environment of a task; the settings are those of
+    `QuadrupedParallelEnv`.
+    """
     return QuadrupedParallelEnv(task, **settings)
 
 
 def env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> AECEnv[str, np.ndarray, Any]:
-    """Returns the turn-based (AEC) environment; the physics advances after the last agent's action."""
+    """Returns the turn-based (AEC) environment; the physics advances after the last agent's
+    action.
+    """
     return OrderEnforcingWrapper(parallel_to_aec(parallel_env(task, **settings)))
 
 
 class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     """One environment as a parallel environment; all agents end together.
 
-    A copied or unpickled instance is a new environment with the same settings, as SuperSuit's vectorisers require.
+    A copied or unpickled instance is a new environment with the same settings, as SuperSuit's
+    vectorisers require.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -76,7 +84,12 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
             overrides: `opponent` of `task_env`, and arguments of `make`.
         """
         EzPickle.__init__(
-            self, task, max_cycles=max_cycles, render_mode=render_mode, render_size=render_size, **overrides
+            self,
+            task,
+            max_cycles=max_cycles,
+            render_mode=render_mode,
+            render_size=render_size,
+            **overrides,
         )
         self.task = task_env(task, max_steps=max_cycles, limit="max_cycles", **overrides)
         self.metadata = {**type(self).metadata, "name": self.task.name}
@@ -86,10 +99,15 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         self.teams = tuple(tuple(self.possible_agents[i] for i in team) for team in self.task.teams)
         box = gymnasium.spaces.Box
         self._observation_spaces, self._action_spaces = (
-            {a: box(*x, dtype=np.float32) for a, *x in zip(self.possible_agents, space.low, space.high, strict=True)}
+            {
+                a: box(*x, dtype=np.float32)
+                for a, *x in zip(self.possible_agents, space.low, space.high, strict=True)
+            }
             for space in (self.task.observation_space, self.task.action_space)
         )
-        self.state_space = box(-np.inf, np.inf, (self.task.privileged_observation_size,), np.float32)
+        self.state_space = box(
+            -np.inf, np.inf, (self.task.privileged_observation_size,), np.float32
+        )
         self._generator = np.random.default_rng()
         self._host = HostEnvs(self.task, 1, render_mode, render_size)
 
@@ -116,10 +134,12 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
             return {}, {}, {}, {}, {}
         if set(check("actions", actions, Mapping)) != set(self.agents):
             raise InputError(
-                f"actions: for {short_repr(list(actions))}; expected one for each of {', '.join(self.agents)}"
+                f"actions: for {short_repr(list(actions))}; expected one for each of "
+                f"{', '.join(self.agents)}"
             )
         out = self._host.step([[actions[agent] for agent in self.agents]])
-        terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
+        terminated = bool(out.terminated[0])
+        truncated = bool(out.truncated[0])
         metrics = {name: float(value[0]) for name, value in out.info.items()}
         agents = self.agents
         result = (

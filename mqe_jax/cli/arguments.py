@@ -41,7 +41,8 @@ COMMANDS: dict[str, Any] = {
     "replay": commands.Replay,
     "bench": commands.Bench,
     "demo": commands.Demo,
-    "skill train": "Train a skill's weights, from scratch or from other weights (GPU): mqe skill train agile.",
+    "skill train": "Train a skill's weights, from scratch or from other weights (GPU): mqe skill "
+    "train agile.",
     "skill eval": skill.SkillEval,
     "skill convert": skill.SkillConvert,
     "sweep": study.SweepCommand,
@@ -59,7 +60,9 @@ def overview(group: str = "") -> str:
         name: kind if isinstance(kind, str) else (kind.__doc__ or name).splitlines()[0]
         for name, kind in COMMANDS.items()
     }
-    lines = "\n".join(f"  {name:12} {line}" for name, line in about.items() if name.startswith(group))
+    lines = "\n".join(
+        f"  {name:12} {line}" for name, line in about.items() if name.startswith(group)
+    )
     return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
 
 
@@ -72,7 +75,9 @@ def resolve_alias(arguments: Sequence[str]) -> list[str]:
 
 
 def _check_words(arguments: Sequence[str]) -> None:
-    """Raises an InputError for an empty value, which would stand for this folder, and for what is no text."""
+    """Raises an InputError for an empty value, which would stand for this folder, and for what is
+    no text.
+    """
     for flag, word in itertools.pairwise(("mqe", *arguments)):
         name, equals, value = word.partition("=")
         if not word or (word.startswith("--") and equals and not value):
@@ -82,22 +87,32 @@ def _check_words(arguments: Sequence[str]) -> None:
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Returns the parsed command that the first word or two name; its `run` returns the object of `--json`.
+    """Returns the parsed command that the first word or two name; its `run` returns the object of
+    `--json`.
 
-    InputError for an unknown command or task; SystemExit 0 after help, 2 after tyro's message about a wrong argument.
+    InputError for an unknown command or task; SystemExit 0 after help, 2 after tyro's message about
+    a wrong argument.
     """
     _check_words(arguments)
-    given, arguments = arguments, resolve_alias(arguments)
+    given = arguments
+    arguments = resolve_alias(arguments)
     words = 2 if " ".join(arguments[:2]) in COMMANDS else 1
-    name, rest = " ".join(arguments[:words]), list(arguments[words:])
+    name = " ".join(arguments[:words])
+    rest = list(arguments[words:])
     if {"-h", "--help"}.intersection(arguments[:2]) and name not in COMMANDS:
         print(overview("" if name.startswith("-") else name))
         raise SystemExit(0)
     if name not in COMMANDS:
         group = given[0] if name.startswith("skill") else ""
-        known = [f"{group}{each[5:]}" for each in COMMANDS if each.startswith("skill ")] if group else list(COMMANDS)
+        known = (
+            [f"{group}{each[5:]}" for each in COMMANDS if each.startswith("skill ")]
+            if group
+            else list(COMMANDS)
+        )
         name = " ".join(given[: 2 if group else 1])
-        raise InputError(f"unknown command {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
+        raise InputError(
+            f"unknown command {name!r}{nearest(name, known)}; allowed: {', '.join(known)}"
+        )
     if name == "train":
         if rest and not rest[0].startswith("-"):
             task_id(rest[0])
@@ -109,7 +124,9 @@ def parse(arguments: Sequence[str]) -> Any:
         from mqe_jax.cli import skill_train
 
         return {"launch": _parse_launch, "skill train": skill_train.parse_skill_train}[name](rest)
-    command = tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
+    command = tyro.cli(
+        COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,)
+    )
     target = getattr(command, "target", None) or getattr(command, "task", None)
     if isinstance(target, str) and os.sep not in target and not Path(target).exists():
         task_id(target)  # before JAX and MuJoCo are imported, which take seconds
@@ -122,9 +139,21 @@ def _parse_launch(arguments: Sequence[str]) -> Any:
 
     names = {"walk", *(name.split()[0] for name in COMMANDS)}
     start = next((i for i, word in enumerate(arguments) if word in names), len(arguments))
-    launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]), config=(tyro.conf.FlagCreatePairsOff,))
+    launch = tyro.cli(
+        Launch,
+        prog="mqe launch",
+        args=list(arguments[:start]),
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
     command = tuple(arguments[start:])
-    if command[:1] not in (("train",), ("sweep",)) and tuple(resolve_alias(command))[:2] != ("skill", "train"):
-        fail("command", " ".join(command[:2]), "train, skill train or sweep: mqe launch --processes 2 train go1gate")
+    if command[:1] not in (("train",), ("sweep",)) and tuple(resolve_alias(command))[:2] != (
+        "skill",
+        "train",
+    ):
+        fail(
+            "command",
+            " ".join(command[:2]),
+            "train, skill train or sweep: mqe launch --processes 2 train go1gate",
+        )
     parse(command)
     return dataclasses.replace(launch, command=command)

@@ -35,12 +35,15 @@ _RATES = {
         "win/idle": "against idle",
     },
 }
-"""Rates of the shipped policies that `mqe zoo` lists: title of each table and its columns, by name in the cards."""
+"""Rates of the shipped policies that `mqe zoo` lists: title of each table and its columns, by name
+in the cards."""
 
 
 @settings_class
 class Tasks:
-    """List the tasks with their robots, sizes and time limits; with --long, also the sizes of their observations."""
+    """List the tasks with their robots, sizes and time limits; with --long, also the sizes of their
+    observations.
+    """
 
     json: Json = False
     long: Long = False
@@ -71,12 +74,17 @@ class Tasks:
             "task": [row["task"] for row in rows],
             "title": [row["title"] for row in rows],
             "robots": [" vs ".join(map(str, task.teams)) for task in SHIPPED.values()],
-            "sizes": [f"{task.sizes[0]} to {task.sizes[1]}" if task.sizes else "" for task in SHIPPED.values()],
+            "sizes": [
+                f"{task.sizes[0]} to {task.sizes[1]}" if task.sizes else ""
+                for task in SHIPPED.values()
+            ],
             "time, s": [f"{row['time_limit_s']:g}" for row in rows],
         }
         if self.long:
             del columns["title"]
-            columns |= {name: [str(row[name]) for row in rows] for name in ("observation", "privileged")}
+            columns |= {
+                name: [str(row[name]) for row in rows] for name in ("observation", "privileged")
+            }
             columns["policy"] = ["shipped" if row["shipped_policy"] else "none" for row in rows]
         print_columns(columns, left=3 if self.long else 4)
         if self.long:
@@ -101,7 +109,9 @@ class Zoo:
         from mqe_jax.envs.registry import SHIPPED
         from mqe_jax.policies import zoo
 
-        tasks = [name for name in SHIPPED if name in zoo.names()] if self.task is None else [self.task]
+        tasks = (
+            [name for name in SHIPPED if name in zoo.names()] if self.task is None else [self.task]
+        )
         cards = {task: zoo.card(task) for task in tasks}
         plain = {task: _plain(card, zoo.load(task).needs) for task, card in cards.items()}
         if self.json:
@@ -115,7 +125,8 @@ class Zoo:
             listed = [task for task, card in cards.items() if rates.keys() <= card.results.keys()]
             columns = {"task": listed, "title": [SHIPPED[task].title for task in listed]}
             columns |= {
-                text: [cards[task].results[name].rate.percent for task in listed] for name, text in rates.items()
+                text: [cards[task].results[name].rate.percent for task in listed]
+                for name, text in rates.items()
             }
             print(f"{title}\n")
             print_columns(columns, left=2)
@@ -134,28 +145,49 @@ def _print_card(task: str, card: Any, plain: dict[str, Any], long: bool) -> None
         shown[name] = f"{found.rate}, {found.episodes} episodes{sides}"
     if long:
         episodes = card.results["success" if "success" in card.results else "win/scripted"].episodes
-        shown |= {f"ends by {name}": str(Rate.of(share, episodes)) for name, share in card.endings.items()}
+        shown |= {
+            f"ends by {name}": str(Rate.of(share, episodes)) for name, share in card.endings.items()
+        }
     ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in plain["commands"].items())
-    shown |= {"skill": f"{plain['skill']}: {', '.join(ranges)}", "trained": card.date, "command": card.command}
+    shown |= {
+        "skill": f"{plain['skill']}: {', '.join(ranges)}",
+        "trained": card.date,
+        "command": card.command,
+    }
     if long:
         minutes = "not recorded" if card.gpu_minutes is None else f"{card.gpu_minutes:g}"
-        shown |= {"note": card.note, "GPU minutes": minutes, "acts": card.mode, "task version": plain["version"]}
+        shown |= {
+            "note": card.note,
+            "GPU minutes": minutes,
+            "acts": card.mode,
+            "task version": plain["version"],
+        }
     for name, value in shown.items():
-        print(textwrap.fill(f"{name:<22} {value}", 80, subsequent_indent=" " * 23, break_on_hyphens=False))
+        print(
+            textwrap.fill(
+                f"{name:<22} {value}", 80, subsequent_indent=" " * 23, break_on_hyphens=False
+            )
+        )
 
 
 def _plain(card: Any, needs: Any) -> dict[str, Any]:
-    """Returns a policy's card for JSON, with what the policy needs and the interval of each rate."""
+    """Returns a policy's card for JSON, with what the policy needs and the interval of each
+    rate.
+    """
     from mqe_jax.core.settings import to_mapping
 
-    results = {name: {**to_mapping(found), **found.rate._asdict()} for name, found in card.results.items()}
+    results = {
+        name: {**to_mapping(found), **found.rate._asdict()} for name, found in card.results.items()
+    }
     about = {"version": needs.version, "skill": needs.skill, "commands": dict(needs.command_ranges)}
     return {**about, **to_mapping(card), "results": results}
 
 
 @settings_class
 class Eval(PolicyOptions):
-    """Evaluate a trained run, or a task's shipped or scripted policy, over complete episodes from fresh resets."""
+    """Evaluate a trained run, or a task's shipped or scripted policy, over complete episodes from
+    fresh resets.
+    """
 
     json: Json = False
     long: Long = False
@@ -164,11 +196,13 @@ class Eval(PolicyOptions):
     num_envs: Environments = 128
     """Number of parallel environments."""
     sides: Literal["both", "first"] = "first"
-    """Side of the policy in a match: the task's team 0 in all episodes (first), or in half of them (both)."""
+    """Side of the policy in a match: the task's team 0 in all episodes (first), or in half of them
+    (both)."""
     dump_diverged: DumpDiverged = None
     export: RobotFile = None
-    """Graph of one robot, in place of a policy; `mqe export` writes it with `--per-robot`. Each robot is a process that
-    has only this file and its own readings. The file determines whether actions are sampled."""
+    """Graph of one robot, in place of a policy; `mqe export` writes it with `--per-robot`. Each
+    robot is a process that has only this file and its own readings. The file determines whether
+    actions are sampled."""
     opponent_export: RobotFile = None
     """The same for the robots of the opponents."""
 
@@ -176,12 +210,18 @@ class Eval(PolicyOptions):
         """Evaluates a policy; prints a table, or returns the object for `--json`."""
         from mqe_jax.runs.playing import evaluate
 
-        options = {"episodes": self.episodes, "num_envs": self.num_envs, "sides": self.sides, "seed": self.seed}
+        options = {
+            "episodes": self.episodes,
+            "num_envs": self.num_envs,
+            "sides": self.sides,
+            "seed": self.seed,
+        }
         with self._robots() as robots:
             result = evaluate(**self.playing | robots, **options, dump_diverged=self.dump_diverged)
         if result.overflow:
             echo(
-                f"mqe: warning: the engine may have dropped contacts in {result.overflow} environment steps; "
+                f"mqe: warning: the engine may have dropped contacts in {result.overflow} "
+                "environment steps; "
                 "raise --set contacts_per_robot and --set constraints_per_robot"
             )
         if not self.json:
@@ -243,7 +283,10 @@ class Replay:
         }
         if self.output is not None:
             finite = np.all(np.isfinite(recorded.states["data/qpos"]), axis=1)
-            pose = (recorded.states[f"data/{name}"][finite] for name in ("qpos", "mocap_pos", "mocap_quat"))
+            pose = (
+                recorded.states[f"data/{name}"][finite]
+                for name in ("qpos", "mocap_pos", "mocap_quat")
+            )
             render.render_episode(env, recording.Episode(*pose, dt=env.dt), self.output)
             echo(f"mqe: wrote {self.output}")
         if not self.json:
@@ -253,7 +296,9 @@ class Replay:
 
 @settings_class
 class Bench(TaskOptions):
-    """Measure throughput in environment steps per second: of whole steps with skill and resets, and of physics only."""
+    """Measure throughput in environment steps per second: of whole steps with skill and resets, and
+    of physics only.
+    """
 
     task: tyro.conf.Positional[str] = "go1gate"
     """Id of the task."""
@@ -263,14 +308,17 @@ class Bench(TaskOptions):
     steps: Horizon = 50
     """Environment steps per timed call."""
     repeats: Horizon = 10
-    """Number of timed calls after five that warm up; their median, slowest and fastest are reported."""
+    """Number of timed calls after five that warm up; their median, slowest and fastest are
+    reported."""
     seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
         """Measures throughput; prints a table, or returns the object for `--json`."""
         from mqe_jax.runs.throughput import bench
 
-        options = {name: getattr(self, name) for name in ("impl", "num_envs", "steps", "repeats", "seed")}
+        options = {
+            name: getattr(self, name) for name in ("impl", "num_envs", "steps", "repeats", "seed")
+        }
         result = bench(self.task, env=self.overrides(), **options)
         if not self.json:
             print_table(result)
@@ -279,7 +327,9 @@ class Bench(TaskOptions):
 
 @settings_class
 class Demo:
-    """Train Narrow Gate from scratch on the CPU, evaluate before and after, write curve and video."""
+    """Train Narrow Gate from scratch on the CPU, evaluate before and after, write curve and
+    video.
+    """
 
     run_dir: Path = Path("runs/demo")
     """Run folder; an interrupted demo resumes from it."""

@@ -27,16 +27,24 @@ DEMO_TASK = "go1gate"
 
 
 def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
-    """Trains from scratch, evaluates before and after, writes curve and video; resumes an interrupted run."""
+    """Trains from scratch, evaluates before and after, writes curve and video; resumes an
+    interrupted run.
+    """
     began = time.perf_counter()
     config = for_task(base_config(DEMO_TASK, settings), DEMO_TASK)
     check_folder(run_dir)
     resume = (run_dir / CONFIG_FILE).exists()
-    _, batch = make_env(DEMO_TASK, impl, config.env, config.num_envs, final=config.network.critic_reads)
+    _, batch = make_env(
+        DEMO_TASK, impl, config.env, config.num_envs, final=config.network.critic_reads
+    )
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
     playing: dict[str, Any] = {"env": config.env, "impl": impl, "deterministic": True}
-    measure: dict[str, Any] = playing | {"episodes": episodes, "num_envs": config.num_envs, "seed": config.seed + 1000}
+    measure: dict[str, Any] = playing | {
+        "episodes": episodes,
+        "num_envs": config.num_envs,
+        "seed": config.seed + 1000,
+    }
 
     state = jax.jit(make_learner(batch, config).init)(initial_key(config))
     before = policy_of(state, batch, config)
@@ -50,24 +58,35 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     echo("mqe demo: evaluating the trained policy")
     table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
-    curves.save_figure(curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU"), run_dir / "curve.png")
+    curves.save_figure(
+        curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU"), run_dir / "curve.png"
+    )
     video = run_dir / "video.mp4"
     try:
         check_output(video)
     except InputError:
         video = run_dir / "video.gif"
     echo("mqe demo: rendering an episode")
-    render(DEMO_TASK, run.policy, **playing, seed=config.seed + 1, episodes=16, width=640).save(video)
+    render(DEMO_TASK, run.policy, **playing, seed=config.seed + 1, episodes=16, width=640).save(
+        video
+    )
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
-    print(f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, policy.safetensors")
+    print(
+        f"{run_dir}: {video.name}, curve.png, metrics.csv, evaluation.json, checkpoints/, "
+        "policy.safetensors"
+    )
     minutes = (time.perf_counter() - began) / 60
     print(f"took {minutes:.1f} minutes; evaluate it again with: mqe eval {run_dir} --deterministic")
 
 
 def _summary(result: Mapping[str, Any]) -> str:
     named = {"both robots through": "success_rate", "at least one": "success/one"}
-    rates = {text: Rate.of(result[name], result["episodes"]) for text, name in named.items() if name in result}
+    rates = {
+        text: Rate.of(result[name], result["episodes"])
+        for text, name in named.items()
+        if name in result
+    }
     parts = [f"{text} {rate}" for text, rate in rates.items()]
     parts.append(f"average step reward {result['average_step_reward']:.3f}")
     return f"{', '.join(parts)} ({result['episodes']} episodes)"

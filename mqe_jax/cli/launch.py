@@ -1,4 +1,6 @@
-"""The command `launch`: a training in several processes, one for each device of one or many hosts."""
+"""The command `launch`: a training in several processes, one for each device of one or many
+hosts.
+"""
 
 import os
 import re
@@ -49,26 +51,33 @@ _NOISE = re.compile(
     r"[IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo"
     r"|Additional GRPC error|:[A-Z_]+:|=== Source Location Trace|external/xla|\s*$"
 )
-"""Lines of JAX's coordination service and collectives; several of a lost connection if the training has ended."""
+"""Lines of JAX's coordination service and collectives; several of a lost connection if the training
+has ended."""
 
 
 @settings_class
 class Launch:
-    """Train in several processes, one per device, on one host or many: `mqe launch --processes 2 train go1gate`.
+    """Train in several processes, one per device, on one host or many: `mqe launch --processes 2
+    train go1gate`.
 
-    Flags of `launch` come before the command, which is train, skill train or sweep. A sweep's processes train different
-    cells. Started by SLURM's srun or Open MPI's mpirun, it needs no flags and is one process of the training.
+    Flags of `launch` come before the command, which is train, skill train or sweep. A sweep's
+    processes train different cells. Started by SLURM's srun or Open MPI's mpirun, it needs no flags
+    and is one process of the training.
     """
 
     processes: PositiveInt | None = None
     """Number of processes of this host."""
-    devices: Annotated[list[NonNegativeInt], tyro.conf.arg(metavar="INT ...")] = field(default_factory=list)
+    devices: Annotated[list[NonNegativeInt], tyro.conf.arg(metavar="INT ...")] = field(
+        default_factory=list
+    )
     """GPUs of this host, one per process. Default: the first ones."""
     command: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
     """Arguments of the command."""
 
     def run(self) -> None:
-        """Runs the processes of this host; SystemExit with the exit code of the first one that failed."""
+        """Runs the processes of this host; SystemExit with the exit code of the first one that
+        failed.
+        """
         if os.name != "posix":
             raise InputError(f"launch: {sys.platform} is not supported; it needs Linux or macOS")
         code = _supervise(self.command, self._members(), together=not self._sweeps)
@@ -89,7 +98,9 @@ class Launch:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        return [{**variables, MEMBER: f"{i}/{self.processes}@{port}"} for i, variables in enumerate(own)]
+        return [
+            {**variables, MEMBER: f"{i}/{self.processes}@{port}"} for i, variables in enumerate(own)
+        ]
 
     def _member_of_job(self) -> dict[str, str]:
         """Returns the variables of a process that srun or mpirun has started."""
@@ -100,10 +111,15 @@ class Launch:
             if not os.environ.get(name, "0").isdecimal():
                 fail(name, os.environ[name], "a number, which srun or mpirun sets")
         if self.devices:
-            fail("devices", ", ".join(map(str, self.devices)), "left out if srun or mpirun starts the processes")
+            fail(
+                "devices",
+                ", ".join(map(str, self.devices)),
+                "left out if srun or mpirun starts the processes",
+            )
         if not self._sweeps:
             return {MEMBER: AUTO}
-        index, visible = int(os.environ.get(names[1], "0")), os.environ.get(_DEVICES)
+        index = int(os.environ.get(names[1], "0"))
+        visible = os.environ.get(_DEVICES)
         if visible in _NO_DEVICES:
             return {MEMBER: ALONE}
         devices = _split(visible) or [str(index)]
@@ -139,7 +155,9 @@ def _split(visible: str | None) -> list[str]:
 
 
 def join() -> None:
-    """Joins the other processes of a training if `launch` started this one; InputError if they cannot be reached."""
+    """Joins the other processes of a training if `launch` started this one; InputError if they
+    cannot be reached.
+    """
     if MEMBER not in os.environ:
         return
     member = os.environ[MEMBER]
@@ -152,8 +170,11 @@ def join() -> None:
         return
     import jax
 
-    jax.config.update("jax_enable_preemption_service", False)  # it would replace the handler of SIGTERM
-    address, count, index = (f"127.0.0.1:{match[3]}", int(match[2]), int(match[1])) if match else _job()
+    # it would replace the handler of SIGTERM
+    jax.config.update("jax_enable_preemption_service", False)
+    address, count, index = (
+        (f"127.0.0.1:{match[3]}", int(match[2]), int(match[1])) if match else _job()
+    )
     own = address if match else None  # Otherwise JAX listens on all addresses of the machine.
     if index == 0:
         _check_free(own or f":{address.rpartition(':')[2]}", address)
@@ -164,13 +185,17 @@ def join() -> None:
     try:
         jax.distributed.initialize(address, count, index, coordinator_bind_address=own, **timeouts)
     except Exception as error:
-        raise InputError(f"coordinator: the other processes cannot be reached at {address} ({error})") from None
+        raise InputError(
+            f"coordinator: the other processes cannot be reached at {address} ({error})"
+        ) from None
     finally:
         alone.cancel()
 
 
 def _job() -> tuple[str, int, int]:
-    """Returns the address of process 0, the number of processes and this one's index, as SLURM or MPI tells JAX."""
+    """Returns the address of process 0, the number of processes and this one's index, as SLURM or
+    MPI tells JAX.
+    """
     from jax._src.clusters import ClusterEnv  # without a public name
 
     try:
@@ -178,14 +203,20 @@ def _job() -> tuple[str, int, int]:
         detect = ClusterEnv.auto_detect_unset_distributed_params
         address, count, index, _ = detect(known, None, None, None, None, int(LIMIT))
     except Exception as error:  # of variables that are not theirs
-        raise InputError(f"coordinator: variables of srun or mpirun cannot be read ({error})") from None
+        raise InputError(
+            f"coordinator: variables of srun or mpirun cannot be read ({error})"
+        ) from None
     if address is None or count is None or index is None:
-        raise InputError("coordinator: variables are missing that srun, or mpirun of Open MPI 4, sets")
+        raise InputError(
+            "coordinator: variables are missing that srun, or mpirun of Open MPI 4, sets"
+        )
     return address, count, index
 
 
 def _check_free(own: str, address: str) -> None:
-    """Raises an InputError if process 0 cannot listen at its address: JAX could end with SIGSEGV."""
+    """Raises an InputError if process 0 cannot listen at its address: JAX could end with
+    SIGSEGV.
+    """
     host, _, port = own.rpartition(":")
     both = not host and socket.has_dualstack_ipv6()
     family = socket.AF_INET6 if both else socket.AF_INET
@@ -199,7 +230,8 @@ def _check_free(own: str, address: str) -> None:
 def _end_alone(address: str) -> None:
     """Ends this process, which JAX keeps waiting for others."""
     print(
-        f"mqe: coordinator: the other processes did not come to {address} within {LIMIT:g} s; start all of them, "
+        f"mqe: coordinator: the other processes did not come to {address} within {LIMIT:g} s; "
+        "start all of them, "
         f"and if another program uses the port: {_PORT}",
         file=sys.stderr,
         flush=True,
@@ -215,11 +247,18 @@ def _end_with_parent() -> None:
 
 
 class _Process:
-    """A process of the training; its standard error is shown for the first of its host, without JAX's noise."""
+    """A process of the training; its standard error is shown for the first of its host, without
+    JAX's noise.
+    """
 
-    def __init__(self, command: Sequence[str], variables: Mapping[str, str], prefix: str, shown: bool) -> None:
-        self.peer, self.last, self.muted = False, "", False
-        self._prefix, self._shown = prefix, shown
+    def __init__(
+        self, command: Sequence[str], variables: Mapping[str, str], prefix: str, shown: bool
+    ) -> None:
+        self.peer = False
+        self.last = ""
+        self.muted = False
+        self._prefix = prefix
+        self._shown = shown
         self.popen = subprocess.Popen(
             [*PROGRAM, *command],
             env={**os.environ, **variables},
@@ -256,12 +295,19 @@ class _Process:
         if self.peer:
             return f"mqe: {PEER_ENDED}; {resume}"
         if code < 0:
-            return f"mqe: a process of the training was killed by {signal.Signals(-code).name}; {resume}"
+            return (
+                f"mqe: a process of the training was killed by {signal.Signals(-code).name}; "
+                f"{resume}"
+            )
         return "" if self._shown else self.last
 
 
-def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, together: bool) -> int:
-    """Runs the processes of this host, which end when one fails if they are `together`; returns the exit code."""
+def _supervise(
+    command: Sequence[str], members: Sequence[Mapping[str, str]], *, together: bool
+) -> int:
+    """Runs the processes of this host, which end when one fails if they are `together`; returns the
+    exit code.
+    """
     processes: list[_Process] = []
 
     with interrupts.defer() as signalled:
@@ -289,14 +335,19 @@ def _supervise(command: Sequence[str], members: Sequence[Mapping[str, str]], *, 
 
 
 def _wait(processes: Sequence[_Process], pause: Callable[[], None]) -> int:
-    """Waits until all processes have ended, or the others `_GRACE` after one that failed; returns the exit code."""
-    failed, since = None, 0.0
+    """Waits until all processes have ended, or the others `_GRACE` after one that failed; returns
+    the exit code.
+    """
+    failed = None
+    since = 0.0
     while any(process.popen.poll() is None for process in processes):
         if failed is None and (failed := _cause(processes)):
             since = time.monotonic()
             for process in processes:
                 process.muted |= failed.popen.returncode < 0
-        if failed is not None and (failed.popen.returncode < 0 or time.monotonic() - since > _GRACE):
+        if failed is not None and (
+            failed.popen.returncode < 0 or time.monotonic() - since > _GRACE
+        ):
             break
         pause()
     failed = failed or _cause(processes)
@@ -310,7 +361,9 @@ def _wait(processes: Sequence[_Process], pause: Callable[[], None]) -> int:
 
 
 def _cause(processes: Sequence[_Process]) -> _Process | None:
-    """Returns the process that has failed, if any; of several, the one whose end has ended the others."""
+    """Returns the process that has failed, if any; of several, the one whose end has ended the
+    others.
+    """
     ended = [process for process in processes if process.popen.poll()]
     for process in ended:
         process.read()

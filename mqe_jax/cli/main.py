@@ -24,8 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     | 2 | bad input (InputError), or a file that cannot be read or written (OSError) |
     | 130, 143 | SIGINT (Ctrl-C), SIGTERM; for a program only (`arguments` is None) |
 
-    Each failure prints one line on standard error, wrong arguments tyro's message. Any other exception is a defect and
-    keeps its traceback. After a signal a training finishes its update; everything else ends at once.
+    Each failure prints one line on standard error, wrong arguments tyro's message. Any other
+    exception is a defect and keeps its traceback. After a signal a training finishes its update;
+    everything else ends at once.
     """
     if arguments is None:
         interrupts.install()
@@ -45,7 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
-    """Runs a command; returns the exit code, and the message for standard error or an empty string."""
+    """Runs a command; returns the exit code, and the message for standard error or an empty
+    string.
+    """
     # Imported after `interrupts.install`.
     import mqe_jax
     from mqe_jax.cli.arguments import FIRST_STEPS, parse
@@ -80,15 +83,25 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         return 1, one_line(error)
     except ValueError as error:
         if variable := _jax_variable(error):
-            return 2, f"{variable}: {short_repr(os.environ[variable])} is not allowed; JAX says: {one_line(error)}"
+            return (
+                2,
+                f"{variable}: {short_repr(os.environ[variable])} is not allowed; JAX says: "
+                f"{one_line(error)}",
+            )
         raise
     return 0, ""
 
 
 def _jax_variable(error: ValueError) -> str:
-    """Returns the environment variable whose value JAX rejects when it is imported; empty for another error."""
-    importing, message = "jax" not in sys.modules, str(error).upper()
-    return next((name for name in os.environ if importing and name.startswith("JAX_") and name in message), "")
+    """Returns the environment variable whose value JAX rejects when it is imported; empty for
+    another error.
+    """
+    importing = "jax" not in sys.modules
+    message = str(error).upper()
+    return next(
+        (name for name in os.environ if importing and name.startswith("JAX_") and name in message),
+        "",
+    )
 
 
 def _run(command: Any) -> None:

@@ -1,4 +1,6 @@
-"""The start of a command, and compiled programs that JAX stores: their folder, and a check that each file is whole."""
+"""The start of a command, and compiled programs that JAX stores: their folder, and a check that
+each file is whole.
+"""
 
 import contextlib
 import gc
@@ -13,7 +15,9 @@ from mqe_jax.core.errors import InputError
 
 
 def hasten() -> None:
-    """Makes the start of a command faster: fewer searches for garbage, and none for plug-ins of pydantic."""
+    """Makes the start of a command faster: fewer searches for garbage, and none for plug-ins of
+    pydantic.
+    """
     gc.set_threshold(50_000, 20, 100)
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
@@ -34,14 +38,23 @@ def import_mujoco() -> None:
 
 
 def keep() -> None:
-    """Has JAX store compiled programs in the user's cache folder, by kind of processor, unless its variable is set."""
+    """Has JAX store compiled programs in the user's cache folder, by kind of processor, unless its
+    variable is set.
+    """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     from mqe_jax.core.files import user_cache
 
-    with contextlib.suppress(OSError, InputError):  # without a home, or one that cannot be written, nothing is stored
-        lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
-        flags = next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
+    # without a home, or one that cannot be written, nothing is stored
+    with contextlib.suppress(OSError, InputError):
+        lines = (
+            Path("/proc/cpuinfo").read_text().splitlines()
+            if Path("/proc/cpuinfo").is_file()
+            else []
+        )
+        flags = next(
+            (line for line in lines if line.startswith(("flags", "Features"))), platform.machine()
+        )
         folder = user_cache() / f"programs-{zlib.crc32(flags.encode()):08x}"
         folder.mkdir(parents=True, exist_ok=True)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
@@ -51,12 +64,14 @@ def keep() -> None:
 def write_whole() -> None:
     """Has JAX write the files of compiled programs atomically.
 
-    JAX itself writes them in place and never replaces one. A file cut off by a kill or a full disk would be read in
-    vain at every later start, with a warning, and its program compiled anew. Imports JAX.
+    JAX itself writes them in place and never replaces one. A file cut off by a kill or a full disk
+    would be read in vain at every later start, with a warning, and its program compiled anew.
+    Imports JAX.
     """
     from mqe_jax.core.files import write_atomically
 
-    with contextlib.suppress(ImportError, AttributeError):  # a private class; another JAX writes as it does
+    # a private class; another JAX writes as it does
+    with contextlib.suppress(ImportError, AttributeError):
         from jax._src.lru_cache import LRUCache
 
         original = LRUCache.put

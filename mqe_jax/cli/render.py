@@ -28,8 +28,9 @@ class Render(PolicyOptions):
     fps: Annotated[FrameRate | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Frames per second. Default: 25 for .mp4, 12.5 for .webp and .gif."""
     view: Literal["follow", "near", "scene", "side"] | None = None
-    """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene (fixed, whole scene),
-    side (tracks the first robot). Default: follow for a clip, scene for an image."""
+    """Camera: follow (tracks robots and objects), near (fixed, frames their trajectories), scene
+    (fixed, whole scene), side (tracks the first robot). Default: follow for a clip, scene for an
+    image."""
     speed: Speed = 1.0
     """Playback speed of a clip; 0.5 is slow motion."""
     at: Annotated[Time | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -43,7 +44,10 @@ class Render(PolicyOptions):
         from mqe_jax.viz.clips import check_output
 
         check_output(self.output, fps=self.fps, speed=self.speed, at=self.at)
-        look = {name: getattr(self, name) for name in ("seed", "seconds", "view", "width", "fps", "speed", "sensors")}
+        look = {
+            name: getattr(self, name)
+            for name in ("seed", "seconds", "view", "width", "fps", "speed", "sensors")
+        }
         clip = render(**self.playing, episodes=self.best_of, **look)
         renderer = clip.save(self.output, at=self.at)
         echo(f"mqe: wrote {self.output} ({renderer})")
@@ -55,4 +59,10 @@ class Render(PolicyOptions):
             }
             for episode in clip.episodes
         ]
-        return {"task": clip.env.name, **clip.about, "renderer": renderer, "rendered": clip.best, "episodes": episodes}
+        return {
+            "task": clip.env.name,
+            **clip.about,
+            "renderer": renderer,
+            "rendered": clip.best,
+            "episodes": episodes,
+        }

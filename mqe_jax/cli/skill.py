@@ -26,7 +26,9 @@ class SkillEval:
     json: Json = False
     episodes: Environments = 1000
     """Number of episodes per scenario, run in parallel."""
-    scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(default_factory=list)
+    scenario: Annotated[list[str], Repeated, tyro.conf.arg(metavar="NAME")] = field(
+        default_factory=list
+    )
     """Scenario, such as flat, pushes or slope_up; may be repeated. Default: all."""
     impl: Impl = "auto"
     robot: Robot = "go1"
@@ -37,10 +39,15 @@ class SkillEval:
         from mqe_jax.walk.evaluation import evaluate_skill
 
         def report(name: str, figures: Mapping[str, float]) -> None:
-            echo(f"{self.skill}: {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in figures.items()))
+            echo(
+                f"{self.skill}: {name}: "
+                + ", ".join(f"{key} {value:.3g}" for key, value in figures.items())
+            )
 
         options = {name: getattr(self, name) for name in ("robot", "impl", "episodes", "seed")}
-        result = evaluate_skill(self.skill, self.weights, **options, scenarios=self.scenario or None, report=report)
+        result = evaluate_skill(
+            self.skill, self.weights, **options, scenarios=self.scenario or None, report=report
+        )
         if not self.json:
             print_table({name: value for name, value in result.items() if name != "scenarios"})
         return result
@@ -59,7 +66,8 @@ class SkillConvert:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """Weights to write (.safetensors)."""
     float16: bool = False
-    """Round the weights to float16, half the size; they then act slightly differently. Default: float32."""
+    """Round the weights to float16, half the size; they then act slightly differently. Default:
+    float32."""
     robot: Robot = "go1"
 
     def run(self) -> None:
@@ -70,7 +78,9 @@ class SkillConvert:
         from mqe_jax.walk.torchscript import convert
 
         if self.output.suffix != ".safetensors":
-            raise InputError(f"output: {str(self.output)!r} is not allowed; it must end in .safetensors")
+            raise InputError(
+                f"output: {str(self.output)!r} is not allowed; it must end in .safetensors"
+            )
         check_output(self.output)
         for path in (self.adaptation, self.body):
             if not path.is_file():

@@ -22,14 +22,19 @@ from mqe_jax.walk.training import SETTINGS, train_skill
 class SkillTrain:
     """Train a skill's weights, from scratch or from other weights (GPU)."""
 
-    skill: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SKILL"), pydantic.SkipValidation()]  # pyright: ignore[reportCallIssue]
+    skill: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="SKILL"),
+        pydantic.SkipValidation(),  # pyright: ignore[reportCallIssue]
+    ]
     """Name of the skill: walk or agile."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """Settings of the training."""
     task: WalkTask = WalkTask()
     """Parameters of the walking task."""
     run_dir: Path | None = None
-    """Run folder: SKILL.safetensors (rounded to float16), metrics.csv, checkpoints. Default: runs/SKILL."""
+    """Run folder: SKILL.safetensors (rounded to float16), metrics.csv, checkpoints. Default:
+    runs/SKILL."""
     resume: bool = False
     """Continue from the newest checkpoint in the run folder, with environments reset."""
     weights: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -50,13 +55,20 @@ class SkillTrain:
 
 
 def parse_skill_train(arguments: Sequence[str]) -> SkillTrain:
-    """Parses the arguments of `mqe skill train`: the skill, which decides the flags' defaults, comes first.
+    """Parses the arguments of `mqe skill train`: the skill, which decides the flags' defaults,
+    comes first.
 
     InputError for a skill that cannot be trained; SystemExit as of `parse_train`.
     """
     name = next(iter(arguments), "")
     if name not in SETTINGS and not {"-h", "--help"}.intersection(arguments):
-        fail("skill", name, f"{' or '.join(SETTINGS)}, before all flags: mqe skill train agile --robot go2")
+        fail(
+            "skill",
+            name,
+            f"{' or '.join(SETTINGS)}, before all flags: mqe skill train agile --robot go2",
+        )
     settings, task = SETTINGS.get(name, SETTINGS["walk"])
     default = SkillTrain(skill=tyro.MISSING, settings=settings, task=task)
-    return tyro.cli(SkillTrain, prog="mqe skill train", args=list(arguments), default=default, config=MARKERS)
+    return tyro.cli(
+        SkillTrain, prog="mqe skill train", args=list(arguments), default=default, config=MARKERS
+    )

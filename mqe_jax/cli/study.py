@@ -17,7 +17,9 @@ from mqe_jax.core.settings import settings_class
 
 @settings_class
 class SweepCommand:
-    """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes interrupted runs."""
+    """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes
+    interrupted runs.
+    """
 
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/sweeps.md)."""
@@ -26,10 +28,14 @@ class SweepCommand:
     """Name of one sweep in a file that maps names to sweeps."""
     folder: Path | None = None
     """Folder of the sweep. Default: runs/PART, or runs/NAME of the file."""
-    cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(default_factory=list)
-    """Train only these cells: TASK/ALGORITHM, in a sweep with variants TASK/ALGORITHM+VARIANT, in a part that measures
-    TASK/VARIANT. May be a pattern such as '*/mat'; may be repeated."""
-    seeds: Annotated[list[int], Repeated, tyro.conf.arg(metavar="SEED")] = field(default_factory=list)
+    cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(
+        default_factory=list
+    )
+    """Train only these cells: TASK/ALGORITHM, in a sweep with variants TASK/ALGORITHM+VARIANT, in a
+    part that measures TASK/VARIANT. May be a pattern such as '*/mat'; may be repeated."""
+    seeds: Annotated[list[int], Repeated, tyro.conf.arg(metavar="SEED")] = field(
+        default_factory=list
+    )
     """Train only these seeds; may be repeated."""
     time_limit: Annotated[Positive | None, tyro.conf.arg(metavar="MINUTES")] = None
     """Save the run in training after this time, min, and end; the same command resumes it."""
@@ -42,12 +48,18 @@ class SweepCommand:
         from mqe_jax.runs.sweeping import sweep
 
         folder = self.folder or Path("runs") / (self.part or self.file.stem)
-        options = {name: getattr(self, name) for name in ("part", "cells", "seeds", "time_limit", "impl", "dry_run")}
+        options = {
+            name: getattr(self, name)
+            for name in ("part", "cells", "seeds", "time_limit", "impl", "dry_run")
+        }
         try:
             result = sweep(self.file, folder, **options)
         except KeyboardInterrupt:
             part = [] if self.part is None else ["--part", self.part]
-            chosen = [*(f"--cells={cell}" for cell in self.cells), *(f"--seeds={seed}" for seed in self.seeds)]
+            chosen = [
+                *(f"--cells={cell}" for cell in self.cells),
+                *(f"--seeds={seed}" for seed in self.seeds),
+            ]
             words = ["mqe", "sweep", str(self.file), *part, "--folder", str(folder), *chosen]
             raise interrupts.Interrupted(f"resume with: {shlex.join(words)}") from None
         if self.dry_run and not self.json:
@@ -78,14 +90,20 @@ class Report:
 
 @settings_class
 class Tournament(TaskOptions):
-    """Play policies against each other and rate them, or as mates in a cooperative task: tables, CSV and picture."""
+    """Play policies against each other and rate them, or as mates in a cooperative task: tables,
+    CSV and picture.
+    """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """Id of a task, such as go1wrestling or go1gate."""
-    policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME|RUN|FILE")]
-    """Policies. Scripted, idle and (in a match) random play too. Ratings are relative to scripted, or idle without
-    it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("runs/tournament")
+    policies: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME|RUN|FILE")
+    ]
+    """Policies. Scripted, idle and (in a match) random play too. Ratings are relative to scripted,
+    or idle without it."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path(
+        "runs/tournament"
+    )
     """Folder of tournament.csv, tournament.png and, of a match, policies.csv."""
     episodes: Candidates = 64
     """Episodes of each pair on each side, or of each mixed team."""
@@ -101,7 +119,9 @@ class Tournament(TaskOptions):
 
         for name in (CSV, POLICIES, PICTURE):
             check_output(self.output / name)
-        options = {name: getattr(self, name) for name in ("impl", "episodes", "deterministic", "seed")}
+        options = {
+            name: getattr(self, name) for name in ("impl", "episodes", "deterministic", "seed")
+        }
         played = tournament(self.task, self.policies, env=self.overrides(), **options)
         played.save(self.output)
         echo(f"mqe: wrote {self.output / CSV} and {PICTURE}")
@@ -111,8 +131,14 @@ class Tournament(TaskOptions):
 
 
 def _print(result: dict[str, Any]) -> None:
-    for row in [*result["jobs"], {"task": "all", "steps_left": result["steps_left"], "seconds": result["seconds"]}]:
+    for row in [
+        *result["jobs"],
+        {"task": "all", "steps_left": result["steps_left"], "seconds": result["seconds"]},
+    ]:
         name = " ".join(str(row[key]) for key in ("task", "algorithm", "variant") if key in row)
         seeds = " ".join(map(str, row.get("seeds", [])))
         time = "time unknown" if row["seconds"] is None else f"{row['seconds'] / 3600:.2f} h"
-        print(f"{name:<45} {f'seeds {seeds}' if seeds else '':<20} {row['steps_left'] / 1e6:>9.3g} M steps  {time}")
+        print(
+            f"{name:<45} {f'seeds {seeds}' if seeds else '':<20} {row['steps_left'] / 1e6:>9.3g} "
+            f"M steps  {time}"
+        )

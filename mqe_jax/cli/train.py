@@ -28,9 +28,9 @@ class Source:
     """Where the settings come from that flags then change."""
 
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
-    """YAML file of settings (missing ones have the defaults of `TrainConfig`), or the name of a shipped one: demo,
-    league, sizes, tuned/TASK, paper/ALGORITHM. Default: with --algorithm, the paper's settings; else the task's tuned
-    ones, else league (a match) or the paper's MAPPO."""
+    """YAML file of settings (missing ones have the defaults of `TrainConfig`), or the name of a
+    shipped one: demo, league, sizes, tuned/TASK, paper/ALGORITHM. Default: with --algorithm, the
+    paper's settings; else the task's tuned ones, else league (a match) or the paper's MAPPO."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
 
@@ -47,11 +47,16 @@ class Network:
 class Train(TaskOptions):
     """Train a policy on a task, into a run folder.
 
-    Settings are those of a configuration file, changed by the flags below, which show the file's values as defaults.
+    Settings are those of a configuration file, changed by the flags below, which show the file's
+    values as defaults.
     """
 
     # `parse_train` fills the settings with tyro.MISSING here.
-    target: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK"), pydantic.SkipValidation()]  # pyright: ignore[reportCallIssue]
+    target: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="TASK"),
+        pydantic.SkipValidation(),  # pyright: ignore[reportCallIssue]
+    ]
     """Id of the task, such as go1gate (see `mqe tasks`)."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """Settings of the training."""
@@ -60,10 +65,11 @@ class Train(TaskOptions):
     run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Run folder. Default: runs/TASK."""
     resume: bool = False
-    """Continue exactly from the newest checkpoint, with the same settings; without a run in the folder, start one."""
+    """Continue exactly from the newest checkpoint, with the same settings; without a run in the
+    folder, start one."""
     num_seeds: SeedCount = 1
-    """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0, seed1, ... below
-    --run-dir."""
+    """Number of consecutive seeds to train at once, starting at --seed, into run folders seed0,
+    seed1, ... below --run-dir."""
     dump_diverged: DumpDiverged = None
 
     def run(self) -> None:
@@ -73,11 +79,17 @@ class Train(TaskOptions):
         from mqe_jax.runs.learning import learn, learn_seeds
         from mqe_jax.viz import curves
 
-        run_dir, seed = self.run_dir or Path("runs") / self.target, self.settings.seed
-        options: dict[str, Any] = {"env": self.overrides(), "impl": self.impl, "resume": self.resume}
+        run_dir = self.run_dir or Path("runs") / self.target
+        seed = self.settings.seed
+        options: dict[str, Any] = {
+            "env": self.overrides(),
+            "impl": self.impl,
+            "resume": self.resume,
+        }
         options |= {"run_dir": run_dir, "dump_diverged": self.dump_diverged}
         if self.num_seeds == 1:
-            folders, runs = [run_dir], [learn(self.target, self.settings, **options)]
+            folders = [run_dir]
+            runs = [learn(self.target, self.settings, **options)]
         else:
             seeds = range(seed, seed + self.num_seeds)
             folders = [run_dir / f"seed{number}" for number in seeds]
@@ -86,29 +98,38 @@ class Train(TaskOptions):
             raise interrupts.Interrupted(HINT.format(run_dir))
         if jax.process_index() > 0:  # one process writes the files
             return
-        curves.save_figure(curves.plot_curves([run.metrics for run in runs], self.target), run_dir / "curve.png")
+        curves.save_figure(
+            curves.plot_curves([run.metrics for run in runs], self.target), run_dir / "curve.png"
+        )
         for folder in folders:
             echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
         echo(f"mqe: {run_dir / 'curve.png'} has the curve")
 
 
 def parse_train(arguments: Sequence[str]) -> Train:
-    """Parses the arguments of `mqe train`; settings' file, algorithm, network and sensors decide the flags' defaults.
+    """Parses the arguments of `mqe train`; settings' file, algorithm, network and sensors decide
+    the flags' defaults.
 
-    InputError without a task in front, or for a file, an algorithm or a network that is not allowed; SystemExit as of
-    `mqe_jax.cli.arguments.parse`.
+    InputError without a task in front, or for a file, an algorithm or a network that is not
+    allowed; SystemExit as of `mqe_jax.cli.arguments.parse`.
     """
-    task, helps = next(iter(arguments), ""), {"-h", "--help"}.intersection(arguments)
+    task = next(iter(arguments), "")
+    helps = {"-h", "--help"}.intersection(arguments)
     if not helps and (not task or task.startswith("-")):
-        raise InputError(f"task: is missing; it comes first: mqe train TASK {' '.join(arguments)}".rstrip())
-    source, others = tyro.cli(Source, args=list(arguments), add_help=False, return_unknown_args=True)
+        raise InputError(
+            f"task: is missing; it comes first: mqe train TASK {' '.join(arguments)}".rstrip()
+        )
+    source, others = tyro.cli(
+        Source, args=list(arguments), add_help=False, return_unknown_args=True
+    )
     network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
     given, others = tyro.cli(TaskOptions, args=others, add_help=False, return_unknown_args=True)
     settings = base_config(task, source.config, source.algorithm, given.overrides())
     if network.name is not None and network.name != settings.network.name:
         settings = override(settings, {"network": {"name": network.name}})
     for flag, name in {"--opponent": "opponents", "--mate": "mates"}.items():
-        if any(word.split("=")[0] == flag for word in others):  # tyro would append to those of the file
+        # tyro would append to those of the file
+        if any(word.split("=")[0] == flag for word in others):
             settings = override(settings, {name: ()})
     default = Train(target=tyro.MISSING, settings=settings, source=source)
     return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=MARKERS)

@@ -20,21 +20,27 @@ _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 @settings_class
 class View(PolicyOptions):
-    """Show a task or a trained run in the browser, with teleoperation and live plots; the page can choose others."""
+    """Show a task or a trained run in the browser, with teleoperation and live plots; the page can
+    choose others.
+    """
 
     num_envs: Annotated[int, Ge(1), Le(16)] = 1
     """Number of environments, side by side: 1 to 16."""
     sensors: bool = False
-    """Draw what a robot's sensors of the parameter senses measure, else those of its set onboard."""
+    """Draw what a robot's sensors of the parameter senses measure, else those of its set
+    onboard."""
     host: str = "127.0.0.1"
-    """Address or name to listen on; the default is reachable from this machine only. There is no authentication."""
+    """Address or name to listen on; the default is reachable from this machine only. There is no
+    authentication."""
     port: Port = 8080
     """Port to listen on, or the next free one if it is in use."""
 
     def run(self) -> None:
         """Shows a task in the browser until Ctrl-C."""
         if importlib.util.find_spec("viser") is None or importlib.util.find_spec("mjviser") is None:
-            raise InputError("view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')")
+            raise InputError(
+                "view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')"
+            )
         _check_address(self.host, self.port)
         from mqe_jax.envs import ALIASES
         from mqe_jax.runs.build import players
@@ -45,10 +51,14 @@ class View(PolicyOptions):
         shown: Any = {"num_envs": self.num_envs, "sensors": self.sensors}
 
         def open_choice(choice: Entry) -> Session:
-            """Creates another session, with the task's default parameters; a run has its own ones."""
+            """Creates another session, with the task's default parameters; a run has its own
+            ones.
+            """
             names = [None if name == DEFAULT else name for name in (choice.policy, choice.opponent)]
             target = choice.policy if choice.policy in runs else choice.task
-            options = dataclasses.replace(self, target=target, policy=names[0], opponent=names[1], set=[])
+            options = dataclasses.replace(
+                self, target=target, policy=names[0], opponent=names[1], set=[]
+            )
             return Session(*players(**options.playing, **shown)[:3], self.seed)
 
         env, vector_env, policy, _ = players(**self.playing, **shown)
@@ -58,20 +68,30 @@ class View(PolicyOptions):
         viewer = Viewer(self.host, self.port, menu)
         viewer.announce(env, self.num_envs)
         if self.host not in _LOCAL:
-            echo(f"mqe: warning: every machine that reaches {self.host} can open this page and control the robots")
+            echo(
+                f"mqe: warning: every machine that reaches {self.host} can open this page and "
+                "control the robots"
+            )
         echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")
         viewer.run(lambda: Session(env, vector_env, policy, self.seed))
 
 
 def _check_address(host: str, port: int) -> None:
-    """Raises an InputError for a host that is not this machine, on which viser would wait without an end.
+    """Raises an InputError for a host that is not this machine, on which viser would wait without
+    an end.
 
     A port in use is no error: viser takes the next one.
     """
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )[0]
         with socket.socket(family, kind, protocol) as server:
             server.bind(address)
     except (OSError, UnicodeError) as error:
         if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
-            fail("host", host, f"an address of this machine ({getattr(error, 'strerror', None) or error})")
+            fail(
+                "host",
+                host,
+                f"an address of this machine ({getattr(error, 'strerror', None) or error})",
+            )

@@ -1,7 +1,9 @@
-"""One training in several processes of `jax.distributed`, each with one device and a share of the environments.
+"""One training in several processes of `jax.distributed`, each with one device and a share of the
+environments.
 
-The learner runs in each of them under `jax.shard_map` over the axis `AXIS`. The functions of this module then span all
-processes; anywhere else they are those of a single process: means are the identity, and rows are all rows.
+The learner runs in each of them under `jax.shard_map` over the axis `AXIS`. The functions of this
+module then span all processes; anywhere else they are those of a single process: means are the
+identity, and rows are all rows.
 """
 
 import contextlib
@@ -49,7 +51,9 @@ def size() -> int:
 
 
 def total(tree: PyTree) -> PyTree:
-    """Returns the sums over processes of the leaves of a pytree of one dtype, by a single collective."""
+    """Returns the sums over processes of the leaves of a pytree of one dtype, by a single
+    collective.
+    """
     if size() == 1:
         return tree
     flat, restore = ravel_pytree(tree)
@@ -62,7 +66,9 @@ def mean(tree: PyTree) -> PyTree:
 
 
 def mean_where(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Array:
-    """Returns the mean of the elements whose mask (same shape) is true, over an axis and processes; 0 without any."""
+    """Returns the mean of the elements whose mask (same shape) is true, over an axis and processes;
+    0 without any.
+    """
     count = jnp.maximum(total(jnp.sum(mask.astype(jnp.float32), axis)), 1.0)
     return total(jnp.sum(jnp.where(mask, x, 0.0), axis)) / count
 
@@ -78,17 +84,22 @@ def variance(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Arra
 
 
 def rows(draw: Callable[[int], jax.Array], count: int) -> jax.Array:
-    """Returns this process's `count` rows of `draw(n)`, which returns those of all processes (n, ...).
+    """Returns this process's `count` rows of `draw(n)`, which returns those of all processes (n,
+    ...).
 
     Random numbers drawn so belong to an environment, wherever it is.
     """
     if size() == 1:
         return draw(count)
-    return jax.lax.dynamic_slice_in_dim(draw(count * size()), jax.lax.axis_index(AXIS) * count, count)
+    return jax.lax.dynamic_slice_in_dim(
+        draw(count * size()), jax.lax.axis_index(AXIS) * count, count
+    )
 
 
 def normal(key: jax.Array, shape: Sequence[int], dtype: Any) -> jax.Array:
-    """Returns normal random numbers of a shape whose leading axis has an environment in each row; see `rows`."""
+    """Returns normal random numbers of a shape whose leading axis has an environment in each row;
+    see `rows`.
+    """
     return rows(lambda n: jax.random.normal(key, (n, *shape[1:]), dtype), shape[0])
 
 
@@ -104,27 +115,36 @@ def alone() -> Iterator[None]:
 
 @contextlib.contextmanager
 def translate_errors() -> Iterator[None]:
-    """Turns JAX's error of a collective, if another process has ended, into a ConnectionError of one line."""
+    """Turns JAX's error of a collective, if another process has ended, into a ConnectionError of
+    one line.
+    """
     try:
         yield
-    except (jax.errors.JaxRuntimeError, ValueError) as error:  # either, by where the collective was called
+    # either, by where the collective was called
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
         if isinstance(error, InputError) or jax.process_count() == 1 or not PEER.search(str(error)):
             raise
         raise ConnectionError(f"{PEER_ENDED}; the same command with --resume continues") from None
 
 
 def share(name: str, count: int, parts: int) -> int:
-    """Returns a process's share of `count` environments; raises an InputError, naming the setting, for a fraction."""
+    """Returns a process's share of `count` environments; raises an InputError, naming the setting,
+    for a fraction.
+    """
     if count % check("parts", parts, PositiveInt):
-        raise InputError(f"{name}: {count} is not allowed; it must be a multiple of the number of processes, {parts}")
+        raise InputError(
+            f"{name}: {count} is not allowed; it must be a multiple of the number of processes, "
+            f"{parts}"
+        )
     return count // parts
 
 
 class Processes:
     """The processes of `jax.distributed` as those of a training; without it, this process alone.
 
-    The learner state is in arrays that span all processes. Each process has its part of it: rows of the arrays that are
-    split, and copies of all others. `own` and `together` convert; a conversion takes about 30 us per array.
+    The learner state is in arrays that span all processes. Each process has its part of it: rows of
+    the arrays that are split, and copies of all others. `own` and `together` convert; a conversion
+    takes about 30 us per array.
     """
 
     count: int  # number of processes
@@ -132,22 +152,35 @@ class Processes:
     whole: PyTree  # shapes of the state of all environments
 
     def __init__(self, own: PyTree, whole: PyTree) -> None:
-        """Takes the shapes of a process's part of the state and of the state of all environments."""
-        self.count, self.leads, self.whole = jax.process_count(), jax.process_index() == 0, whole
+        """Takes the shapes of a process's part of the state and of the state of all
+        environments.
+        """
+        self.count = jax.process_count()
+        self.leads = jax.process_index() == 0
+        self.whole = whole
         if self.count > 1 and jax.local_device_count() > 1:
-            raise InputError(f"processes: one has {jax.local_device_count()} devices; it must have one")
+            raise InputError(
+                f"processes: one has {jax.local_device_count()} devices; it must have one"
+            )
         self._mesh = Mesh(np.array(jax.devices()[: self.count]), (AXIS,))
         self._specs = jax.tree.map(self._spec, own, whole)
 
     def stack(self, shared: PyTree) -> "Processes":
-        """Returns those of several states, with a leading axis on all leaves but the shared ones (`SeedBatch`)."""
+        """Returns those of several states, with a leading axis on all leaves but the shared ones
+        (`SeedBatch`).
+        """
         other = object.__new__(Processes)
         vars(other).update(vars(self))
-        stack = lambda once, spec: spec if once else PartitionSpec(None, *spec)  # noqa: E731
+
+        def stack(once, spec):
+            return spec if once else PartitionSpec(None, *spec)
+
         other._specs = jax.tree.map(stack, shared, self._specs)
         return other
 
-    def compile(self, function: Callable[..., Any], *, start: bool = False, more: bool = False) -> jax.stages.Wrapped:
+    def compile(
+        self, function: Callable[..., Any], *, start: bool = False, more: bool = False
+    ) -> jax.stages.Wrapped:
         """Returns a compiled function of the state, to be called by all processes.
 
         Args:
@@ -157,9 +190,14 @@ class Processes:
         """
         if self.count == 1:
             return jax.jit(function)
-        given, result = _WHOLE if start else self._specs, (self._specs, _WHOLE) if more else self._specs
+        given = _WHOLE if start else self._specs
+        result = (self._specs, _WHOLE) if more else self._specs
         inner = _own_empty(function)
-        return jax.jit(jax.shard_map(inner, mesh=self._mesh, in_specs=(given,), out_specs=result, check_vma=False))
+        return jax.jit(
+            jax.shard_map(
+                inner, mesh=self._mesh, in_specs=(given,), out_specs=result, check_vma=False
+            )
+        )
 
     def own(self, state: PyTree) -> PyTree:
         """Returns this process's part of the state, as local arrays."""
@@ -189,11 +227,14 @@ class Processes:
         return own[None] if self.count == 1 else multihost_utils.process_allgather(own)
 
     def check_equal(self, checked: object) -> None:
-        """Raises an InputError unless the text of an object is that of all processes; called by all of them."""
+        """Raises an InputError unless the text of an object is that of all processes; called by all
+        of them.
+        """
         sums = self.gather([zlib.crc32(repr(checked).encode()) >> 1])  # 31 bits
         if np.any(sums != sums[0]):
             raise InputError(
-                "run_dir: processes have different settings or see different checkpoints; start the same command on "
+                "run_dir: processes have different settings or see different checkpoints; start "
+                "the same command on "
                 "all hosts, with a run folder that all of them see"
             )
 
@@ -208,7 +249,9 @@ class Processes:
         return multihost_utils.host_local_array_to_global_array(state, self._mesh, specs)
 
     def _local(self, x: jax.Array, spec: PartitionSpec) -> jax.Array:
-        """Returns this process's part of an array of all processes; programs give the whole of an empty one to each."""
+        """Returns this process's part of an array of all processes; programs give the whole of an
+        empty one to each.
+        """
         own = x.addressable_data(0)
         return self._rows(own, spec) if not x.size and own.shape == x.shape else own
 
@@ -217,14 +260,16 @@ class Processes:
             return x
         axis = spec.index(AXIS)
         length = x.shape[axis] // self.count
-        return jax.lax.slice_in_dim(x, jax.process_index() * length, (jax.process_index() + 1) * length, axis=axis)
+        return jax.lax.slice_in_dim(
+            x, jax.process_index() * length, (jax.process_index() + 1) * length, axis=axis
+        )
 
 
 def _own_empty(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Returns a function that makes the empty arrays of its argument and of what it closes over.
 
-    There are some for whatever a model does not have; in a program of several processes they crash the compiler of
-    jaxlib 0.11.2.
+    There are some for whatever a model does not have; in a program of several processes they crash
+    the compiler of jaxlib 0.11.2.
     """
 
     def own(x: Any) -> Any:
@@ -233,7 +278,9 @@ def _own_empty(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def call(argument: Any) -> Any:
         closed, result = jax.make_jaxpr(function, return_shape=True)(argument)
         evaluate = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, list(map(own, closed.consts))))
-        return jax.tree.unflatten(jax.tree.structure(result), evaluate(*map(own, jax.tree.leaves(argument))))
+        return jax.tree.unflatten(
+            jax.tree.structure(result), evaluate(*map(own, jax.tree.leaves(argument)))
+        )
 
     return call
 

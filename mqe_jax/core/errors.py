@@ -11,12 +11,16 @@ from mqe_jax.core.limits import SHOWN
 from mqe_jax.core.literal import line
 
 _REPR = reprlib.Repr()
-_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, SHOWN, SHOWN
+_REPR.maxlevel = 3
+_REPR.maxstring = SHOWN
+_REPR.maxother = SHOWN
 _REPR.maxtuple = _REPR.maxlist = _REPR.maxdict = 8
 
 
 class InputError(ValueError):
-    """Invalid user input: arguments, settings or files. The command line prints it as one line, exit code 2.
+    """Invalid user input: arguments, settings or files.
+
+    The command line prints it as one line, exit code 2.
 
     Any other exception is a defect of the program and keeps its traceback.
     """
@@ -30,14 +34,20 @@ class InUseError(InputError):
 
 
 class NonFiniteError(ArithmeticError):
-    """Training produced NaN or infinite numbers. The command line prints it as one line, exit code 1."""
+    """Training produced NaN or infinite numbers.
+
+    The command line prints it as one line, exit code 1.
+    """
 
 
 def warn(message: str) -> None:
     """Warns at the line outside of the package that led to the call."""
-    package, frame, level = f"{Path(__file__).parents[1]}{os.sep}", sys._getframe(), 1
+    package = f"{Path(__file__).parents[1]}{os.sep}"
+    frame = sys._getframe()
+    level = 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
-        frame, level = frame.f_back, level + 1
+        frame = frame.f_back
+        level = level + 1
     warnings.warn(message, stacklevel=level)
 
 
@@ -63,7 +73,9 @@ def brief(text: str) -> str:
 
 
 def known_name(wrong: str, name: str, known: Collection[str]) -> str:
-    """Returns a name if it is known; raises an InputError that begins with `wrong` and suggests the nearest one."""
+    """Returns a name if it is known; raises an InputError that begins with `wrong` and suggests the
+    nearest one.
+    """
     if name not in known:
         raise InputError(f"{wrong} {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")
     return name

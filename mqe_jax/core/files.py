@@ -1,4 +1,6 @@
-"""Files and folders: bounded readers (`mqe_jax.core.limits`), atomic writes, errors that name the file, locks."""
+"""Files and folders: bounded readers (`mqe_jax.core.limits`), atomic writes, errors that name the
+file, locks.
+"""
 
 import contextlib
 import csv
@@ -22,18 +24,22 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-_TAGS = {f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "int", "float", "str", "seq", "map")}
+_TAGS = {
+    f"tag:yaml.org,2002:{name}" for name in ("null", "bool", "int", "float", "str", "seq", "map")
+}
 LOCK = ".mqe.lock"
 """Name of the file that a process locks in a run folder."""
-_locks: dict[Path, os.stat_result] = {}  # folders that this process has locked, with the lock file of each
+# folders that this process has locked, with the lock file of each
+_locks: dict[Path, os.stat_result] = {}
 
 
-# -- writers: below a locked folder they write only while the folder's path still leads to it --------------------------
+# -- writers: below a locked folder they write only while the folder's path still leads to it
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a new file of the same folder, which it creates, and suffix, renamed to `path` at the end.
+    """Yields a new file of the same folder, which it creates, and suffix, renamed to `path` at the
+    end.
 
     The file is removed if this fails, or a signal ends the process. An OSError names `path`.
     """
@@ -63,7 +69,9 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file atomically: under a temporary name in the same folder, flushed to disk, then renamed."""
+    """Writes a file atomically: under a temporary name in the same folder, flushed to disk, then
+    renamed.
+    """
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
@@ -74,7 +82,10 @@ def append(path: Path, content: bytes) -> None:
     """Appends to a file, which it creates if missing; an OSError names it, even for a link."""
     check_locks(path)
     no_links = getattr(os, "O_NOFOLLOW", 0)
-    with naming(path), open(path, "ab", opener=lambda name, flags: os.open(name, flags | no_links, 0o666)) as file:
+    with (
+        naming(path),
+        open(path, "ab", opener=lambda name, flags: os.open(name, flags | no_links, 0o666)) as file,
+    ):
         file.write(content)
 
 
@@ -92,10 +103,13 @@ def check_locks(path: Path) -> None:
             with contextlib.suppress(OSError):
                 if os.path.samestat((folder / LOCK).stat(), _locks[folder]):
                     continue
-            raise InputError(f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it")
+            raise InputError(
+                f"run_dir: {folder} was removed, renamed or replaced; nothing more is written to it"
+            )
 
 
-# -- readers: every failure of a parser is an InputError that names the file; no file costs more than its limit --------
+# -- readers: every failure of a parser is an InputError that names the file; no file costs more
+# than its limit --------
 
 
 def check_file(path: Path, limit: int) -> None:
@@ -113,7 +127,9 @@ def check_file(path: Path, limit: int) -> None:
 
 @contextlib.contextmanager
 def parsing(path: Path | str, what: str) -> Iterator[None]:
-    """Turns what a parser raises for a damaged or hostile file, of any type, into an InputError that names the path."""
+    """Turns what a parser raises for a damaged or hostile file, of any type, into an InputError
+    that names the path.
+    """
     try:
         yield
     except InputError:
@@ -136,12 +152,18 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str, name: str) -> Any:
-    """Returns the value of a JSON text, nested at most `limits.DEPTH` deep; errors start with its name."""
+    """Returns the value of a JSON text, nested at most `limits.DEPTH` deep; errors start with its
+    name.
+    """
     with parsing(name, "JSON"):
         value = json.loads(text)
         level = [value]
         for _ in range(limits.DEPTH):
-            inner = [list(x.values()) if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]
+            inner = [
+                list(x.values()) if isinstance(x, dict) else x
+                for x in level
+                if isinstance(x, dict | list)
+            ]
             level = [x for values in inner for x in values]
         if level:
             raise ValueError(f"nested more than {limits.DEPTH} deep")
@@ -151,7 +173,8 @@ def parse_json(text: str, name: str) -> Any:
 class _Loader(yaml.SafeLoader):
     """Loader of a text, whose depth and number of values it counts while it reads.
 
-    PyYAML itself keeps the last of two values of one name, and lets aliases make a few bytes as large as memory.
+    PyYAML itself keeps the last of two values of one name, and lets aliases make a few bytes as
+    large as memory.
     """
 
     depth = values = 0
@@ -159,14 +182,21 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("aliases (*name) are not allowed")
-        self.depth, self.values = self.depth + 1, self.values + 1
+        self.depth = self.depth + 1
+        self.values = self.values + 1
         if self.depth > limits.DEPTH or self.values > limits.VALUES:
-            raise yaml.YAMLError(f"more than {limits.DEPTH} deep, or more than {limits.VALUES} values")
+            raise yaml.YAMLError(
+                f"more than {limits.DEPTH} deep, or more than {limits.VALUES} values"
+            )
         node = super().compose_node(parent, index)
         self.depth -= 1
         if node is not None and node.tag not in _TAGS:
             raise yaml.YAMLError(f"the tag {node.tag} is not allowed")
-        if node is not None and node.tag.endswith((":int", ":float")) and re.search(r"^[-+]?0[0-7_]|:", node.value):
+        if (
+            node is not None
+            and node.tag.endswith((":int", ":float"))
+            and re.search(r"^[-+]?0[0-7_]|:", node.value)
+        ):
             node.tag = "tag:yaml.org,2002:str"  # 010 and 1:30, which YAML 1.1 reads as 8 and 90
         return node
 
@@ -206,7 +236,9 @@ def read_rows(path: Path) -> Iterator[list[str]]:
 
 
 def read_tensors(file: Path, what: str) -> "dict[str, np.ndarray]":
-    """Reads a safetensors file of finite floating-point weights; an InputError says `what` it should be."""
+    """Reads a safetensors file of finite floating-point weights; an InputError says `what` it
+    should be.
+    """
     import numpy as np
     from safetensors.numpy import load_file
 
@@ -222,7 +254,8 @@ def read_tensors(file: Path, what: str) -> "dict[str, np.ndarray]":
 def linear_layers(
     what: str, arrays: "Mapping[str, np.ndarray]", sizes: Mapping[str, tuple[int, int]]
 ) -> "dict[str, dict[str, np.ndarray]]":
-    """Returns the arrays LAYER.weight (outputs, inputs) and LAYER.bias (outputs,) by layer, as float32.
+    """Returns the arrays LAYER.weight (outputs, inputs) and LAYER.bias (outputs,) by layer, as
+    float32.
 
     `sizes` holds inputs and outputs of each layer. An InputError says what is wrong with `what`.
     """
@@ -237,16 +270,25 @@ def linear_layers(
         if name not in shapes:
             raise InputError(f"{what}: {name} is not expected; expected {', '.join(shapes)}")
         if tuple(arrays[name].shape) != shapes[name]:
-            raise InputError(f"{what}: {name} has shape {tuple(arrays[name].shape)}; expected {shapes[name]}")
+            raise InputError(
+                f"{what}: {name} has shape {tuple(arrays[name].shape)}; expected {shapes[name]}"
+            )
         if (most := float(np.abs(arrays[name].astype(np.float64)).max())) > limits.WEIGHT:
-            raise InputError(f"{what}: {name} holds magnitudes to {most:g}; at most {limits.WEIGHT:g} is allowed")
+            raise InputError(
+                f"{what}: {name} holds magnitudes to {most:g}; at most {limits.WEIGHT:g} is allowed"
+            )
     kinds = ("weight", "bias")
-    return {layer: {kind: np.asarray(arrays[f"{layer}.{kind}"], np.float32) for kind in kinds} for layer in sizes}
+    return {
+        layer: {kind: np.asarray(arrays[f"{layer}.{kind}"], np.float32) for kind in kinds}
+        for layer in sizes
+    }
 
 
 @contextlib.contextmanager
 def archive(path: Path, limit: int, what: str) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip file of at most `limit` bytes, unpacked too; errors while it is open are those of `parsing`."""
+    """Opens a zip file of at most `limit` bytes, unpacked too; errors while it is open are those of
+    `parsing`.
+    """
     check_file(path, limit)
     with parsing(path, what), zipfile.ZipFile(path) as opened:
         size = sum(member.file_size for member in opened.infolist())
@@ -262,14 +304,20 @@ def user_cache() -> Path:
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
-        raise InputError("XDG_CACHE_HOME: is missing, and there is no home folder; it must be a folder") from None
+        raise InputError(
+            "XDG_CACHE_HOME: is missing, and there is no home folder; it must be a folder"
+        ) from None
     return Path(home) / "mqe_jax"
 
 
 def check_folder(folder: Path, field: str = "run_dir", file: Path | None = None) -> None:
-    """Raises an InputError that names the field unless a folder, for a file, can be written, or created."""
+    """Raises an InputError that names the field unless a folder, for a file, can be written, or
+    created.
+    """
     try:
-        there = next(path for path in (folder, *folder.parents) if path.exists() or path.is_symlink())
+        there = next(
+            path for path in (folder, *folder.parents) if path.exists() or path.is_symlink()
+        )
         with tempfile.TemporaryDirectory(prefix=".mqe-", dir=there) as inner:
             made = Path(inner, folder.relative_to(there))
             made.mkdir(parents=True, exist_ok=True)
@@ -280,24 +328,31 @@ def check_folder(folder: Path, field: str = "run_dir", file: Path | None = None)
 
 
 def check_output(path: Path, field: str = "output") -> None:
-    """Raises an InputError that names the field unless a file can be written, in a folder that need not exist."""
+    """Raises an InputError that names the field unless a file can be written, in a folder that need
+    not exist.
+    """
     check_folder(path.parent, field, path)
     if not path.name or (path.exists() and not path.is_file()):
-        raise InputError(f"{field}: {str(path)!r} is not allowed; it must be a file, not a folder or a device")
+        raise InputError(
+            f"{field}: {str(path)!r} is not allowed; it must be a file, not a folder or a device"
+        )
 
 
 @contextlib.contextmanager
 def lock(folder: Path) -> Iterator[None]:
-    """Creates a folder and holds a lock on it, which ends with the process; InUseError if it is locked already.
+    """Creates a folder and holds a lock on it, which ends with the process; InUseError if it is
+    locked already.
 
-    Below it, nothing is written once its path leads to another folder or to none. Folders made and left empty go again.
+    Below it, nothing is written once its path leads to another folder or to none. Folders made and
+    left empty go again.
     """
     import filelock  # 30 ms, which most commands need not wait for
 
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    lock, outer = filelock.FileLock(folder / LOCK, blocking=False), _locks.get(folder)
+    lock = filelock.FileLock(folder / LOCK, blocking=False)
+    outer = _locks.get(folder)
     try:
         lock.acquire()
     except filelock.Timeout:
@@ -308,7 +363,8 @@ def lock(folder: Path) -> Iterator[None]:
     finally:
         with contextlib.suppress(OSError, InputError):
             check_locks(folder / LOCK)
-            (folder / LOCK).unlink()  # before the release: another process takes no lock on a file that is gone
+            # before the release: another process takes no lock on a file that is gone
+            (folder / LOCK).unlink()
         lock.release()
         _locks.pop(folder, None)
         if outer is not None:

@@ -1,7 +1,8 @@
 """SIGINT and SIGTERM: a training ends after the update in progress, any other command at once.
 
-Python runs a signal's handler between two of its instructions, which compiled code may delay for minutes, and JAX
-loses an exception that is raised in a callback. So in the command line a thread waits for the signals.
+Python runs a signal's handler between two of its instructions, which compiled code may delay for
+minutes, and JAX loses an exception that is raised in a callback. So in the command line a thread
+waits for the signals.
 """
 
 import contextlib
@@ -23,7 +24,8 @@ temporaries: set[os.PathLike[str]] = set()
 installed = False
 """Whether `install` was called: in the command line, not in a notebook."""
 _deferring = False
-_noted, _since = 0, 0.0
+_noted = 0
+_since = 0.0
 
 
 class Interrupted(KeyboardInterrupt):
@@ -43,7 +45,10 @@ def exit_code(number: int) -> int:
 
 
 def install() -> None:
-    """Ends the process on SIGINT and SIGTERM from now on. A signal that is ignored, as by `nohup`, stays ignored."""
+    """Ends the process on SIGINT and SIGTERM from now on.
+
+    A signal that is ignored, as by `nohup`, stays ignored.
+    """
     global installed
     if threading.current_thread() is not threading.main_thread():
         return
@@ -59,9 +64,11 @@ def install() -> None:
 
 @contextlib.contextmanager
 def defer() -> Iterator[Callable[[], int]]:
-    """Yields a function that returns the signal that came since, or 0; a later one ends the process at once.
+    """Yields a function that returns the signal that came since, or 0; a later one ends the process
+    at once.
 
-    Without `install`, as in a notebook, only SIGINT is deferred, and a later one raises KeyboardInterrupt.
+    Without `install`, as in a notebook, only SIGINT is deferred, and a later one raises
+    KeyboardInterrupt.
     """
     global _deferring, _noted
 
@@ -73,7 +80,8 @@ def defer() -> Iterator[Callable[[], int]]:
     handled = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
     if handled and not installed and threading.current_thread() is threading.main_thread():
         restore = signal.signal(signal.SIGINT, note)
-    _deferring, _noted = True, 0
+    _deferring = True
+    _noted = 0
     try:
         yield lambda: _noted
     finally:
@@ -88,7 +96,8 @@ def _note(number: int) -> bool:
     if not _deferring:
         return False
     if not _noted:
-        _noted, _since = number, time.monotonic()
+        _noted = number
+        _since = time.monotonic()
     return time.monotonic() - _since <= _REPEATED
 
 
@@ -102,7 +111,8 @@ def _watch(reader: socket.socket, wanted: Sequence[int]) -> None:
 
 def _exit(number: int) -> None:
     with contextlib.suppress(OSError):
-        cursor = "\x1b[?25h" if sys.stderr is not None and sys.stderr.isatty() else ""  # which a bar has hidden
+        # which a bar has hidden
+        cursor = "\x1b[?25h" if sys.stderr is not None and sys.stderr.isatty() else ""
         os.write(2, f"{cursor}mqe: {_WORDS[signal.Signals(number)]}\n".encode())
     for path in tuple(temporaries):
         with contextlib.suppress(OSError):

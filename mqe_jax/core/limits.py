@@ -1,7 +1,10 @@
-"""What input may hold and cost: the one list of bounds. Whatever is outside of them raises an `InputError`.
+"""What input may hold and cost: the one list of bounds.
 
-Kinds of numbers are types of settings (`settings_class`) and of arguments (`check_arguments`). A plain `int` or `float`
-has the bounds of `Integer` or `Number`. The constants bound files, texts and memory.
+Whatever is outside of them raises an `InputError`.
+
+Kinds of numbers are types of settings (`settings_class`) and of arguments (`check_arguments`). A
+plain `int` or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and
+memory.
 """
 
 import typing
@@ -9,7 +12,7 @@ from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 
-# -- numbers: finite, within both bounds -------------------------------------------------------------------------------
+# -- numbers: finite, within both bounds
 Number = Annotated[float, Ge(-1e9), Le(1e9)]
 Positive = Annotated[float, Ge(1e-9), Le(1e9)]
 NonNegative = Annotated[float, Ge(0), Le(1e9)]
@@ -28,7 +31,7 @@ ClipLength = Annotated[float, Ge(0.02), Le(600)]  # s
 FrameRate = Annotated[float, Ge(0.1), Le(240)]  # Hz
 Speed = Annotated[float, Ge(0.01), Le(100)]  # of a clip, relative to real time
 
-# -- counts: integers, not numbers with a fraction, NaN or booleans ----------------------------------------------------
+# -- counts: integers, not numbers with a fraction, NaN or booleans
 Integer = Annotated[int, Ge(-(10**12)), Le(10**12)]
 PositiveInt = Annotated[int, Gt(0), Le(10**6)]
 NonNegativeInt = Annotated[int, Ge(0), Le(10**6)]
@@ -55,7 +58,7 @@ ImageWidth = Annotated[int, Ge(27), Le(4096)]  # at 16:9, whose height has 16 pi
 Rays = Annotated[int, Gt(0), Le(1024)]  # of a lidar
 Port = Annotated[int, Gt(0), Lt(65536)]
 
-# -- texts, settings and files -----------------------------------------------------------------------------------------
+# -- texts, settings and files
 TEXT = 4096  # characters of a name or a path, none of which is a control character
 FILE_NAME = 255  # bytes of a part of a path
 SHOWN = 200  # characters of a value in a message
@@ -64,20 +67,26 @@ VALUES = 20_000  # in one YAML file
 YAML_BYTES = 2**17
 JSON_BYTES = 2**26
 CSV_BYTES = 2**27
-WEIGHTS_BYTES = 2**27  # of skills and actuator networks; in a TorchScript archive, all members and all tensors
+# of skills and actuator networks; in a TorchScript archive, all members and all tensors
+WEIGHTS_BYTES = 2**27
 POLICY_BYTES = 2**28
 CHECKPOINT_BYTES = 2**34
-WEIGHT = 1e4  # magnitude of a weight of a policy, a skill or an actuator network; trained ones are below 10
+# magnitude of a weight of a policy, a skill or an actuator network; trained ones are below 10
+WEIGHT = 1e4
 RECORDING_BYTES = 2**28  # all members
 
-# -- memory, checked before it is allocated ----------------------------------------------------------------------------
+# -- memory, checked before it is allocated
 CLIP_BYTES = 2**30  # recorded episodes; images of a clip that is not streamed
 MEMORY_SHARE = 0.5  # of the free memory, for the states of all environments or for a rollout
 
 
 def bounds(kind: Any) -> tuple[float, float]:
-    """Returns the lowest and the highest allowed number of a kind; an exclusive bound is the first number inside."""
-    low, high, step = -float("inf"), float("inf"), int(typing.get_args(kind)[0] is int)
+    """Returns the lowest and the highest allowed number of a kind; an exclusive bound is the first
+    number inside.
+    """
+    low = -float("inf")
+    high = float("inf")
+    step = int(typing.get_args(kind)[0] is int)
     for limit in kind.__metadata__:
         match limit:
             case Ge(ge=value):

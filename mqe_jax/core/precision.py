@@ -11,11 +11,13 @@ R = TypeVar("R")
 
 
 def single(function: Callable[P, R]) -> Callable[P, R]:
-    """Makes a function compute in float32 and int32, also if a caller traces it with `jax_enable_x64`.
+    """Makes a function compute in float32 and int32, also if a caller traces it with
+    `jax_enable_x64`.
 
     It broadcasts shapes, also with `jax_numpy_rank_promotion`.
 
-    The function and all that it calls, such as a user's task or engine, need no dtype in each `jnp.zeros`.
+    The function and all that it calls, such as a user's task or engine, need no dtype in each
+    `jnp.zeros`.
     """
 
     @functools.wraps(function)

@@ -1,4 +1,6 @@
-"""Checks of what methods of tasks and sensors return; a ValueError names the method, the value and what is expected."""
+"""Checks of what methods of tasks and sensors return; a ValueError names the method, the value and
+what is expected.
+"""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
@@ -12,20 +14,36 @@ from mqe_jax.core.errors import short_repr
 def weights_of(params: Any) -> Any:
     """Returns the weights of the reward terms, the field `rewards` of a task's parameters."""
     if not hasattr(params, "rewards"):
-        _fail(f"Params = {type(params).__name__}", "no field rewards", "one, the weights of the reward terms")
+        _fail(
+            f"Params = {type(params).__name__}",
+            "no field rewards",
+            "one, the weights of the reward terms",
+        )
     return params.rewards
 
 
 def check_names(method: str, values: Any, names: Iterable[str]) -> None:
     """Checks that values are a mapping of these names."""
     if not isinstance(values, Mapping) or set(values) != set(names):
-        _fail(method, sorted(values) if isinstance(values, Mapping) else _kind(values), f"by name: {sorted(names)}")
+        _fail(
+            method,
+            sorted(values) if isinstance(values, Mapping) else _kind(values),
+            f"by name: {sorted(names)}",
+        )
 
 
 def check_shape(method: str, value: Any, *shapes: tuple[int, ...], dtype: Any = None) -> jax.Array:
     """Returns an array of one of these shapes, and of a dtype if one is given."""
-    if value is None or jnp.shape(value) not in shapes or dtype not in (None, getattr(value, "dtype", type(value))):
-        _fail(method, _kind(value), " or ".join(map(str, shapes)) + ("" if dtype is None else f" {dtype.__name__}"))
+    if (
+        value is None
+        or jnp.shape(value) not in shapes
+        or dtype not in (None, getattr(value, "dtype", type(value)))
+    ):
+        _fail(
+            method,
+            _kind(value),
+            " or ".join(map(str, shapes)) + ("" if dtype is None else f" {dtype.__name__}"),
+        )
     return jnp.asarray(value)
 
 
@@ -46,7 +64,8 @@ def results(method: str, values: Any) -> dict[str, jax.Array]:
 
 def alike(method: str, values: Any, before: Any) -> Any:
     """Returns a pytree with the structure, shapes and dtypes of another."""
-    now, then = jax.tree.map(_kind, values), jax.tree.map(_kind, before)
+    now = jax.tree.map(_kind, values)
+    then = jax.tree.map(_kind, before)
     if jax.tree.flatten(now) != jax.tree.flatten(then):
         _fail(method, now, f"as before, {then}")
     return values

@@ -7,12 +7,12 @@ A settings class is a frozen dataclass whose annotations hold the type and the b
         clip: Positive = 0.2
         \"\"\"Half width of the clipping interval of the ratio.\"\"\"
 
-Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, validates the fields and raises a one-line
-`InputError`: `ppo.clip: -1 is not allowed; it must be greater than 0`.
+Fields are given by keyword. Every constructor, `Ppo(clip=0.1)` included, validates the fields and
+raises a one-line `InputError`: `ppo.clip: -1 is not allowed; it must be greater than 0`.
 
-Every number has bounds: those of its kind (`mqe_jax.core.limits`), or of `Number` and `Integer` for a plain `float` or
-`int`. Numpy scalars are numbers, and so are strings such as "7e-4", which YAML does not read as a number. Booleans and
-bytes are not. For an optional field, "none" means None.
+Every number has bounds: those of its kind (`mqe_jax.core.limits`), or of `Number` and `Integer` for
+a plain `float` or `int`. Numpy scalars are numbers, and so are strings such as "7e-4", which YAML
+does not read as a number. Booleans and bytes are not. For an optional field, "none" means None.
 """
 
 import dataclasses
@@ -36,7 +36,16 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, brief, nearest, short_repr
 from mqe_jax.core.files import read_yaml
-from mqe_jax.core.limits import Coordinate, Fraction, NonNegative, NonNegativeInt, Number, Positive, PositiveInt, Seed  # noqa: F401  (for modules that declare settings)
+from mqe_jax.core.limits import (  # noqa: F401  (for modules that declare settings)
+    Coordinate,
+    Fraction,
+    NonNegative,
+    NonNegativeInt,
+    Number,
+    Positive,
+    PositiveInt,
+    Seed,
+)
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -89,12 +98,15 @@ Parameters = Annotated[Mapping[str, Any], pydantic.AfterValidator(_parameters)]
 """A task's parameters by name; the control mode may be among them."""
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,))
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
+)
 def settings_class(cls: type[T]) -> type[T]:
     """Makes a class a frozen, keyword-only dataclass that validates its fields.
 
-    Checks that involve several fields go into `__post_init__`, which may call `fail` with the field's name; messages
-    of nested settings are prefixed with their path. A subclass must be decorated too.
+    Checks that involve several fields go into `__post_init__`, which may call `fail` with the
+    field's name; messages of nested settings are prefixed with their path. A subclass must be
+    decorated too.
     """
     hints = typing.get_type_hints(cls, include_extras=True)
     cls.__annotations__ = {name: _accept_yaml(hints[name]) for name in inspect.get_annotations(cls)}
@@ -103,7 +115,9 @@ def settings_class(cls: type[T]) -> type[T]:
     @functools.wraps(made.__init__)
     def checked_init(self: Any, /, **values: Any) -> None:
         try:  # as pydantic's own `__init__`, which has no value named as its argument
-            self.__pydantic_validator__.validate_python(pydantic_core.ArgsKwargs((), values), self_instance=self)
+            self.__pydantic_validator__.validate_python(
+                pydantic_core.ArgsKwargs((), values), self_instance=self
+            )
         except pydantic.ValidationError as error:
             raise _one_line(made, error) from None
 
@@ -141,11 +155,14 @@ TEXT = f"at most {limits.TEXT} characters, none of which is a control character"
 
 def is_text(value: str) -> bool:
     """Returns whether a text can be a name or a path, and be printed."""
-    return len(value) <= limits.TEXT and not any(ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value)
+    return len(value) <= limits.TEXT and not any(
+        ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value
+    )
 
 
 def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a function check some of its arguments, each against a type, as settings classes check their fields.
+    """Makes a function check some of its arguments, each against a type, as settings classes check
+    their fields.
 
     `annotated` are names of arguments that are checked against their annotations.
     """
@@ -168,7 +185,9 @@ def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]],
 
 
 def check(name: str, value: Any, kind: Any) -> Any:
-    """Returns a value converted to a type; raises the InputError of `fail` if that is not possible."""
+    """Returns a value converted to a type; raises the InputError of `fail` if that is not
+    possible.
+    """
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return value if isinstance(value, kind) else fail(name, value, f"a {kind.__name__}")
     try:
@@ -191,12 +210,15 @@ def is_settings(kind: object) -> bool:
 
 
 def fail(name: str, value: object, allowed: str) -> NoReturn:
-    """Raises the `InputError` of a value that is not allowed: `name: value is not allowed; it must be ...`."""
+    """Raises the `InputError` of a value that is not allowed: `name: value is not allowed; it must
+    be ...`.
+    """
     raise InputError(f"{name}: {short_repr(value)} is not allowed; it must be {allowed}")
 
 
 def build(kind: type[T], values: Mapping[str, Any]) -> T:
-    """Builds settings from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted (`{"ppo.clip": 0.1}`).
+    """Builds settings from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted
+    (`{"ppo.clip": 0.1}`).
 
     InputError for a value that is not allowed or an unknown name, with the nearest known one.
     """
@@ -206,7 +228,10 @@ def build(kind: type[T], values: Mapping[str, Any]) -> T:
 
 
 def override(settings: T, changes: Mapping[str, Any]) -> T:
-    """Returns settings with fields replaced, named as in `build`; mappings are merged. InputError as `build`."""
+    """Returns settings with fields replaced, named as in `build`; mappings are merged.
+
+    InputError as `build`.
+    """
     if not is_settings(settings):
         fail("settings", settings, "an instance of a settings class, such as TrainConfig()")
     return type(settings)(**_joined(type(settings), _fields(settings), changes))
@@ -225,7 +250,9 @@ def _joined(kind: Any, first: Mapping[str, Any], changes: Mapping[str, Any]) -> 
 def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
     """Yields the dotted names of all values that are no mappings."""
     for key, value in values.items():
-        yield from _names(value, f"{prefix}{key}.") if isinstance(value, Mapping) else (f"{prefix}{key}",)
+        yield from (
+            _names(value, f"{prefix}{key}.") if isinstance(value, Mapping) else (f"{prefix}{key}",)
+        )
 
 
 def differences(settings: Any, default: Any) -> dict[str, Any]:
@@ -249,11 +276,14 @@ def leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{name}", value
 
 
-def merge(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH) -> dict[str, Any]:
-    """Returns two mappings merged at every depth, dotted names as nested ones; the second's values count.
+def merge(
+    first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH
+) -> dict[str, Any]:
+    """Returns two mappings merged at every depth, dotted names as nested ones; the second's values
+    count.
 
-    Settings with a `name`, which selects one of several classes, are replaced as a whole. InputError for
-    mappings that are nested more than `depth` deep.
+    Settings with a `name`, which selects one of several classes, are replaced as a whole.
+    InputError for mappings that are nested more than `depth` deep.
     """
     both: dict[str, Any] = {}
     for key, value in (*first.items(), *second.items()):
@@ -263,32 +293,44 @@ def merge(first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limi
             if not depth:
                 fail(name, value, f"nested at most {limits.DEPTH} deep")
             now = _fields(both.get(name))
-            other = is_settings(both.get(name)) and value.get("name", now.get("name")) != now.get("name")
+            other = is_settings(both.get(name)) and value.get("name", now.get("name")) != now.get(
+                "name"
+            )
             value = merge({} if other else now, value, depth - 1)
         both[name] = value
     return both
 
 
 def to_mapping(settings: Any) -> dict[str, Any]:
-    """Returns settings as nested mappings, lists and scalars for YAML and JSON; InputError for any other value."""
+    """Returns settings as nested mappings, lists and scalars for YAML and JSON; InputError for any
+    other value.
+    """
 
     def plain(value: Any) -> Any:
         if hasattr(value, "tolist"):
             return value.tolist()
         if isinstance(value, FrozenMapping):
             return dict(value)
-        fail(type(settings).__name__, value, "a number, a string, true, false, none, or lists and mappings of these")
+        fail(
+            type(settings).__name__,
+            value,
+            "a number, a string, true, false, none, or lists and mappings of these",
+        )
 
     return pydantic_core.to_jsonable_python(settings, fallback=plain)
 
 
 def load_yaml(path: str | Path) -> dict[str, Any]:
-    """Reads names and values from a YAML file, which may be empty; InputError, naming it, if it is no mapping."""
+    """Reads names and values from a YAML file, which may be empty; InputError, naming it, if it is
+    no mapping.
+    """
     values = read_yaml(Path(check("path", path, PathText)))
     if values is None:
         return {}
     if not isinstance(values, dict):
-        raise InputError(f"{path}: holds {type(values).__name__}; it must be a mapping of settings to values")
+        raise InputError(
+            f"{path}: holds {type(values).__name__}; it must be a mapping of settings to values"
+        )
     return {str(name): value for name, value in values.items()}
 
 
@@ -299,8 +341,11 @@ def hints_of(kind: Any) -> dict[str, Any]:
 
 
 def _accept_yaml(hint: Any) -> Any:
-    """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as numbers."""
-    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as
+    numbers.
+    """
+    origin = typing.get_origin(hint)
+    parts = typing.get_args(hint)
     if origin is Annotated and parts[0] in (int, float):
         return _add_bounds(hint)
     if origin is Annotated:  # pydantic applies the last validators of an annotation first
@@ -308,12 +353,16 @@ def _accept_yaml(hint: Any) -> Any:
         return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
     if origin in (typing.Union, types.UnionType):
         union = typing.Union[tuple(_accept_yaml(part) for part in parts)]  # noqa: UP007
-        return Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
+        return (
+            Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
+        )
     if origin is tuple:
         return tuple[tuple(part if part is Ellipsis else _accept_yaml(part) for part in parts)]  # type: ignore[misc]
     if origin in (Mapping, Sequence, list):
         made = origin[tuple(map(_accept_yaml, parts))]  # type: ignore[index]
-        return Annotated[made, pydantic.AfterValidator(FrozenMapping)] if origin is Mapping else made
+        return (
+            Annotated[made, pydantic.AfterValidator(FrozenMapping)] if origin is Mapping else made
+        )
     if hint in (int, float):
         return _add_bounds(Annotated[hint, None])
     before = {bool: _boolean, str: _text, Path: _text}.get(hint)
@@ -343,7 +392,9 @@ def _number(kind: type, value: Any) -> Any:
 
 
 def _text(value: Any) -> Any:
-    if isinstance(value, bytes | bytearray) or (isinstance(value, str | Path) and not is_text(str(value))):
+    if isinstance(value, bytes | bytearray) or (
+        isinstance(value, str | Path) and not is_text(str(value))
+    ):
         raise ValueError(f"a text, {TEXT}")
     return _expand_home(value)
 
@@ -365,14 +416,17 @@ def _settings_in(hint: Any) -> Any:
     """Returns the settings class within an annotated or optional type, or None."""
     if is_settings(hint):
         return hint
-    return next((found for part in typing.get_args(hint) if (found := _settings_in(part)) is not None), None)
+    return next(
+        (found for part in typing.get_args(hint) if (found := _settings_in(part)) is not None), None
+    )
 
 
 def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     """Returns the first error of a validation: path, value, and what is allowed."""
     first = error.errors(include_url=False)[0]
     places = [brief(str(part)) for part in first["loc"]]
-    value, context = first["input"], first.get("ctx", {})
+    value = first["input"]
+    context = first.get("ctx", {})
     if isinstance(raised := context.get("error"), InputError):
         named = places and re.match(rf"{re.escape(places[-1])}[:.]", str(raised))
         return InputError(".".join([*(places[:-1] if named else places), str(raised)]))
@@ -384,9 +438,18 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
         return InputError(f"{'.'.join(places)}: unknown name (value {short_repr(value)}){hint}")
     if first["type"] == "missing":
         return InputError(f"{'.'.join(places)}: is missing")
-    allowed = first["msg"].replace("Input should be", "it must be").replace("Value error, ", "it must be ")
-    allowed = allowed.replace("a valid tuple", "a list").replace("a valid dictionary", "a mapping of names to values")
+    allowed = (
+        first["msg"]
+        .replace("Input should be", "it must be")
+        .replace("Value error, ", "it must be ")
+    )
+    allowed = allowed.replace("a valid tuple", "a list").replace(
+        "a valid dictionary", "a mapping of names to values"
+    )
     if first["type"].startswith("dataclass"):
         allowed = "it must be a mapping of names to values"
     choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", "")) if word]
-    return InputError(f"{'.'.join(places)}: {short_repr(value)} is not allowed; {allowed}{nearest(value, choices)}")
+    return InputError(
+        f"{'.'.join(places)}: {short_repr(value)} is not allowed; "
+        f"{allowed}{nearest(value, choices)}"
+    )

@@ -53,9 +53,14 @@ def _raw_key(implementation: str) -> Any:
 
 
 def _level(value: Any) -> Any:
-    traced, dtype = isinstance(value, Tracer), getattr(value, "dtype", None)
+    traced = isinstance(value, Tracer)
+    dtype = getattr(value, "dtype", None)
     kinds = (jnp.integer, jnp.floating)
-    number = isinstance(value, int | float) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in kinds)
+    number = (
+        isinstance(value, int | float)
+        if dtype is None
+        else any(jnp.issubdtype(dtype, kind) for kind in kinds)
+    )
     # By numpy: under jit comparisons are traced even if an array is a captured constant.
     inside = number and not np.shape(value) and (traced or 0 <= np.asarray(value) <= 1)
     if isinstance(value, bool) or not inside:
@@ -67,7 +72,9 @@ def _having(names: str, allowed: str, *, lacks: str = "", callables: bool = Fals
     """Returns the validator of objects with some attributes, or of functions too."""
 
     def validate(value: Any) -> Any:
-        whole = all(hasattr(value, name) for name in names.split()) and not (lacks and hasattr(value, lacks))
+        whole = all(hasattr(value, name) for name in names.split()) and not (
+            lacks and hasattr(value, lacks)
+        )
         if isinstance(value, type) or not (whole or (callables and callable(value))):
             raise ValueError(allowed)
         return value
@@ -76,16 +83,24 @@ def _having(names: str, allowed: str, *, lacks: str = "", callables: bool = Fals
 
 
 # Kinds of arguments (`mqe_jax.core.settings.check_arguments`).
-_ENV, _POLICY = "name num_agents action_size reset step", "a policy, such as that of mqe_jax.load_policy"
+_ENV = "name num_agents action_size reset step"
+_POLICY = "a policy, such as that of mqe_jax.load_policy"
 _ACT = f"{_POLICY}, or a function act(obs, memory, key)"
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
 RandomKeys = Annotated[Any, pydantic.AfterValidator(_keys)]  # one for each environment of a batch
-Level = Annotated[Any, pydantic.AfterValidator(_level)]  # of a curriculum, a number or an array () in [0, 1]
+# of a curriculum, a number or an array () in [0, 1]
+Level = Annotated[Any, pydantic.AfterValidator(_level)]
 AnyEnvironment = Annotated[Any, _having(_ENV, "an environment, such as that of mqe_jax.make")]
-AnySingle = Annotated[Any, _having(_ENV, "one environment, such as that of mqe_jax.make", lacks="num_envs")]
-AnyBatch = Annotated[Any, _having(f"{_ENV} num_envs", "a batch, such as VectorEnv(mqe_jax.make(task), 64)")]
+AnySingle = Annotated[
+    Any, _having(_ENV, "one environment, such as that of mqe_jax.make", lacks="num_envs")
+]
+AnyBatch = Annotated[
+    Any, _having(f"{_ENV} num_envs", "a batch, such as VectorEnv(mqe_jax.make(task), 64)")
+]
 AnyPolicy = Annotated[Any, _having("task agents act initial_memory", _POLICY)]
-AnyTrained = Annotated[Any, _having("needs config act initial_memory", "a trained policy or a mixture of such")]
+AnyTrained = Annotated[
+    Any, _having("needs config act initial_memory", "a trained policy or a mixture of such")
+]
 PolicyOrAct = Annotated[Any, _having("act initial_memory", _ACT, callables=True)]
 
 Teams = tuple[tuple[int, ...], ...]
@@ -93,24 +108,27 @@ Teams = tuple[tuple[int, ...], ...]
 
 
 class VectorEnv(Protocol):
-    """N environments of A agents with automatic reset; `reset` and `step` are pure and may be jitted.
+    """N environments of A agents with automatic reset; `reset` and `step` are pure and may be
+    jitted.
 
-    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`. The policy samples unbounded actions,
-    which the environment clips. A state is any pytree with these fields, all present from the reset on:
+    `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`. The policy samples
+    unbounded actions, which the environment clips. A state is any pytree with these fields, all
+    present from the reset on:
 
     | field | shape | meaning |
     |---|---|---|
     | `obs` | (N, A, O) | input of the next action |
     | `privileged_obs` | (N, P) | observation of the critic |
-    | `final_obs`, `final_privileged_obs` | as above | before any reset; None if not in `NetworkSettings.critic_reads` |
+    | `final_obs`, `final_privileged_obs` | as above | before a reset, or None (`critic_reads`) |
     | `reward` | (N, A) | of the step |
     | `terminated`, `truncated` | (N,) bool | whether the step ended the episode |
     | `outcome` | | an `Outcome`, valid at the end of an episode |
     | `metrics` | (N,) by name | averaged over steps; `diverged` and `overflow` are summed |
 
-    Optional attributes of the environments are `teams` (one by default; learning needs a single one),
-    `max_episode_steps` and `group_sizes` (lengths of further observations). With several processes, `share(parts)`
-    returns the batch of one: its states are consecutive rows of the whole batch (`devices.rows`).
+    Optional attributes of the environments are `teams` (one by default; learning needs a single
+    one), `max_episode_steps` and `group_sizes` (lengths of further observations). With several
+    processes, `share(parts)` returns the batch of one: its states are consecutive rows of the whole
+    batch (`devices.rows`).
 
     Optional fields of the state:
 
@@ -118,8 +136,8 @@ class VectorEnv(Protocol):
     |---|---|---|
     | `step` | (N,) | steps in the episode; set by `stagger_episodes` |
     | `assistance` | (N,) | set by `curriculum.assistance` (`replace_fields`) |
-    | `active` | (N, A) bool | agents that take part; the others enter neither statistics, losses nor results |
-    | `learners` | (N, A) bool | active agents whose actions the policy chooses; it learns from these only |
+    | `active` | (N, A) bool | agents that take part; others enter no statistics, loss or result |
+    | `learners` | (N, A) bool | active agents for which the policy acts and learns |
     | `groups`, `final_groups` | (N, A, O_g) by name | further observations |
     """
 
@@ -140,10 +158,11 @@ class VectorEnv(Protocol):
 
 
 class Matchmaker(Protocol):
-    """Gives the environments their opponents between updates of the learner state, a `TrainState`; pure.
+    """Gives the environments their opponents between updates of the learner state, a `TrainState`;
+    pure.
 
-    `begin(state)` returns the first value of `TrainState.extra`; `seat(state)` gives new environments the opponents
-    that it names; `after(state) -> (state, metrics)` follows an update.
+    `begin(state)` returns the first value of `TrainState.extra`; `seat(state)` gives new
+    environments the opponents that it names; `after(state) -> (state, metrics)` follows an update.
     """
 
     def begin(self, state: Any) -> PyTree: ...
@@ -153,42 +172,60 @@ class Matchmaker(Protocol):
 
 def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
     """Selects rows of two pytrees: condition (N,) bool, leaves (N, ...)."""
-    return jax.tree.map(lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no)
+    return jax.tree.map(
+        lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no
+    )
 
 
 def reset_memory(memory: "NetworkMemory", is_first: jax.Array) -> "NetworkMemory":
-    """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first (N,) bool."""
+    """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first
+    (N,) bool.
+    """
     return where_rows(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
-    """Returns a state, which is a dataclass, a NamedTuple or has a method `replace`, with fields replaced."""
+    """Returns a state, which is a dataclass, a NamedTuple or has a method `replace`, with fields
+    replaced.
+    """
     if dataclasses.is_dataclass(state) and not isinstance(state, type):
         return dataclasses.replace(state, **fields)
     for method in ("_replace", "replace"):
         if hasattr(state, method):
             return getattr(state, method)(**fields)
     kind = type(state).__name__
-    raise InputError(f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}")
+    raise InputError(
+        f"env: states of {kind} have no replaceable fields; needed to set {', '.join(fields)}"
+    )
 
 
 def shapes_of(tree: PyTree) -> Any:
     """Returns the structure of a pytree, and the shape of each leaf, None of what is no array."""
-    return jax.tree.structure(tree), [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
+    return jax.tree.structure(tree), [
+        getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)
+    ]
 
 
-def check_act(name: str, returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
-    """Returns what a policy's `act` returned: actions of a shape, and a recurrent state like its `memory`.
+def check_act(
+    name: str, returned: Any, shape: tuple[int, ...], memory: Memory
+) -> tuple[jax.Array, Memory]:
+    """Returns what a policy's `act` returned: actions of a shape, and a recurrent state like its
+    `memory`.
 
     InputError, naming the argument that the policy is, for anything else.
     """
     if not isinstance(returned, tuple | list) or len(returned) != 2:
-        found, expected = f"returns {type(returned).__name__}", "returns (action, memory)"
-    elif shapes_of(returned[0]) != shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32)) or is_typed_key(returned[0]):
+        found = f"returns {type(returned).__name__}"
+        expected = "returns (action, memory)"
+    elif shapes_of(returned[0]) != shapes_of(
+        jax.ShapeDtypeStruct(shape, jnp.float32)
+    ) or is_typed_key(returned[0]):
         given = getattr(returned[0], "shape", type(returned[0]).__name__)
-        found, expected = f"returns actions {given}", f"returns {shape}"
+        found = f"returns actions {given}"
+        expected = f"returns {shape}"
     elif shapes_of(returned[1]) != shapes_of(memory):
-        found, expected = "changes the structure of its memory", "keeps it"
+        found = "changes the structure of its memory"
+        expected = "keeps it"
     else:
         return returned[0], returned[1]
     fail(name, f"a function that {found}", f"one that {expected}")
@@ -212,11 +249,16 @@ def teams_of(env: VectorEnv) -> Teams:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How an episode ended, for K teams; before its last step, as if it ended there. Any leading axes."""
+    """How an episode ended, for K teams; before its last step, as if it ended there.
+
+    Any leading axes.
+    """
 
     success: Any = None
-    """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None without such a measure."""
-    win: Any = None  # whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss
+    """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None without such a
+    measure."""
+    # whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss
+    win: Any = None
     draw: Any = None  # whether it was a draw (K,)
     loss: Any = None  # whether each team lost (K,)
     further: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
@@ -233,17 +275,23 @@ class Outcome:
         """Returns the outcome with all arrays (..., K) changed."""
         teams = {name: getattr(self, name) for name in ("success", *RESULTS)}
         teams = {name: change(x) for name, x in teams.items() if x is not None}
-        return dataclasses.replace(self, **teams, further={name: change(x) for name, x in self.further.items()})
+        return dataclasses.replace(
+            self, **teams, further={name: change(x) for name, x in self.further.items()}
+        )
 
     def by_name(self) -> dict[str, jax.Array]:
-        """Returns the values by the names under which they are logged: `success`, `team0/win`, `ending/fall`, ..."""
+        """Returns the values by the names under which they are logged: `success`, `team0/win`,
+        `ending/fall`, ...
+        """
         values = {} if self.success is None else {"success": self.success[..., 0]}
         if self.win is None:
             values |= {f"success/{name}": x[..., 0] for name, x in self.further.items()}
         else:
             results = {**{name: getattr(self, name) for name in RESULTS}, **self.further}
             teams = range(self.win.shape[-1])
-            values |= {f"team{team}/{name}": x[..., team] for team in teams for name, x in results.items()}
+            values |= {
+                f"team{team}/{name}": x[..., team] for team in teams for name, x in results.items()
+            }
         return values | {f"ending/{name}": x for name, x in self.ending.items()}
 
 
@@ -259,7 +307,10 @@ class Observations:
 
     def of(self, agents: slice) -> "Observations":
         """Returns what some of the agents see."""
-        cut = lambda x: x[..., agents, :]  # noqa: E731
+
+        def cut(x):
+            return x[..., agents, :]
+
         active = None if self.active is None else self.active[..., agents]
         return Observations(cut(self.obs), active, jax.tree.map(cut, self.groups))
 
@@ -267,16 +318,23 @@ class Observations:
         """Returns the observations of a group (N, A, O_g); InputError if they are missing."""
         if name != "policy" and name not in self.groups:
             allowed = ", ".join(["policy", *self.groups])
-            raise InputError(f"group: {name!r} is missing in the state; `VectorEnv.with_groups` adds it to {allowed}")
+            raise InputError(
+                f"group: {name!r} is missing in the state; `VectorEnv.with_groups` adds it to "
+                f"{allowed}"
+            )
         return self.obs if name == "policy" else self.groups[name]
 
     def to(self, policy: Any) -> Any:
-        """Returns the argument of a policy's `act`: these, or an array for a policy that declares no `groups`."""
+        """Returns the argument of a policy's `act`: these, or an array for a policy that declares
+        no `groups`.
+        """
         return self if hasattr(policy, "groups") else self.obs
 
     @classmethod
     def at(cls, seen: Any) -> "Observations":
-        """Returns the observations of an environment's state; an array is that of the group `policy`."""
+        """Returns the observations of an environment's state; an array is that of the group
+        `policy`.
+        """
         return seen if isinstance(seen, Observations) else cls(seen)
 
 
@@ -312,8 +370,10 @@ class Transition(NamedTuple):
     is_first: jax.Array  # whether the step is the first of its episode (N,) bool
     obs: jax.Array  # observations (N, A, O)
     privileged_obs: jax.Array  # privileged observations (N, P)
-    final_obs: jax.Array | None  # observations of the state reached (N, A, O), or None if the critic does not read them
-    final_privileged_obs: jax.Array | None  # privileged observations of the state reached (N, P), or None
+    # observations of the state reached (N, A, O), or None if the critic does not read them
+    final_obs: jax.Array | None
+    # privileged observations of the state reached (N, P), or None
+    final_privileged_obs: jax.Array | None
     action: jax.Array  # actions as sampled: unscaled and unclipped (N, A, D)
     log_prob: jax.Array  # log-probabilities of the actions (N, A, D)
     reward: jax.Array  # rewards (N, A)
@@ -321,11 +381,14 @@ class Transition(NamedTuple):
     learners: jax.Array  # active agents from whose samples the policy learns (N, A) bool
     terminated: jax.Array  # whether the episode terminated (N,) bool
     done: jax.Array  # whether it was terminated or truncated (N,) bool
-    teacher_action: Any = ()  # actions of the teacher, as the environment would get them (N, A, D); empty without one
+    # actions of the teacher, as the environment would get them (N, A, D); empty without one
+    teacher_action: Any = ()
 
 
 class Batch(NamedTuple):
-    """Chunks of L steps (L, C, ...), with the recurrent state at each chunk's first step (C, ...)."""
+    """Chunks of L steps (L, C, ...), with the recurrent state at each chunk's first step (C,
+    ...).
+    """
 
     memory: NetworkMemory
     is_first: jax.Array
@@ -338,4 +401,5 @@ class Batch(NamedTuple):
     old_value: jax.Array  # normalised values at collection (L, C, V)
     active: jax.Array  # which agents took part (L, C, A) bool
     learners: jax.Array  # active agents from whose samples the policy learns (L, C, A) bool
-    teacher_action: Any = ()  # the first D' entries of the teacher's actions, unscaled (L, C, A, D'); empty without one
+    # the first D' entries of the teacher's actions, unscaled (L, C, A, D'); empty without one
+    teacher_action: Any = ()

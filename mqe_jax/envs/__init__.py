@@ -43,7 +43,12 @@ def tasks() -> tuple[str, ...]:
 
 @check_arguments(task=str, impl=str, control=str, num_envs=Environments)
 def make(
-    task: str, *, impl: str = "auto", control: str = "command", num_envs: int = 4096, **overrides: Any
+    task: str,
+    *,
+    impl: str = "auto",
+    control: str = "command",
+    num_envs: int = 4096,
+    **overrides: Any,
 ) -> "QuadrupedEnv":
     """Creates the environment of a task.
 
@@ -58,8 +63,8 @@ def make(
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         control: action mode: 'command', 'position' or 'torque'.
         num_envs: maximum batch size; sizes Warp's contact buffer.
-        overrides: task parameters by name. Nested ones are mappings, `rewards={"collision": -5.0}`, or have dotted
-            names in a dict, `**{"rewards.collision": -5.0}`.
+        overrides: task parameters by name. Nested ones are mappings, `rewards={"collision": -5.0}`,
+            or have dotted names in a dict, `**{"rewards.collision": -5.0}`.
 
     Raises:
         InputError: for an unknown task, engine, mode or parameter, or a value that is not allowed.

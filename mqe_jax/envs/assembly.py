@@ -1,4 +1,6 @@
-"""What an environment is made of: its scene and its controller, from the task and its parameters."""
+"""What an environment is made of: its scene and its controller, from the task and its
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,16 @@ from mqe_jax.skills.control import Controller
 
 def make_scene(task: Task[Any, Any]) -> Scene:
     """Returns the task's scene with the robot, physics and sensors of its parameters."""
-    scene, params = task.scene(), task.params
+    scene = task.scene()
+    params = task.params
     # NPC robots follow joint targets in every mode.
-    by_torque = task.num_agents if task.control == "torque" else scene.num_robots if params.actuator_network else 0
+    by_torque = (
+        task.num_agents
+        if task.control == "torque"
+        else scene.num_robots
+        if params.actuator_network
+        else 0
+    )
     return dataclasses.replace(
         scene,
         robot=task.robot,
@@ -34,14 +43,16 @@ def make_scene(task: Task[Any, Any]) -> Scene:
 def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Controller:
     """Returns the controller of the scene's robots: the agents' skill, and that of NPC robots.
 
-    Warns of commands beyond those that the skill was trained for. InputError for a skill whose period is not that of an
-    environment step of `num_substeps`.
+    Warns of commands beyond those that the skill was trained for. InputError for a skill whose
+    period is not that of an environment step of `num_substeps`.
     """
     params = task.params
     skill = skills.make(params.skill, task.robot)
-    npc, npcs = None, scene.num_robots > task.num_agents
+    npc = None
+    npcs = scene.num_robots > task.num_agents
     if npcs and task.npc_skill != skill.name:
-        other, npcs = skills.make(task.npc_skill, task.robot), False
+        other = skills.make(task.npc_skill, task.robot)
+        npcs = False
         other = other.restrict(task.npc_varied, None) if task.npc_varied else other
         other.check_period(scene.timestep, num_substeps)
         npc = other, other.load_params()

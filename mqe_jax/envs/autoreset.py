@@ -21,9 +21,18 @@ from mqe_jax.envs.state import State
 from mqe_jax.sensors.suite import ONBOARD
 
 SEEN = ("obs", "privileged_obs", "groups")
-"""Fields of observations. They describe the state after a reset; `VectorEnv.final` adds those from before it."""
+"""Fields of observations. They describe the state after a reset; `VectorEnv.final` adds those from
+before it."""
 
-KEPT = ("assistance", "reward", "terminated", "truncated", "outcome", "metrics", *(f"final_{name}" for name in SEEN))
+KEPT = (
+    "assistance",
+    "reward",
+    "terminated",
+    "truncated",
+    "outcome",
+    "metrics",
+    *(f"final_{name}" for name in SEEN),
+)
 """Fields that an auto-reset keeps; all but the first describe the last step."""
 
 _SMALL = 4096
@@ -33,12 +42,15 @@ Start = Callable[[jax.Array, jax.Array], State]
 """Returns an initial state from a random key and the assistance, as `QuadrupedEnv.begin`."""
 
 
-def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None, groups: Sequence[str] = ()) -> State:
-    """Replaces the state of one environment by a new initial state if its episode has ended, and observes it.
+def autoreset(
+    env: QuadrupedEnv, state: State, start: Start | None = None, groups: Sequence[str] = ()
+) -> State:
+    """Replaces the state of one environment by a new initial state if its episode has ended, and
+    observes it.
 
-    Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step that ended the episode,
-    and `assistance` is kept. `start` samples the new state, by default the task's reset. `groups` are observed in
-    addition to the group `policy`.
+    Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step
+    that ended the episode, and `assistance` is kept. `start` samples the new state, by default the
+    task's reset. `groups` are observed in addition to the group `policy`.
     """
     done = state.terminated | state.truncated
     with jax.named_scope("reset"):
@@ -46,7 +58,9 @@ def autoreset(env: QuadrupedEnv, state: State, start: Start | None = None, group
         fresh = (start or env.begin)(reset_key, state.assistance)
         merged = {
             field.name: jax.tree.map(
-                lambda new, old: jnp.where(done, new, old), getattr(fresh, field.name), getattr(state, field.name)
+                lambda new, old: jnp.where(done, new, old),
+                getattr(fresh, field.name),
+                getattr(state, field.name),
             )
             for field in dataclasses.fields(state)
             if field.name not in ("data", "key", *SEEN, *KEPT)
@@ -70,18 +84,23 @@ class EnvBatch:
         return f"<{type(self).__name__} of {self.num_envs}: {getattr(self, 'inner', self.env)!r}>"
 
     def check_step(self, state: Any, action: jax.Array, kind: type) -> None:
-        """Raises an InputError unless state is a `kind` of N environments and actions are (N, A, action_size)."""
+        """Raises an InputError unless state is a `kind` of N environments and actions are (N, A,
+        action_size).
+        """
         steps = jnp.shape(state.step) if isinstance(state, kind) else ()
         if steps != (self.num_envs,):
             found = f"{type(state).__name__} {steps}".removesuffix(" ()")
             raise InputError(
-                f"state: {found} is not allowed; it must be the {kind.__name__} of {self.num_envs} environments that "
+                f"state: {found} is not allowed; it must be the {kind.__name__} of "
+                f"{self.num_envs} environments that "
                 f"`reset` of this {type(self).__name__} returns"
             )
         shape = (self.num_envs, self.num_agents, self.action_size)
         if getattr(action, "shape", None) != shape:
             given = getattr(action, "shape", type(action).__name__)
-            raise InputError(f"action: shape {given}; expected {shape} (environments, agents, action size)")
+            raise InputError(
+                f"action: shape {given}; expected {shape} (environments, agents, action size)"
+            )
 
 
 class VectorEnv(EnvBatch):
@@ -98,23 +117,31 @@ class VectorEnv(EnvBatch):
     groups: tuple[str, ...] = ()
     """Groups that are observed besides `policy`."""
 
-    def __init__(self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = SEEN) -> None:
+    def __init__(
+        self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = SEEN
+    ) -> None:
         """Creates the batch.
 
-        `copies` is the number of batches under an outer `vmap`, such as one per seed; buffers are sized for all.
-        `final` names the fields in `SEEN` that a step also returns as they were before any reset (`final_obs`, ...). A
-        critic needs those that it reads, and each takes time.
+        `copies` is the number of batches under an outer `vmap`, such as one per seed; buffers are
+        sized for all. `final` names the fields in `SEEN` that a step also returns as they were
+        before any reset (`final_obs`, ...). A critic needs those that it reads, and each takes
+        time.
         """
         if not isinstance(env, QuadrupedEnv):
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
-        num_envs, copies = check("num_envs", num_envs, Environments), check("copies", copies, PositiveInt)
+        num_envs = check("num_envs", num_envs, Environments)
+        copies = check("copies", copies, PositiveInt)
         self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
-        self.num_envs, self.copies, self.final = num_envs, copies, tuple(final)
+        self.num_envs = num_envs
+        self.copies = copies
+        self.final = tuple(final)
         if not {*final} <= {*SEEN}:
             fail("final", final, f"some of {', '.join(SEEN)}")
         if num_envs * copies > _SMALL:
             state = jax.eval_shape(functools.partial(VectorEnv.reset, self), jax.random.PRNGKey(0))
-            check_memory("num_envs", num_envs * copies, copies * bytes_of(state) / jax.process_count())
+            check_memory(
+                "num_envs", num_envs * copies, copies * bytes_of(state) / jax.process_count()
+            )
         self.name = env.name
         self.max_episode_steps = env.max_steps
         self.num_agents = env.num_agents
@@ -125,7 +152,9 @@ class VectorEnv(EnvBatch):
         self.group_sizes = env.group_sizes
 
     def with_groups(self, names: Iterable[str]) -> Self:
-        """Returns the batch that also observes further groups; InputError for one that the task does not have."""
+        """Returns the batch that also observes further groups; InputError for one that the task
+        does not have.
+        """
         other = copy.copy(self)
         other.groups = tuple(sorted({*names} - {"policy"}))
         for name in other.groups:
@@ -137,17 +166,23 @@ class VectorEnv(EnvBatch):
     @check_arguments(key=RandomKey)
     def reset(self, key: jax.Array) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
-        return jax.vmap(self._reset)(devices.rows(lambda n: jax.random.split(key, n), self.num_envs))
+        return jax.vmap(self._reset)(
+            devices.rows(lambda n: jax.random.split(key, n), self.num_envs)
+        )
 
     def share(self, parts: int) -> Self:
-        """Returns the batch of one of several processes; InputError if the environments do not divide evenly."""
+        """Returns the batch of one of several processes; InputError if the environments do not
+        divide evenly.
+        """
         other = copy.copy(self)
         other.num_envs = devices.share("num_envs", self.num_envs, parts)
         other.env = self.env.with_num_envs(other.num_envs * self.copies)
         return other
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
+        """Advances all environments by one step with actions (N, A, action_size); resets those that
+        ended.
+        """
         self.check_step(state, action, State)
         return jax.vmap(self._step)(state, action)
 
@@ -156,12 +191,18 @@ class VectorEnv(EnvBatch):
         return self._with_final(self.env.with_observations(self.env.begin(key), self.groups))
 
     def _with_final(self, state: State) -> State:
-        """Returns a state whose observations, as far as `final` names them, are also those at the end of its step."""
-        return dataclasses.replace(state, **{f"final_{name}": getattr(state, name) for name in self.final})
+        """Returns a state whose observations, as far as `final` names them, are also those at the
+        end of its step.
+        """
+        return dataclasses.replace(
+            state, **{f"final_{name}": getattr(state, name) for name in self.final}
+        )
 
     @single
     def _step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
-        """Advances one environment, and resets it to `start` if its episode ended; see `autoreset`."""
+        """Advances one environment, and resets it to `start` if its episode ended; see
+        `autoreset`.
+        """
         state = self.env.advance(state, action)
         if self.final:
             seen = self._with_final(self.env.with_observations(state, self.groups))

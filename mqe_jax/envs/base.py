@@ -1,7 +1,9 @@
-"""The environment core: one environment of several robots as pure `reset` and `step` functions, batched by `jax.vmap`.
+"""The environment core: one environment of several robots as pure `reset` and `step` functions,
+batched by `jax.vmap`.
 
-A task is a subclass in its own file (`mqe_jax.envs.task`). This module has what all tasks share: spawning, control,
-physics, randomisation, falls, collisions, the time limit, and the detection of diverged physics.
+A task is a subclass in its own file (`mqe_jax.envs.task`). This module has what all tasks share:
+spawning, control, physics, randomisation, falls, collisions, the time limit, and the detection of
+diverged physics.
 """
 
 from __future__ import annotations
@@ -42,11 +44,14 @@ from mqe_jax.skills.control import check_mode
 if TYPE_CHECKING:
     from mujoco import mjx
 
-_NOISE, _SENSING = 7919, 7907  # folded into a state's key for the noise of its observations, and for its sensors
+# folded into a state's key for the noise of its observations, and for its sensors
+_NOISE = 7919
+_SENSING = 7907
 
 
 class QuadrupedEnv(Task[S, P]):
-    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by `jax.jit`.
+    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by
+    `jax.jit`.
 
     Example:
         ```python
@@ -57,58 +62,87 @@ class QuadrupedEnv(Task[S, P]):
 
     @single
     def __init__(
-        self, params: P | None = None, *, impl: str = "auto", control: str = "command", num_envs: int = 4096
+        self,
+        params: P | None = None,
+        *,
+        impl: str = "auto",
+        control: str = "command",
+        num_envs: int = 4096,
     ) -> None:
         self.params = self.Params() if params is None else params
         self.weights = weights_of(self.params)
         offset = self.params.randomization.motor_offset
         self.control = check_mode(control)
         if offset and control == "torque":
-            fail("randomization.motor_offset", offset, "0 with control torque, which has no joint targets")
+            fail(
+                "randomization.motor_offset",
+                offset,
+                "0 with control torque, which has no joint targets",
+            )
         num_envs = check("num_envs", num_envs, Environments)
-        self.num_agents, self.robot = self.params.num_agents, robots.get(self.params.robot)
+        self.num_agents = self.params.num_agents
+        self.robot = robots.get(self.params.robot)
         check_sizes(self)
         self._scene = scene = make_scene(self)
         self.compiled = compile_scene(scene)
-        self.index, self.objects = self.compiled.index, self.compiled.objects
+        self.index = self.compiled.index
+        self.objects = self.compiled.objects
         self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
             impl=impl,
             num_envs=num_envs,
             contacts_per_env=scene.max_contacts,
-            max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots + 4 * self.extra_contacts,
+            max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots
+            + 4 * self.extra_contacts,
             sparse_solver=self.params.sparse_solver,
         )
         self.impl = self.physics.impl
         self.check_senses()
         self.dt = float(self.compiled.model.opt.timestep) * self.physics.num_substeps
         if self.max_steps < 1:
-            fail("episode_length", self.params.episode_length, f"at least one environment step, {self.dt} s")
+            fail(
+                "episode_length",
+                self.params.episode_length,
+                f"at least one environment step, {self.dt} s",
+            )
         self.actuators = None
         if (network := self.params.actuator_network) and control != "torque":
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
         self.controller = make_controller(self, scene, self.physics.num_substeps)
         self.sizes = Sizes(self)
-        self.randomizer = Randomizer(self.params.randomization, self.compiled.model, self.index, self.params.friction)
+        self.randomizer = Randomizer(
+            self.params.randomization, self.compiled.model, self.index, self.params.friction
+        )
         self.privileged = PrivilegedObservation(
             self.robot,
             self.compiled.model,
             self.index,
             num_anchors=len(self.compiled.layout.anchors),
-            clock_size=jax.eval_shape(lambda: self.controller.clock(self.controller.reset())).shape[1],
+            clock_size=jax.eval_shape(lambda: self.controller.clock(self.controller.reset())).shape[
+                1
+            ],
             contact_forces=self.params.privileged_contact_forces,
         )
 
     def __repr__(self) -> str:
-        size, actions = self.observation_size, f"{self.control} {self.action_size}"
+        size = self.observation_size
+        actions = f"{self.control} {self.action_size}"
         actions += f" ({self.params.commanded_text()})" if self.control == "command" else ""
         agents = " vs ".join(str(len(team)) for team in self.teams)
         changed = differences(self.params, self.Params())
-        changed |= {"senses": [sensor.name for sensor in self.params.senses]} if self.params.senses else {}
+        changed |= (
+            {"senses": [sensor.name for sensor in self.params.senses]} if self.params.senses else {}
+        )
         changed = [f"{name}={value!r}" for name, value in changed.items()]
-        facts = [f"{agents} agents", f"observation {size}", f"action {actions}", f"engine {self.impl}", *changed]
+        facts = [
+            f"{agents} agents",
+            f"observation {size}",
+            f"action {actions}",
+            f"engine {self.impl}",
+            *changed,
+        ]
         return f"<{self.name}: {', '.join(facts)}>"
 
     @property
@@ -123,7 +157,9 @@ class QuadrupedEnv(Task[S, P]):
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
-        """Rendering model: the physics model plus visual geoms; qpos and mocap layouts are identical."""
+        """Rendering model: the physics model plus visual geoms; qpos and mocap layouts are
+        identical.
+        """
         return build_model(self._scene, visual=True)[0]
 
     @property
@@ -133,7 +169,9 @@ class QuadrupedEnv(Task[S, P]):
 
     @check_arguments(num_envs=Environments)
     def with_num_envs(self, num_envs: int) -> QuadrupedEnv[S, P]:
-        """Returns an environment whose engine holds `num_envs` environments: itself, or one with larger buffers."""
+        """Returns an environment whose engine holds `num_envs` environments: itself, or one with
+        larger buffers.
+        """
         if self.physics.holds(num_envs):
             return self
         return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
@@ -141,23 +179,38 @@ class QuadrupedEnv(Task[S, P]):
     @single
     @check_arguments(key=RandomKey, assistance=Level)
     def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
-        """Returns a randomised initial state; the task is unmodified at `assistance` 0, a curriculum level up to 1."""
+        """Returns a randomised initial state; the task is unmodified at `assistance` 0, a
+        curriculum level up to 1.
+        """
         return with_final(self.with_observations(self.begin(key, assistance)))
 
     def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns the state of `reset` without observations."""
         keys = jax.random.split(key, 9)
-        next_key, anchor_key, spawn_key, body_key, object_key, physics_key, task_key, size_key, freeze_key = keys
+        (
+            next_key,
+            anchor_key,
+            spawn_key,
+            body_key,
+            object_key,
+            physics_key,
+            task_key,
+            size_key,
+            freeze_key,
+        ) = keys
         assistance = jnp.asarray(assistance, jnp.float32)
         anchors = self.compiled.sample_anchors(anchor_key)
         active = self.sizes.draw(size_key, assistance)
-        qpos, qvel = self._sample_robots(self.sizes.line_up(self.spawn(spawn_key), active), body_key)
+        qpos, qvel = self._sample_robots(
+            self.sizes.line_up(self.spawn(spawn_key), active), body_key
+        )
         qpos, qvel = self.reset_objects(object_key, qpos, qvel, assistance)
         ctrl = self._ctrl(jnp.asarray(self.controller.neutral))
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
         data = self.sizes.park(data, active)
         robot_state = self.read(data, active)
-        no, empty = jnp.zeros((), bool), jnp.zeros((0,))
+        no = jnp.zeros((), bool)
+        empty = jnp.zeros((0,))
         nothing: Any = None
         state = State(
             data=data,
@@ -186,17 +239,22 @@ class QuadrupedEnv(Task[S, P]):
         now = Moment(state, robot_state)
         _, logged = self.score(now, now, no)
         names = (*logged, "collision", "diverged", "overflow")
-        outcome = dataclasses.replace(self.result(state, robot_state, no), ending=dict.fromkeys(ENDINGS, no))
+        outcome = dataclasses.replace(
+            self.result(state, robot_state, no), ending=dict.fromkeys(ENDINGS, no)
+        )
         outcome = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), outcome)
-        return dataclasses.replace(state, outcome=outcome, metrics={name: jnp.zeros(()) for name in names})
+        return dataclasses.replace(
+            state, outcome=outcome, metrics={name: jnp.zeros(()) for name in names}
+        )
 
     @single
     def step(self, state: State[S], action: jax.Array) -> State[S]:
-        """Advances one environment by one environment step with actions (A, action_size), clipped to [-1, 1].
+        """Advances one environment by one environment step with actions (A, action_size), clipped
+        to [-1, 1].
 
-        An episode that has ended continues unless it is reset (see `VectorEnv`). InputError for a state of another task
-        or of a batch, and for an action of another shape or dtype, or that is not finite. In compiled code an action
-        that is not finite ends the episode as diverged.
+        An episode that has ended continues unless it is reset (see `VectorEnv`). InputError for a
+        state of another task or of a batch, and for an action of another shape or dtype, or that is
+        not finite. In compiled code an action that is not finite ends the episode as diverged.
         """
         return with_final(self.with_observations(self.advance(state, action)))
 
@@ -206,7 +264,9 @@ class QuadrupedEnv(Task[S, P]):
         self.check_state(state)
         action = self.controller.check_action(action, self.action_size)
         bad_action = ~jnp.all(jnp.isfinite(action) | ~state.active[:, None])
-        action = jnp.clip(jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit)
+        action = jnp.clip(
+            jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit
+        )
         still = (state.step < state.frozen_steps) | ~self.acting(state)
         own_action = jnp.where(still[:, None], 0.0, action)
         action = self.unmirror_action(self.moving(own_action))
@@ -223,27 +283,42 @@ class QuadrupedEnv(Task[S, P]):
         if self.params.randomization.motor_offset:
             target = target + state.randomized.motor_offset
         target = self.sizes.hold(target, state.active)
-        data = self.step_npcs(self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key)
+        data = self.step_npcs(
+            self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key
+        )
         data = self.sizes.park(data, state.active)
-        fields, forces = self.randomizer.fields(state.randomized) | self.fields(state), self.external_forces(state)
+        fields = self.randomizer.fields(state.randomized) | self.fields(state)
+        forces = self.external_forces(state)
         if self.actuators is None:
             actuators = ()
-            data, overflow = self.physics.step(data, self._ctrl(target), fields=fields, xfrc_applied=forces)
+            data, overflow = self.physics.step(
+                data, self._ctrl(target), fields=fields, xfrc_applied=forces
+            )
         else:
-            data, actuators, overflow = self.actuators.step(data, state.actuators, target, fields, forces)
+            data, actuators, overflow = self.actuators.step(
+                data, state.actuators, target, fields, forces
+            )
         robot_state = self.read(data, state.active)
         senses = state.senses._replace(action=own_action) if self.params.senses else ()
         moved = {"data": data, "control": control, "actuators": actuators, "senses": senses}
         state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
         state = self.judge(before, Moment(state, robot_state), bad_action)
-        return dataclasses.replace(state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)})
+        return dataclasses.replace(
+            state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)}
+        )
 
     @jax.named_scope("task")
     def with_observations(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
-        """Returns the state with its observations, also of further groups; once a step, as sensors have memory."""
-        robots, noise, seen = self.read(state.data, state.active), self.params.randomization.observation_noise, {}
+        """Returns the state with its observations, also of further groups; once a step, as sensors
+        have memory.
+        """
+        robots = self.read(state.data, state.active)
+        noise = self.params.randomization.observation_noise
+        seen = {}
         there = self.there(state) if self.varies else {}
-        for number, (name, layout) in enumerate({"policy": self.observation_layout, **self.groups}.items()):
+        for number, (name, layout) in enumerate(
+            {"policy": self.observation_layout, **self.groups}.items()
+        ):
             if name != "policy" and name not in groups:
                 continue
             if name == ONBOARD:
@@ -251,7 +326,11 @@ class QuadrupedEnv(Task[S, P]):
                 blocks, senses = self.suite.observe(self.snapshot(state, robots), state.senses, key)
                 state = dataclasses.replace(state, senses=senses)
             else:
-                blocks = self.observe(state, robots) if name == "policy" else self.observe_group(name, state, robots)
+                blocks = (
+                    self.observe(state, robots)
+                    if name == "policy"
+                    else self.observe_group(name, state, robots)
+                )
             obs = layout.pack(blocks, self.num_agents)
             if noise:
                 key = jax.random.fold_in(state.key, _NOISE + number)
@@ -262,18 +341,33 @@ class QuadrupedEnv(Task[S, P]):
         seen = {"obs": seen.pop("policy"), "privileged_obs": finite(privileged), "groups": seen}
         return dataclasses.replace(state, **seen)
 
-    def judge(self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False) -> State[S]:
-        """Returns the state after a step with the task's own fields, reward, metrics and ending of this step."""
+    def judge(
+        self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False
+    ) -> State[S]:
+        """Returns the state after a step with the task's own fields, reward, metrics and ending of
+        this step.
+        """
         state, robot_state = after
         diverged = bad_action | self._diverged(state.data)
-        collision = jnp.any(robot_state.count(robot_state.trunk_force[: self.num_agents] > self.params.collision_force))
-        state = dataclasses.replace(state, task=alike("step_task", self.step_task(before, after), state.task))
+        collision = jnp.any(
+            robot_state.count(
+                robot_state.trunk_force[: self.num_agents] > self.params.collision_force
+            )
+        )
+        state = dataclasses.replace(
+            state, task=alike("step_task", self.step_task(before, after), state.task)
+        )
         reward, logged = self.score(before, Moment(state, robot_state), collision)
-        fall, crash = jnp.any(self.fallen(robot_state)) & self.falls_end, collision & self.params.end_on_collision
+        fall = jnp.any(self.fallen(robot_state)) & self.falls_end
+        crash = collision & self.params.end_on_collision
         failed = diverged | fall | crash
         decided = check_shape("ending", self.ending(state, robot_state), (), dtype=bool)
-        terminated, late = failed | decided, state.step >= self.max_steps
-        clean = lambda x, instead=0.0: jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))  # noqa: E731
+        terminated = failed | decided
+        late = state.step >= self.max_steps
+
+        def clean(x, instead=0.0):
+            return jnp.where(diverged, instead, jnp.asarray(x, jnp.float32))
+
         outcome = self.result(state, robot_state, failed)
         draw = None if outcome.draw is None else clean(outcome.draw, 1.0)
         causes = jnp.stack([diverged, fall, crash, decided, late])
@@ -283,56 +377,78 @@ class QuadrupedEnv(Task[S, P]):
         metrics = {name: clean(value) for name, value in {**logged, "collision": collision}.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
         ended = {"terminated": terminated, "truncated": ~terminated & late}
-        return dataclasses.replace(state, reward=clean(reward), **ended, outcome=outcome, metrics=metrics)
+        return dataclasses.replace(
+            state, reward=clean(reward), **ended, outcome=outcome, metrics=metrics
+        )
 
     def observe_privileged(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns the privileged observation (P,), in the blocks of `privileged_layout`."""
         return self.privileged.observe(robot_state, state, self.controller.clock(state.control))
 
     def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:
-        """Returns the outcome of an episode that ends in this step, without the cause; arguments as of `outcome`."""
+        """Returns the outcome of an episode that ends in this step, without the cause; arguments as
+        of `outcome`.
+        """
         values = results("outcome", self.outcome(state, robot_state, failed))
         values = {name: value[None] for name, value in values.items()}
         return Outcome(success=values.pop("success"), further=values)
 
     def read(self, data: mjx.Data, active: jax.Array | None = None) -> RobotState:
-        """Returns the state of all robots; `active` (A,) says which agents take part, by default all."""
+        """Returns the state of all robots; `active` (A,) says which agents take part, by default
+        all.
+        """
         return read_robots(self.index, data.qpos, data.qvel, data.sensordata, active)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
-        """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame; InputError if unknown."""
+        """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame;
+        InputError if unknown.
+        """
         check("name", name, Literal[tuple(self.objects)])
         qpos: Any = getattr(data, "qpos", None)
         if np.shape(qpos)[-1:] != (self.compiled.model.nq,):
             fail("data", data, "the data of a state of this task")
-        return jnp.concatenate(poses(self.compiled.model, data, [self.objects[name].body]), axis=-1)[0]
+        return jnp.concatenate(
+            poses(self.compiled.model, data, [self.objects[name].body]), axis=-1
+        )[0]
 
     def fallen(self, robot_state: RobotState) -> jax.Array:
         """Returns which active robots exceed the roll, pitch or height limits (R,) bool."""
-        params, height = self.params, robot_state.position_w[:, 2]
-        roll, pitch = jnp.abs(robot_state.euler[:, 0]), jnp.abs(robot_state.euler[:, 1])
+        params = self.params
+        height = robot_state.position_w[:, 2]
+        roll = jnp.abs(robot_state.euler[:, 0])
+        pitch = jnp.abs(robot_state.euler[:, 1])
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
-        return (out | (height < params.min_height) | (height > params.max_height)) & robot_state.active
+        return (
+            out | (height < params.min_height) | (height > params.max_height)
+        ) & robot_state.active
 
     def _ctrl(self, targets: jax.Array) -> jax.Array:
         """Returns the engine's control (nu,) from targets of all robots (R, 12)."""
         return scatter(np.zeros(self.compiled.model.nu), self.index.actuator, targets)
 
     def _sample_robots(self, pose: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        params, model, index = self.params, self.compiled.model, self.index
+        params = self.params
+        model = self.compiled.model
+        index = self.index
         joint_key, velocity_key = jax.random.split(key)
         low, high = params.spawn_joint_scale
         factor = jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
-        joints = jnp.clip(self.robot.default_joints * factor, self.robot.joint_lower, self.robot.joint_upper)
+        joints = jnp.clip(
+            self.robot.default_joints * factor, self.robot.joint_lower, self.robot.joint_upper
+        )
         speed = params.spawn_velocity
-        velocity = jax.random.uniform(velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed)
+        velocity = jax.random.uniform(
+            velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed
+        )
         level = jnp.zeros(len(pose))
         turn = euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
         robots = np.concatenate([index.base_qpos, index.joint_qpos], axis=-1)
         qpos = scatter(model.qpos0, robots, jnp.concatenate([pose[:, :3], turn, joints], axis=-1))
         return qpos, scatter(np.zeros(model.nv), index.base_qvel, velocity)
 
-    def _sample_frozen_steps(self, key: jax.Array, assistance: jax.Array, active: jax.Array) -> jax.Array:
+    def _sample_frozen_steps(
+        self, key: jax.Array, assistance: jax.Array, active: jax.Array
+    ) -> jax.Array:
         agent_key, time_key = jax.random.split(key)
         steps = assistance * self.params.frozen_time / self.dt * jax.random.uniform(time_key, ())
         number = 1 + jax.random.randint(agent_key, (), 0, jnp.sum(active))
@@ -340,7 +456,8 @@ class QuadrupedEnv(Task[S, P]):
 
     def check_state(self, state: State[S]) -> None:
         """Raises an InputError for anything but a state of one environment of this task."""
-        names, size = {f"reward/{field.name}" for field in dataclasses.fields(self.weights)}, self.compiled.model.nq
+        names = {f"reward/{field.name}" for field in dataclasses.fields(self.weights)}
+        size = self.compiled.model.nq
         if isinstance(state, State):
             shape = jnp.shape(state.data.qpos)
             if shape == (size,) and names <= set(state.metrics):
@@ -349,10 +466,13 @@ class QuadrupedEnv(Task[S, P]):
         else:
             found = f"of type {type(state).__name__}"
         raise InputError(
-            f"state: {found} is not allowed; it must be one of {self.name}, with qpos ({size},), such as `reset` "
+            f"state: {found} is not allowed; it must be one of {self.name}, with qpos ({size},), "
+            "such as `reset` "
             "returns; jax.vmap or VectorEnv steps a batch"
         )
 
     def _diverged(self, data: mjx.Data) -> jax.Array:
-        slow, near = jnp.abs(data.qvel) < 1e3, jnp.abs(data.qpos[self.index.base_qpos[:, :3]]) < 1e3  # false for NaN
+        # false for NaN
+        slow = jnp.abs(data.qvel) < 1e3
+        near = jnp.abs(data.qpos[self.index.base_qpos[:, :3]]) < 1e3
         return ~(jnp.all(jnp.isfinite(data.qpos)) & jnp.all(slow) & jnp.all(near))

@@ -36,8 +36,8 @@ class BridgeParams(TaskParams):
     episode_length: TimeLimit = 20.0
     spawn_height: Length = 1.4
     platform: tuple[Length, Length] = (1.3, 2.5)
-    """Extents of both platforms along x and y, m; their long sides are perpendicular to the bridge, as in the paper's
-    figure."""
+    """Extents of both platforms along x and y, m; their long sides are perpendicular to the bridge,
+    as in the paper's figure."""
     platform_x: Coordinates = (2.35, 7.65)
     """X of the platforms' centres, m."""
     top: Length = 1.02
@@ -47,8 +47,8 @@ class BridgeParams(TaskParams):
     bridge_thickness: Length = 0.3
     """Thickness of the bridge, m."""
     spawn_x: Coordinates = (2.5, 7.5)
-    """X of the robots' spawn poses, m. The released system spawns the first robot at 2.0, with its hind feet on the
-    platform's edge; here the two poses are symmetric."""
+    """X of the robots' spawn poses, m. The released system spawns the first robot at 2.0, with its
+    hind feet on the platform's edge; here the two poses are symmetric."""
     off_height: Coordinate = 0.5
     """Height of a trunk below which a robot counts as off the bridge, m."""
     rewards: BridgeRewards = BridgeRewards()
@@ -59,7 +59,11 @@ class BridgeParams(TaskParams):
         check_above(self.spawn_height, self.top, self.robot)
         first, second = self.platform_x
         if second - first <= self.platform[0]:
-            fail("platform_x", self.platform_x, f"more than a platform's length, {self.platform[0]}, apart")
+            fail(
+                "platform_x",
+                self.platform_x,
+                f"more than a platform's length, {self.platform[0]}, apart",
+            )
 
 
 class Go1Bridge(Duel[None, BridgeParams]):
@@ -68,8 +72,8 @@ class Go1Bridge(Duel[None, BridgeParams]):
     - Scene: two platforms, 1 m high, joined by a bridge 0.7 m wide; one robot is spawned on each.
     - Observation: own base info 6, the opponent's base info 6, in the agent's own frame.
     - Reward: see `BridgeRewards`; zero-sum.
-    - End: a robot is off the bridge or has fallen, or 20 s. Win: the opponent is off or has fallen, or at the time
-      limit only this robot is on the other's platform.
+    - End: a robot is off the bridge or has fallen, or 20 s. Win: the opponent is off or has fallen,
+      or at the time limit only this robot is on the other's platform.
 
     Source: paper, section III.
     """
@@ -89,14 +93,20 @@ class Go1Bridge(Duel[None, BridgeParams]):
         first, second = params.platform_x
         length, width = params.platform
         objects = {
-            f"platform{side}": Platform(center=(x, 0.0, params.top), size=(length, width, params.top))
+            f"platform{side}": Platform(
+                center=(x, 0.0, params.top), size=(length, width, params.top)
+            )
             for side, x in enumerate(params.platform_x)
         }
         middle = (*self.center, params.top)
         span = second - first - length
-        objects["deck"] = Platform(center=middle, size=(span, params.bridge_width, params.bridge_thickness))
+        objects["deck"] = Platform(
+            center=middle, size=(span, params.bridge_width, params.bridge_thickness)
+        )
         ends = (first + length / 2, second - length / 2)
-        ground = grounds.river(params.platform_x, ends, (length, width, params.bridge_width), params.top)
+        ground = grounds.river(
+            params.platform_x, ends, (length, width, params.bridge_width), params.top
+        )
         blocks = (SpawnArea(2.0, back_wall=False), Plane(8.0))
         track = Track(blocks=blocks, width=6.0, walled=False, ground=ground)
         return Scene(track, num_robots=2, objects=objects, colors=(0, 2))
@@ -113,16 +123,22 @@ class Go1Bridge(Duel[None, BridgeParams]):
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         out = self.eliminated(after.state, after.robots)
-        return {"win": self.zero_sum(out[::-1] & ~out), "far_side": self.zero_sum(self.across(after.robots))}
+        return {
+            "win": self.zero_sum(out[::-1] & ~out),
+            "far_side": self.zero_sum(self.across(after.robots)),
+        }
 
     def eliminated(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns which robots are off the bridge or have fallen (2,) bool."""
-        return self.fallen(robot_state) | robot_state.count(robot_state.position_w[:, 2] < self.params.off_height)
+        return self.fallen(robot_state) | robot_state.count(
+            robot_state.position_w[:, 2] < self.params.off_height
+        )
 
     def across(self, robot_state: RobotState) -> jax.Array:
         """Returns which robots are on the opponent's platform (2,) bool."""
         params = self.params
-        x, height = robot_state.position_w[:, 0], robot_state.position_w[:, 2]
+        x = robot_state.position_w[:, 0]
+        height = robot_state.position_w[:, 2]
         first, second = params.platform_x
         half = params.platform[0] / 2
         reached = jnp.stack([x[0] > second - half, x[1] < first + half])

@@ -1,4 +1,6 @@
-"""go1revolvingdoor, the paper's Revolving Door: two robots compete to pass a door that is wide enough for one."""
+"""go1revolvingdoor, the paper's Revolving Door: two robots compete to pass a door that is wide
+enough for one.
+"""
 
 from collections.abc import Sequence
 
@@ -61,10 +63,12 @@ class DoorParams(TaskParams):
 class Go1RevolvingDoor(Duel[None, DoorParams]):
     """Revolving Door.
 
-    - Scene: a wall with a gap of 2 m that holds a door on a central hinge; both robots start on the same side.
+    - Scene: a wall with a gap of 2 m that holds a door on a central hinge; both robots start on the
+      same side.
     - Observation, mirrored for the second robot: own base info 6, the opponent's base info 6.
     - Reward: see `DoorRewards`; zero-sum.
-    - End: a robot is past the line, a fall, or 5 s. Win: past the line first, or the opponent falls.
+    - End: a robot is past the line, a fall, or 5 s. Win: past the line first, or the opponent
+      falls.
 
     Source: paper, section III.
     """
@@ -78,9 +82,18 @@ class Go1RevolvingDoor(Duel[None, DoorParams]):
     def scene(self) -> Scene:
         params = self.params
         wall = Gate(_WALL_LENGTH, width=params.gap)
-        blocks = (SpawnArea(params.door.position[0] - _WALL_LENGTH / 2), wall, Plane(2.5), EndWall())
-        colors, half = (0, 2), params.track_width / 2
-        marks = (*grounds.pads(self.spawn_poses(), colors), *grounds.finish(params.line_x, (-half, half)))
+        blocks = (
+            SpawnArea(params.door.position[0] - _WALL_LENGTH / 2),
+            wall,
+            Plane(2.5),
+            EndWall(),
+        )
+        colors = (0, 2)
+        half = params.track_width / 2
+        marks = (
+            *grounds.pads(self.spawn_poses(), colors),
+            *grounds.finish(params.line_x, (-half, half)),
+        )
         length = params.door.position[0] + 3.0
         ground = grounds.track((0.0, length), params.track_width, 2, marks, grounds.COURT)
         track = Track(blocks=blocks, width=params.track_width, wall_height=0.85, ground=ground)
@@ -88,12 +101,15 @@ class Go1RevolvingDoor(Duel[None, DoorParams]):
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Side by side in front of the door."""
-        x, y = self.params.spawn_x, self.params.spawn_y
+        x = self.params.spawn_x
+        y = self.params.spawn_y
         return (x, -y, 0.0), (x, y, 0.0)
 
     def distance(self, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to the midpoint of the line (2,), m."""
-        return jnp.linalg.norm(robot_state.position_w[:, :2] - jnp.array([self.params.line_x, 0.0]), axis=-1)
+        return jnp.linalg.norm(
+            robot_state.position_w[:, :2] - jnp.array([self.params.line_x, 0.0]), axis=-1
+        )
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         return {

@@ -1,4 +1,5 @@
-"""go1football-1vs1 and go1football-2vs2, one match of any size, and what all football tasks share: field and ball.
+"""go1football-1vs1 and go1football-2vs2, one match of any size, and what all football tasks share:
+field and ball.
 
 The field extends from x 2 to 12; the goals are gaps in the thick walls behind both goal lines.
 """
@@ -30,7 +31,8 @@ from mqe_jax.terrain import LANE, EndWall, Gate, Plane, SpawnArea, Track
 if TYPE_CHECKING:
     from mujoco import mjx
 
-# Midpoints of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1 attacks.
+# Midpoints of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1
+# attacks.
 GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)
 _GOAL_DEPTH = 1.0  # m
 FAR = 1e3  # m; distance of robots that take no part
@@ -56,9 +58,9 @@ class FootballParams(TaskParams):
     ball_noise: Distance = 0.0
     """Half-width of the uniform noise on the ball's position at reset, m."""
     head_start: Fraction = 0.0
-    """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a match to either one.
-    The robots that attack this goal start as far forward. Agents first learn to score from near. Inactive at assistance
-    0."""
+    """Curriculum: the ball starts up to head_start x `State.assistance` of the way to a goal, in a
+    match to either one. The robots that attack this goal start as far forward. Agents first learn
+    to score from near. Inactive at assistance 0."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,7 +77,8 @@ class Play:
 
     touched: jax.Array  # robots that touched it (R,) bool
     last: jax.Array  # the robot that touched it last (R,) bool
-    passes: jax.Array  # passes of each side (2,) int32: touches by a mate of the robot that touched the ball last
+    # passes of each side (2,) int32: touches by a mate of the robot that touched the ball last
+    passes: jax.Array
 
 
 class Football(QuadrupedEnv[S, F]):
@@ -117,7 +120,9 @@ class Football(QuadrupedEnv[S, F]):
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Samples the ball's initial position about its spot, and moves ball and robots by the head start."""
+        """Samples the ball's initial position about its spot, and moves ball and robots by the head
+        start.
+        """
         params = self.params
         key, start_key = jax.random.split(key) if params.head_start else (key, key)
         noise = jax.random.uniform(key, (2,), minval=-params.ball_noise, maxval=params.ball_noise)
@@ -128,7 +133,12 @@ class Football(QuadrupedEnv[S, F]):
             start = params.head_start * assistance * jax.random.uniform(start_key)
             way = start * (goal - position[:2])
             forward = jnp.where(attackers, way[0], 0.0)
-            qpos = qpos.at[self.objects["ball"].qpos[:2]].add(way).at[self.index.base_qpos[:, 0]].add(forward)
+            qpos = (
+                qpos.at[self.objects["ball"].qpos[:2]]
+                .add(way)
+                .at[self.index.base_qpos[:, 0]]
+                .add(forward)
+            )
         return qpos, qvel
 
     def sample_spot(self, key: jax.Array) -> jax.Array:
@@ -136,16 +146,23 @@ class Football(QuadrupedEnv[S, F]):
         return jnp.array(self.ball_spot)
 
     def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Returns the midpoint of a goal line (2,), m, of a head start, and which robots attack that goal (R,) bool."""
+        """Returns the midpoint of a goal line (2,), m, of a head start, and which robots attack
+        that goal (R,) bool.
+        """
         raise NotImplementedError(f"{type(self).__name__}: sample_attack() is not defined")
 
     def touches(self, before: Moment, after: Moment) -> jax.Array:
-        """Returns which robot touched the ball in a step (R,) bool: the nearest one, if the ball's velocity changed.
+        """Returns which robot touched the ball in a step (R,) bool: the nearest one, if the ball's
+        velocity changed.
 
         Contacts themselves are not read, since the engines give them in different forms.
         """
-        changed = jnp.linalg.norm((self.ball_velocity(after.state.data) - self.ball_velocity(before.state.data))[:2])
-        apart = jnp.linalg.norm(after.robots.position_w[:, :2] - self.ball(after.state.data)[:2], axis=-1)
+        changed = jnp.linalg.norm(
+            (self.ball_velocity(after.state.data) - self.ball_velocity(before.state.data))[:2]
+        )
+        apart = jnp.linalg.norm(
+            after.robots.position_w[:, :2] - self.ball(after.state.data)[:2], axis=-1
+        )
         apart = jnp.where(after.robots.active, apart, FAR)
         nearest = jnp.arange(len(apart)) == jnp.argmin(apart)
         return nearest & (apart < _REACH) & (changed > _IMPULSE)
@@ -158,9 +175,15 @@ class Football(QuadrupedEnv[S, F]):
     def next_play(self, play: Play, before: Moment, after: Moment) -> Play:
         """Returns the play after a step."""
         halfway = GOALS[:, 0].mean()
-        own = np.array([[(x > halfway) == side for x, _, _ in self.kick_off] for side in (False, True)])
+        own = np.array(
+            [[(x > halfway) == side for x, _, _ in self.kick_off] for side in (False, True)]
+        )
         touch = self.touches(before, after)
-        passed = jnp.any(own & touch, axis=1) & jnp.any(own & play.last, axis=1) & ~jnp.any(touch & play.last)
+        passed = (
+            jnp.any(own & touch, axis=1)
+            & jnp.any(own & play.last, axis=1)
+            & ~jnp.any(touch & play.last)
+        )
         last = jnp.where(jnp.any(touch), touch, play.last)
         return Play(play.touched | touch, last, play.passes + passed.astype(jnp.int32))
 
@@ -173,12 +196,18 @@ class Football(QuadrupedEnv[S, F]):
         return data.qvel[self.objects["ball"].qvel[:3]]
 
     def in_goal(self, data: mjx.Data) -> jax.Array:
-        """Returns whether the ball's centre is past each goal line of `GOALS`, inside the mouth (2,) bool."""
+        """Returns whether the ball's centre is past each goal line of `GOALS`, inside the mouth
+        (2,) bool.
+        """
         x, y, _ = self.ball(data)
-        return jnp.stack([x > GOALS[0, 0], x < GOALS[1, 0]]) & (jnp.abs(y) < self.params.goal_width / 2)
+        return jnp.stack([x > GOALS[0, 0], x < GOALS[1, 0]]) & (
+            jnp.abs(y) < self.params.goal_width / 2
+        )
 
     def goal_distance(self, data: mjx.Data) -> jax.Array:
-        """Returns the ball's horizontal distance to the midpoint of each goal line of `GOALS` (2,), m."""
+        """Returns the ball's horizontal distance to the midpoint of each goal line of `GOALS` (2,),
+        m.
+        """
         return jnp.linalg.norm(self.ball(data)[:2] - GOALS, axis=-1)
 
 
@@ -186,7 +215,8 @@ class Football(QuadrupedEnv[S, F]):
 class FootballMatchRewards:
     """Weights of the reward terms: zero-sum between the teams, except `advance` and `chase`.
 
-    The released system defines no rewards for these matches; all terms except the goal are this package's.
+    The released system defines no rewards for these matches; all terms except the goal are this
+    package's.
     """
 
     goal: float = 10.0
@@ -198,7 +228,8 @@ class FootballMatchRewards:
     fall: float = -10.0
     """When a robot of the team has fallen, which ends the match as a loss."""
     advance: float = 0.0
-    """Per m by which the ball is nearer to that goal than ever before in the episode. For training only."""
+    """Per m by which the ball is nearer to that goal than ever before in the episode. For training
+    only."""
     chase: float = 0.0
     """As `approach`, without subtracting the opponents'. For training only."""
 
@@ -208,11 +239,14 @@ class FootballMatchRewards:
 class FootballMatchState:
     """The task's own state."""
 
-    nearest: jax.Array  # smallest distance of the ball to the goal that each team attacks in this episode (2,), m
+    # smallest distance of the ball to the goal that each team attacks in this episode (2,), m
+    nearest: jax.Array
     play: Play  # touches of the ball
 
 
-_LINES, _IN_LINE = 4, 4  # lines of a team at the kick-off, at most; robots in a line while there are fewer lines
+# lines of a team at the kick-off, at most; robots in a line while there are fewer lines
+_LINES = 4
+_IN_LINE = 4
 
 
 @settings_class
@@ -236,17 +270,21 @@ class Football2vs2Params(FootballMatchParams):
 
 
 class Go1Football1vs1(
-    Football[FootballMatchState, FootballMatchParams], Match[FootballMatchState, FootballMatchParams]
+    Football[FootballMatchState, FootballMatchParams],
+    Match[FootballMatchState, FootballMatchParams],
 ):
     """Football, by default 1 vs 1.
 
-    - Scene: the field with the ball in its centre. Team 0 attacks the goal at x 12, team 1 that at x 2.
-    - Observation, in the team's own frame: one-hot within the team, own base info 6, teammates', opponents',
-      ball position 3, ball velocity 3.
+    - Scene: the field with the ball in its centre. Team 0 attacks the goal at x 12, team 1 that at
+      x 2.
+    - Observation, in the team's own frame: one-hot within the team, own base info 6, teammates',
+      opponents', ball position 3, ball velocity 3.
     - Reward: see `FootballMatchRewards`; zero-sum, shared by the team.
     - End: a goal, a fall, or 20 s. Win: a goal, or the opponents' fall.
-    - In teams with mates, evaluations count a team's passes, and its goals after touches by all its robots.
-    - Sizes: any even `num_agents`; at the kick-off larger teams stand in lines, the first robots in front.
+    - In teams with mates, evaluations count a team's passes, and its goals after touches by all its
+      robots.
+    - Sizes: any even `num_agents`; at the kick-off larger teams stand in lines, the first robots in
+      front.
 
     Source: paper, section III; the released system leaves rewards and observations undefined.
     """
@@ -261,14 +299,18 @@ class Go1Football1vs1(
     @property
     def kick_off(self) -> tuple[tuple[float, float, float], ...]:
         """Team 0's lines, and the same after a half turn about the centre."""
-        team, (x, y) = self.num_agents // 2, self.center
+        team = self.num_agents // 2
+        (x, y) = self.center
         lines = min(math.ceil(team / _IN_LINE), _LINES)
         columns = math.ceil(team / lines)
         apart = min(4.0, (self.params.field_width - 2 * LANE) / max(columns - 1, 1))
         own = []
         for line, first in enumerate(range(0, team, columns)):
             count = min(columns, team - first)
-            own += [(4.0 + (lines - 1) / 2 - line, (i - (count - 1) / 2) * apart, 0.0) for i in range(count)]
+            own += [
+                (4.0 + (lines - 1) / 2 - line, (i - (count - 1) / 2) * apart, 0.0)
+                for i in range(count)
+            ]
         return (*own, *((2 * x - a, 2 * y - b, np.pi) for a, b, _ in own))
 
     @property
@@ -288,17 +330,25 @@ class Go1Football1vs1(
         side = jax.random.randint(key, (), 0, 2)
         return jnp.asarray(GOALS)[side], jnp.asarray(self.team_of) == side
 
-    def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> FootballMatchState:
+    def reset_task(
+        self, key: jax.Array, state: State, robot_state: RobotState
+    ) -> FootballMatchState:
         return FootballMatchState(self.goal_distance(state.data), self.kick_off_play())
 
-    def step_task(self, before: Moment[FootballMatchState], after: Moment[FootballMatchState]) -> FootballMatchState:
+    def step_task(
+        self, before: Moment[FootballMatchState], after: Moment[FootballMatchState]
+    ) -> FootballMatchState:
         was = before.state.task
         nearest = jnp.minimum(was.nearest, self.goal_distance(after.state.data))
         return FootballMatchState(nearest, self.next_play(was.play, before, after))
 
     def distances(self, now: Moment) -> tuple[jax.Array, jax.Array]:
-        """Returns the ball's distances to the goal that each team attacks and to each team's nearest robot (2,), m."""
-        apart = jnp.linalg.norm(now.robots.position_w[:, :2] - self.ball(now.state.data)[:2], axis=-1)
+        """Returns the ball's distances to the goal that each team attacks and to each team's
+        nearest robot (2,), m.
+        """
+        apart = jnp.linalg.norm(
+            now.robots.position_w[:, :2] - self.ball(now.state.data)[:2], axis=-1
+        )
         apart = jnp.where(now.robots.active, apart, FAR)
         return self.goal_distance(now.state.data), jnp.min(apart.reshape(2, -1), axis=1)
 
@@ -308,12 +358,14 @@ class Go1Football1vs1(
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (A, width), each in its agent's own frame."""
-        ball, velocity = self.view_points(self.ball(state.data)), self.view_vectors(self.ball_velocity(state.data))
+        ball = self.view_points(self.ball(state.data))
+        velocity = self.view_vectors(self.ball_velocity(state.data))
         blocks = {"ball": ball[self.team_of], "ball_velocity": velocity[self.team_of]}
         return {**self.observe_teams(robot_state), **blocks}
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        (goal_before, robot_before), (goal, robot) = self.distances(before), self.distances(after)
+        (goal_before, robot_before) = self.distances(before)
+        (goal, robot) = self.distances(after)
         return {
             "goal": self.zero_sum(self.in_goal(after.state.data)),
             "progress": self.zero_sum(goal_before - goal),
@@ -332,7 +384,9 @@ class Go1Football1vs1(
         return self.in_goal(state.data)
 
     def further(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        """Returns, of teams with mates, `passes` and `both_touched`: a goal after touches by all robots of the team."""
+        """Returns, of teams with mates, `passes` and `both_touched`: a goal after touches by all
+        robots of the team.
+        """
         play = state.task.play
         touched = (play.touched | ~state.active).reshape(2, -1)
         together = self.in_goal(state.data) & jnp.all(touched, axis=1)

@@ -27,13 +27,17 @@ class DefenderRewards:
     nearness: float = 3.0
     """In every step, exp(-d / 3 m) with the distance d of the ball to the goal's midpoint."""
     progress: float = 0.0
-    """Per m of decrease of the ball's distance to the goal's midpoint. Not in the paper: shaping."""
+    """Per m of decrease of the ball's distance to the goal's midpoint. Not in the paper:
+    shaping."""
     approach: float = 0.0
-    """Per m of decrease of the distance between the ball and the nearest robot. Not in the paper: shaping."""
+    """Per m of decrease of the distance between the ball and the nearest robot. Not in the paper:
+    shaping."""
     first_goal: float = 0.0
-    """In the step of an episode's first goal. Not in the paper: for training, as `goal` favours early goals."""
+    """In the step of an episode's first goal. Not in the paper: for training, as `goal` favours
+    early goals."""
     fall: float = 0.0
-    """In steps in which an attacker has fallen. Not in the paper: for training, as `first_goal` pays only once."""
+    """In steps in which an attacker has fallen. Not in the paper: for training, as `first_goal`
+    pays only once."""
 
 
 @settings_class
@@ -60,8 +64,10 @@ class DefenderState:
 class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     """Football (2 vs 1).
 
-    - Scene: the field, a ball, and a third robot that defends the goal at x 12 (see `mqe_jax.npc.defend`).
-    - Observation: one-hot 2, own base info 6, teammate's base info 6, ball position 3, ball velocity 3.
+    - Scene: the field, a ball, and a third robot that defends the goal at x 12 (see
+      `mqe_jax.npc.defend`).
+    - Observation: one-hot 2, own base info 6, teammate's base info 6, ball position 3, ball
+      velocity 3.
     - Reward: see `DefenderRewards`; shared.
     - End: a fall, or 20 s. Success: a goal, at any time in the episode.
     - Evaluations count passes before the goal, and goals after touches by both robots.
@@ -86,7 +92,10 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         commands = jnp.asarray(self.controller.npc_default_commands)
         if not self.params.defender_idle:
             move = defend(
-                robot_state.position_w[2, :2], robot_state.euler[2, 2], self.ball(state.data)[:2], jnp.asarray(GOALS[0])
+                robot_state.position_w[2, :2],
+                robot_state.euler[2, 2],
+                self.ball(state.data)[:2],
+                jnp.asarray(GOALS[0]),
             )
             commands = commands.at[self.controller.npc_skill.index(self.npc_varied)].set(move)
         return commands[None]
@@ -94,14 +103,17 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> DefenderState:
         return DefenderState(jnp.zeros((), bool), self.kick_off_play())
 
-    def step_task(self, before: Moment[DefenderState], after: Moment[DefenderState]) -> DefenderState:
+    def step_task(
+        self, before: Moment[DefenderState], after: Moment[DefenderState]
+    ) -> DefenderState:
         was = before.state.task
         play = self.next_play(was.play, before, after)
         play = jax.tree.map(lambda old, new: jnp.where(was.scored, old, new), was.play, play)
         return DefenderState(was.scored | self.in_goal(after.state.data)[0], play)
 
     def sample_spot(self, key: jax.Array) -> jax.Array:
-        spot, share = super().sample_spot(key), self.params.ball_between
+        spot = super().sample_spot(key)
+        share = self.params.ball_between
         if not share:
             return spot
         between = jax.random.bernoulli(jax.random.fold_in(key, 2), share)
@@ -112,8 +124,12 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
 
     def distances(self, now: Moment[DefenderState]) -> tuple[jax.Array, jax.Array]:
         """Returns the ball's distances to the goal's midpoint and to the nearest robot (), m."""
-        apart = jnp.linalg.norm(now.robots.position_w[:2, :2] - self.ball(now.state.data)[:2], axis=-1)
-        return self.goal_distance(now.state.data)[0], jnp.min(jnp.where(now.robots.active[:2], apart, FAR))
+        apart = jnp.linalg.norm(
+            now.robots.position_w[:2, :2] - self.ball(now.state.data)[:2], axis=-1
+        )
+        return self.goal_distance(now.state.data)[0], jnp.min(
+            jnp.where(now.robots.active[:2], apart, FAR)
+        )
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -129,7 +145,8 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
     def rewards(
         self, before: Moment[DefenderState], after: Moment[DefenderState], collision: jax.Array
     ) -> dict[str, jax.Array]:
-        (goal_before, near_before), (goal, near) = self.distances(before), self.distances(after)
+        (goal_before, near_before) = self.distances(before)
+        (goal, near) = self.distances(after)
         return {
             "goal": self.in_goal(after.state.data)[0],
             "nearness": jnp.exp(-goal / 3.0),
@@ -139,11 +156,14 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
             "fall": jnp.any(self.fallen(after.robots)[:2]),
         }
 
-    def outcome(self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State[DefenderState], robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: a goal at any time in this episode.
 
         `both_touched`: one after touches by both robots; `passes`: passes before it.
         """
-        scored, play = state.task.scored, state.task.play
+        scored = state.task.scored
+        play = state.task.play
         both = scored & jnp.all(play.touched[:2])
         return {"success": scored, "both_touched": both, "passes": play.passes[0]}

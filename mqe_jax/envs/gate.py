@@ -1,4 +1,6 @@
-"""go1gate, the paper's Narrow Gate: robots, by default two, pass one by one through a gap wide enough for one."""
+"""go1gate, the paper's Narrow Gate: robots, by default two, pass one by one through a gap wide
+enough for one.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -30,7 +32,8 @@ class GateRewards:
     approach: float = 1.0
     """Per m of decrease of a robot's distance to its target."""
     crowding: float = -0.025
-    """In every step, the sum of 1 / d^2 over ordered pairs of robots at a distance d below 0.5 m."""
+    """In every step, the sum of 1 / d^2 over ordered pairs of robots at a distance d below 0.5
+    m."""
     collision: float = -2.0
     """In steps with any trunk contact."""
 
@@ -57,8 +60,8 @@ class GateParams(TaskParams):
     target_x: Coordinate = 5.5
     """X of the robots' targets, m."""
     target_y: Coordinate = 0.75
-    """|y| of two robots' targets, m. Their paths cross: the first robot's target is on the left. Targets of more robots
-    mirror the rows in which they start."""
+    """|y| of two robots' targets, m. Their paths cross: the first robot's target is on the left.
+    Targets of more robots mirror the rows in which they start."""
     rewards: GateRewards = GateRewards()
     """Weights of the reward terms."""
 
@@ -70,11 +73,13 @@ class GateParams(TaskParams):
 class Go1Gate(QuadrupedEnv[None, GateParams]):
     """Narrow Gate.
 
-    - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is sampled at reset.
+    - Scene: a track 3 m wide, a wall across it with a gap of 0.6 m whose centre is sampled at
+      reset.
     - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2.
     - Reward: see `GateRewards`; shared.
     - End: a fall, a collision, or 10 s. Success: all robots are through without a collision.
-    - Sizes: any `num_agents`; the track is longer by 1 m at both ends for every further row of robots.
+    - Sizes: any `num_agents`; the track is longer by 1 m at both ends for every further row of
+      robots.
 
     Source: paper, section III and table of rewards.
     """
@@ -87,9 +92,12 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
     variable_num_agents = True
 
     def scene(self) -> Scene:
-        params, agents = self.params, self.num_agents
+        params = self.params
+        agents = self.num_agents
         columns, behind = rows_of(agents, params.track_width)
-        gate = Gate(3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random)
+        gate = Gate(
+            3.0, width=params.gate_width, depth=params.gate_depth, random=params.gate_random
+        )
         spawn = SpawnArea(2.0 + behind, spawn_x=1.0 + behind, columns=columns)
         track = Track(
             blocks=(spawn, gate, Plane(1.0 + behind), EndWall()),
@@ -97,7 +105,9 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
             start=0.0 - behind,
             num_robots=agents,
         )
-        pads = grounds.pads([(x, y, 0.0) for x, y in self.targets(track.layout().spawn)], range(agents))
+        pads = grounds.pads(
+            [(x, y, 0.0) for x, y in self.targets(track.layout().spawn)], range(agents)
+        )
         ground = grounds.track((track.start, 6.0 + behind), params.track_width, 4, pads)
         return Scene(dataclasses.replace(track, ground=ground), num_robots=agents)
 
@@ -105,7 +115,8 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
         """Returns the robots' targets (A, 2), m, from their spawn poses."""
         params = self.params
         x, y = np.array(spawn)[:, :2].T
-        apart = params.target_y / (params.track_width / 4)  # |y| of two robots at the start is a quarter of the width
+        # |y| of two robots at the start is a quarter of the width
+        apart = params.target_y / (params.track_width / 4)
         return np.stack([params.target_x + x - x.min(), -apart * y], axis=-1)
 
     @property
@@ -113,7 +124,10 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
         return ObservationLayout((*team_blocks(self.num_agents), GATE))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        return {**observe_team(robot_state.base_info), "gate": for_all(state.anchors, self.num_agents)}
+        return {
+            **observe_team(robot_state.base_info),
+            "gate": for_all(state.anchors, self.num_agents),
+        }
 
     def target_distance(self, robot_state: RobotState) -> jax.Array:
         """Returns each robot's horizontal distance to its target (A,), m."""
@@ -127,13 +141,20 @@ class Go1Gate(QuadrupedEnv[None, GateParams]):
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         nearer = self.target_distance(before.robots) - self.target_distance(after.robots)
         return {
-            "success": jnp.sum(after.robots.count(self.through(after.state, after.robots))).astype(jnp.float32),
+            "success": jnp.sum(after.robots.count(self.through(after.state, after.robots))).astype(
+                jnp.float32
+            ),
             "approach": jnp.sum(after.robots.count(nearer)),
             "crowding": reward.crowding(after.robots.position_w[:, :2], after.robots.active),
             "collision": collision.astype(jnp.float32),
         }
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State, robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: all robots are through; `one`: at least one is, however the episode ended."""
         through = self.through(state, robot_state)
-        return {"success": jnp.all(through | ~robot_state.active) & ~failed, "one": jnp.any(robot_state.count(through))}
+        return {
+            "success": jnp.all(through | ~robot_state.active) & ~failed,
+            "one": jnp.any(robot_state.count(through)),
+        }

@@ -1,7 +1,9 @@
-"""Matches: two teams of the same size against each other, with zero-sum rewards and mirrored observations.
+"""Matches: two teams of the same size against each other, with zero-sum rewards and mirrored
+observations.
 
-A match is symmetric under a half turn about its centre ("turn") or a reflection in the x-z plane ("reflect"). Team 1,
-the second half of the agents, observes in the transformed frame, so that one policy can control either team.
+A match is symmetric under a half turn about its centre ("turn") or a reflection in the x-z plane
+("reflect"). Team 1, the second half of the agents, observes in the transformed frame, so that one
+policy can control either team.
 """
 
 from typing import Any, ClassVar
@@ -23,10 +25,10 @@ from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 class Match(QuadrupedEnv[S, P]):
     """Base of the competitive tasks.
 
-    Reward: zero-sum, except terms whose weight is 0 by default. A term is the team's own minus the opponents'.
-    Result: an `eliminated` team (by default one with a fallen robot) loses. If no team is eliminated, the `leading`
-    team wins. It is a draw if both teams are eliminated, or both or neither lead.
-    Success is a win. Diverged physics is a draw.
+    Reward: zero-sum, except terms whose weight is 0 by default. A term is the team's own minus the
+    opponents'. Result: an `eliminated` team (by default one with a fallen robot) loses. If no team
+    is eliminated, the `leading` team wins. It is a draw if both teams are eliminated, or both or
+    neither lead. Success is a win. Diverged physics is a draw.
 
     Example:
         ```python
@@ -63,7 +65,11 @@ class Match(QuadrupedEnv[S, P]):
         for name, mirror, (low, high) in zip(names, mirrors, self.controller.changes, strict=True):
             if mirror < 0 and low != -high:
                 given = self.params.command_ranges[name]
-                fail(f"command_ranges.{name}", given, f"symmetric in {self.name}, which mirrors team 1")
+                fail(
+                    f"command_ranges.{name}",
+                    given,
+                    f"symmetric in {self.name}, which mirrors team 1",
+                )
 
     def eliminated(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns which team is eliminated (2,) bool: by default one with a fallen active robot."""
@@ -75,7 +81,8 @@ class Match(QuadrupedEnv[S, P]):
 
     def wins(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns which team wins if the episode ends in this step (2,) bool, at most one."""
-        out, leading = self.eliminated(state, robot_state), self.leading(state, robot_state)
+        out = self.eliminated(state, robot_state)
+        leading = self.leading(state, robot_state)
         return jnp.where(jnp.any(out), out[::-1] & ~out, leading & ~leading[::-1])
 
     def further(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
@@ -83,24 +90,45 @@ class Match(QuadrupedEnv[S, P]):
         return {}
 
     def teams_blocks(self, masked: bool = False) -> tuple[Block, ...]:
-        """Returns the first blocks of teams of robots; `observe_teams` fills them, if they are not `masked`."""
+        """Returns the first blocks of teams of robots; `observe_teams` fills them, if they are not
+        `masked`.
+        """
         team = self.num_agents // 2
-        mates = (entities("teammate", "robot", team - 1, 6, BASE_INFO, masked=masked),) if team > 1 else ()
+        mates = (
+            (entities("teammate", "robot", team - 1, 6, BASE_INFO, masked=masked),)
+            if team > 1
+            else ()
+        )
         opponents = entities("opponents", "robot", team, 6, BASE_INFO, masked=masked)
-        return one_hot(team, "agent's id within its team"), Block("base", 6, BASE_INFO), *mates, opponents
+        return (
+            one_hot(team, "agent's id within its team"),
+            Block("base", 6, BASE_INFO),
+            *mates,
+            opponents,
+        )
 
     def observe_teams(self, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of `teams_blocks` (A, width), each in its agent's own frame."""
         team = self.num_agents // 2
-        both = self.views(robot_state.base_info).reshape(2, 2, team, 6)  # (observing team, observed team, robot, info)
-        own, opponents = both[[0, 1], [0, 1]], both[[0, 1], [1, 0]].reshape(2, -1)
+        # (observing team, observed team, robot, info)
+        both = self.views(robot_state.base_info).reshape(2, 2, team, 6)
+        own = both[[0, 1], [0, 1]]
+        opponents = both[[0, 1], [1, 0]].reshape(2, -1)
         mates = {"teammate": jax.vmap(others)(own).reshape(self.num_agents, -1)} if team > 1 else {}
         one_hot = jnp.tile(jnp.eye(team), (2, 1))
-        return {"one_hot": one_hot, "base": own.reshape(-1, 6), **mates, "opponents": opponents[self.team_of]}
+        return {
+            "one_hot": one_hot,
+            "base": own.reshape(-1, 6),
+            **mates,
+            "opponents": opponents[self.team_of],
+        }
 
     def views(self, info: jax.Array) -> jax.Array:
-        """Transforms base information (R, 6), position and roll, pitch, yaw, to both teams' frames: (2, R, 6)."""
-        position, (roll, pitch, yaw) = self.view_points(info[:, :3])[1], jnp.moveaxis(info[:, 3:], -1, 0)
+        """Transforms base information (R, 6), position and roll, pitch, yaw, to both teams' frames:
+        (2, R, 6).
+        """
+        position = self.view_points(info[:, :3])[1]
+        (roll, pitch, yaw) = jnp.moveaxis(info[:, 3:], -1, 0)
         if self.symmetry == "turn":
             euler = jnp.stack([roll, pitch, jnp.arctan2(-jnp.sin(yaw), -jnp.cos(yaw))], axis=-1)
         else:
@@ -124,13 +152,18 @@ class Match(QuadrupedEnv[S, P]):
     def own_frame(self, info: jax.Array) -> jax.Array:
         return self.views(info)[self.team_of, np.arange(self.num_agents)]
 
-    def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
+    def observe_group(
+        self, name: str, state: State[S], robot_state: RobotState
+    ) -> dict[str, jax.Array]:
         """Blocks (A, width), each in its agent's own frame."""
         blocks = super().observe_group(name, state, robot_state)
         if not self.reflected or name != "proprioception":
             return blocks
         image = {"gravity": blocks["gravity"] * np.array([1.0, -1.0, 1.0], np.float32)}
-        image |= {x: blocks[x][:, MIRRORED_JOINTS] * MIRRORED_SIGNS for x in ("joint_position", "joint_velocity")}
+        image |= {
+            x: blocks[x][:, MIRRORED_JOINTS] * MIRRORED_SIGNS
+            for x in ("joint_position", "joint_velocity")
+        }
         return {x: jnp.where(self.team_of[:, None] == 1, image[x], blocks[x]) for x in blocks}
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
@@ -151,7 +184,13 @@ class Match(QuadrupedEnv[S, P]):
     def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:
         wins = self.wins(state, robot_state)
         draw = jnp.broadcast_to(~jnp.any(wins), wins.shape)
-        return Outcome(success=wins, win=wins, draw=draw, loss=wins[::-1], further=self.further(state, robot_state))
+        return Outcome(
+            success=wins,
+            win=wins,
+            draw=draw,
+            loss=wins[::-1],
+            further=self.further(state, robot_state),
+        )
 
 
 class Duel(Match[S, P]):
@@ -164,4 +203,7 @@ class Duel(Match[S, P]):
     def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (2, width), each in its agent's own frame."""
         views = self.views(robot_state.base_info)
-        return {"base": jnp.stack([views[0, 0], views[1, 1]]), "opponent": jnp.stack([views[0, 1], views[1, 0]])}
+        return {
+            "base": jnp.stack([views[0, 0], views[1, 1]]),
+            "opponent": jnp.stack([views[0, 1], views[1, 0]]),
+        }

@@ -43,11 +43,11 @@ class TaskParams:
     num_agents: Robots = 2
     """Number of controlled robots; in a match those of both teams."""
     fewest_agents: Robots | None = None
-    """Fewest robots that take part in an episode, in a match those of both teams. Reset draws the number, at most
-    `num_agents`, and parks the other robots. None: all take part."""
+    """Fewest robots that take part in an episode, in a match those of both teams. Reset draws the
+    number, at most `num_agents`, and parks the other robots. None: all take part."""
     growing: bool = False
-    """Curriculum: agents first learn in small teams. At `State.assistance` 1 only the fewest robots or sheep are drawn;
-    the highest number grows linearly to all at assistance 0."""
+    """Curriculum: agents first learn in small teams. At `State.assistance` 1 only the fewest robots
+    or sheep are drawn; the highest number grows linearly to all at assistance 0."""
     robot: str = "go1"
     """Name of the robot, such as go1 or go2 (`mqe_jax.physics.robots`)."""
     episode_length: TimeLimit = 10.0
@@ -63,8 +63,9 @@ class TaskParams:
     max_roll: Positive = 0.8
     """Maximum |roll|, rad; above it the episode terminates."""
     max_pitch: Positive = 1.6
-    """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so it never reaches the released
-    system's limit, which is above pi / 2. A robot that pitches over has a roll of pi."""
+    """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so it never
+    reaches the released system's limit, which is above pi / 2. A robot that pitches over has a roll
+    of pi."""
     min_height: Coordinate = -1.0
     """Minimum trunk height, m; below it the episode terminates."""
     max_height: Coordinate = 100.0
@@ -72,22 +73,24 @@ class TaskParams:
     end_on_collision: bool = False
     """Whether a contact force on an agent's trunk above `collision_force` ends the episode."""
     collision_force: Positive = 1.0
-    """Threshold of contact forces on the trunk in the last physics step of an environment step, N."""
+    """Threshold of contact forces on the trunk in the last physics step of an environment step,
+    N."""
     skill: str | tuple[str, ...] = "walk"
-    """Skill of the agents with control `command` (`mqe_jax.skills`). With several, a further action entry chooses one
-    (`mqe_jax.skills.choice`)."""
+    """Skill of the agents with control `command` (`mqe_jax.skills`). With several, a further action
+    entry chooses one (`mqe_jax.skills.choice`)."""
     skill_weights: FileName | None = None
     """Weights file of the skill; the shipped one if None."""
     gait: str | None = None
-    """Name of default commands of the skill. The walk policy has trot, pronk, bound and pace; None: trot."""
+    """Name of default commands of the skill. The walk policy has trot, pronk, bound and pace; None:
+    trot."""
     commands: tuple[str, ...] = ("vx", "vy", "yaw_rate")
     """Commands of the skill that the action sets, in order."""
     command_ranges: Mapping[str, Range] = FrozenMapping()
-    """Lowest and highest value of these commands, by name; others have the skill's default ranges. Scripted policies
-    keep the default ranges."""
+    """Lowest and highest value of these commands, by name; others have the skill's default ranges.
+    Scripted policies keep the default ranges."""
     position_scale: Positive = 1.0
-    """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25 rad of the default
-    joint angles, hips within 0.125 rad."""
+    """Factor on the range of the joint targets with control `position`; at 1 they are within 0.25
+    rad of the default joint angles, hips within 0.125 rad."""
     actuator_network: FileName | None = None
     """Weights file of an actuator network that replaces PD control; PD control if None."""
     friction: PositiveFriction = 1.0
@@ -97,31 +100,34 @@ class TaskParams:
     solver_iterations: Iterations = 4
     """Maximum solver iterations per physics step."""
     sparse_solver: bool | None = None
-    """Whether the solver on Warp skips the zeros between robots that do not touch; results are equal up to rounding.
-    None: in scenes with more than 80 degrees of freedom, of which a robot has 18. The other engines ignore it."""
+    """Whether the solver on Warp skips the zeros between robots that do not touch; results are
+    equal up to rounding. None: in scenes with more than 80 degrees of freedom, of which a robot has
+    18. The other engines ignore it."""
     contacts: Literal["full", "minimal"] = "full"
-    """Set of the robots' collision geoms: full, or minimal (trunk and feet), which is several times faster on MJX-JAX
-    and disables limb collisions."""
+    """Set of the robots' collision geoms: full, or minimal (trunk and feet), which is several times
+    faster on MJX-JAX and disables limb collisions."""
     contacts_per_robot: Buffer = 12
-    """Contact buffer size per robot. MJX-JAX has a buffer per environment and keeps the deepest contacts; on Warp all
-    environments share one."""
+    """Contact buffer size per robot. MJX-JAX has a buffer per environment and keeps the deepest
+    contacts; on Warp all environments share one."""
     constraints_per_robot: Buffer = 64
     """Constraint buffer size per robot on Warp, per environment."""
     privileged_contact_forces: bool = False
-    """Whether the privileged observation includes the contact forces on trunks and feet; their sensors cost about 8% of
-    the throughput."""
+    """Whether the privileged observation includes the contact forces on trunks and feet; their
+    sensors cost about 8% of the throughput."""
     randomization: Randomization = Randomization()
     """Domain randomisation."""
     senses: Senses = ()
-    """Sensors, whose readings are the group of observations `onboard`: the set `onboard`, `full` (no sensors), or a
-    list of names and mappings of settings.
+    """Sensors, whose readings are the group of observations `onboard`: the set `onboard`, `full`
+    (no sensors), or a list of names and mappings of settings.
     """
     frozen_time: Time = 4.0
-    """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x `State.assistance`, s. Agents first
-    learn sequential subtasks one at a time. If the number of robots varies, mates do not observe the frozen one: they
-    learn to act as a smaller team. Inactive at assistance 0."""
+    """Curriculum: one agent, sampled at reset, is frozen for up to frozen_time x
+    `State.assistance`, s. Agents first learn sequential subtasks one at a time. If the number of
+    robots varies, mates do not observe the frozen one: they learn to act as a smaller team.
+    Inactive at assistance 0."""
     shaping_floor: Fraction = 1.0
-    """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at assistance 1."""
+    """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at
+    assistance 1."""
 
     def __post_init__(self) -> None:
         commander = self.commander
@@ -138,23 +144,31 @@ class TaskParams:
         return Commander(skill, commands, skill.default_commands(self.gait), self.command_ranges)
 
     def action_ranges(self) -> dict[str, tuple[float, float]]:
-        """Returns the lowest and the highest value of each command that the action sets, in the command's unit."""
+        """Returns the lowest and the highest value of each command that the action sets, in the
+        command's unit.
+        """
         commander = self.commander
         limits = np.round(np.asarray(commander.limits, float), 6)
-        return {name: (float(low), float(high)) for name, (low, high) in zip(commander.commands, limits, strict=True)}
+        return {
+            name: (float(low), float(high))
+            for name, (low, high) in zip(commander.commands, limits, strict=True)
+        }
 
     def actions(self, control: str) -> dict[str, Any]:
         """Returns what an agent's actions mean in a control mode, by names of parameters."""
         meaning: dict[str, Any] = {"robot": self.robot, "control": control}
         if control == "command":
-            gait, ranges = self.gait or next(iter(self.commander.skill.gaits), None), self.action_ranges()
+            gait = self.gait or next(iter(self.commander.skill.gaits), None)
+            ranges = self.action_ranges()
             meaning |= {"skill": self.skill, "gait": gait, "commands": self.commands}
             meaning["command_ranges"] = {name: ranges[name] for name in self.commands}
         return meaning | ({"position_scale": self.position_scale} if control == "position" else {})
 
     def commanded_text(self) -> str:
         """Returns the skill and these ranges, such as `walk: vx -1 to 1`."""
-        ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in self.action_ranges().items())
+        ranges = (
+            f"{name} {low:g} to {high:g}" for name, (low, high) in self.action_ranges().items()
+        )
         names = " or ".join([self.skill] if isinstance(self.skill, str) else self.skill)
         return f"{names}: {', '.join(ranges)}"
 
@@ -164,20 +178,30 @@ P = TypeVar("P", bound=TaskParams)
 
 
 def check_above(spawn_height: float, top: float, robot: str) -> None:
-    """Raises an InputError unless a standing robot's spawn height clears the supporting surface at `top`, m."""
+    """Raises an InputError unless a standing robot's spawn height clears the supporting surface at
+    `top`, m.
+    """
     least = top + robots.get(robot).stand_height
     if spawn_height < least:
-        fail("spawn_height", spawn_height, f"at least {least:.2f}, because the supporting surface is at {top}")
+        fail(
+            "spawn_height",
+            spawn_height,
+            f"at least {least:.2f}, because the supporting surface is at {top}",
+        )
 
 
 def check_teams(num_agents: int, most: int, room: str) -> None:
-    """Raises an InputError unless `num_agents` are two equal teams of at most `most` robots, for which `room` is."""
+    """Raises an InputError unless `num_agents` are two equal teams of at most `most` robots, for
+    which `room` is.
+    """
     most = min(2 * most, int(bounds(Robots)[1]))
     if num_agents % 2 or num_agents > most:
         fail("num_agents", num_agents, f"even, for two equal teams, and at most {most} with {room}")
 
 
 def check_gap(name: str, width: float, track_width: float) -> None:
-    """Raises an InputError unless the parameter `name`, the width of a gap in a wall, m, fits into the track."""
+    """Raises an InputError unless the parameter `name`, the width of a gap in a wall, m, fits into
+    the track.
+    """
     if width >= track_width:
         fail(name, width, f"less than the width of the track, {track_width}")

@@ -69,8 +69,14 @@ class Go1Plane(QuadrupedEnv[None, PlaneParams]):
         return blocks | ({"teammates": others(info)} if self.num_agents > 1 else {})
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        return {"forward": jnp.sum(after.robots.count(after.robots.position_w[:, 0] - before.robots.position_w[:, 0]))}
+        return {
+            "forward": jnp.sum(
+                after.robots.count(after.robots.position_w[:, 0] - before.robots.position_w[:, 0])
+            )
+        }
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State, robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: no robot has fallen."""
         return {"success": 1.0 - jnp.asarray(failed, jnp.float32)}

@@ -1,4 +1,6 @@
-"""go1pushbox, the paper's Push Box: robots, by default two, push a box that is too heavy for one through a gate."""
+"""go1pushbox, the paper's Push Box: robots, by default two, push a box that is too heavy for one
+through a gate.
+"""
 
 import dataclasses
 
@@ -6,10 +8,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.limits import Buffer, Coordinate, Distance, Iterations, Length, NonNegative, TimeLimit
+from mqe_jax.core.limits import (
+    Buffer,
+    Coordinate,
+    Distance,
+    Iterations,
+    Length,
+    NonNegative,
+    TimeLimit,
+)
 from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import GATE, Block, ObservationLayout, for_all, observe_team, team_blocks
+from mqe_jax.envs.observation import (
+    GATE,
+    Block,
+    ObservationLayout,
+    for_all,
+    observe_team,
+    team_blocks,
+)
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
@@ -18,9 +35,14 @@ from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Gate, SpawnArea, Track, rows_of
 
-_SPAWN_LENGTH, _GATE_LENGTH, _GATE_DEPTH = 2.0, 5.0, 0.1  # m, along x
+# m, along x
+_SPAWN_LENGTH = 2.0
+_GATE_LENGTH = 5.0
+_GATE_DEPTH = 0.1
 _BEHIND = 0.3  # of a robot's centre behind the box's rear face, m
-_ABREAST, _LENGTH = 3, 0.8  # robots that push side by side, at most; distance between their rows, m
+# robots that push side by side, at most; distance between their rows, m
+_ABREAST = 3
+_LENGTH = 0.8
 
 
 @settings_class
@@ -32,7 +54,8 @@ class PushBoxRewards:
     success: float = 1.0
     """In steps in which the box is past the gate."""
     approach: float = 0.0
-    """Per m of decrease of the robots' summed distances to their places behind the box. Not in the paper: shaping."""
+    """Per m of decrease of the robots' summed distances to their places behind the box. Not in the
+    paper: shaping."""
     aim: float = 0.0
     """Per m of decrease of the lateral distance between box and gate. Not in the paper: shaping."""
 
@@ -57,8 +80,8 @@ class PushBoxParams(TaskParams):
     box_noise: Distance = 0.5
     """Half-width of the uniform noise on the box's position, m."""
     head_start: NonNegative = 0.0
-    """Curriculum: box and robots start up to head_start x `State.assistance` further along x, m, so that agents first
-    learn the end of the push. Inactive at assistance 0."""
+    """Curriculum: box and robots start up to head_start x `State.assistance` further along x, m, so
+    that agents first learn the end of the push. Inactive at assistance 0."""
     solver_iterations: Iterations = 8  # with 4 the pushed box does not converge on Warp
     contacts_per_robot: Buffer = 16
     rewards: PushBoxRewards = PushBoxRewards()
@@ -70,7 +93,11 @@ class PushBoxParams(TaskParams):
         gate = _SPAWN_LENGTH + (_GATE_LENGTH - _GATE_DEPTH) / 2 - self.gate_random[0]
         room = max(gate - (self.box_x + self.box_noise + self.box.size[0] / 2), 0.0)
         if self.head_start > room:
-            fail("head_start", self.head_start, f"at most {room:.2f}, the distance between box and gate")
+            fail(
+                "head_start",
+                self.head_start,
+                f"at most {room:.2f}, the distance between box and gate",
+            )
 
 
 @jax.tree_util.register_dataclass
@@ -85,7 +112,8 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     """Push Box.
 
     - Scene: a track 5 m wide with a box of 1 m and 3 kg per robot in front of a gate of 1.5 m.
-    - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2, box x, y, box quaternion 4.
+    - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2, box x, y,
+      box quaternion 4.
     - Reward: see `PushBoxRewards`; shared.
     - End: a fall, or 15 s. Success: the box is past the gate.
     - Sizes: any `num_agents`; robots that do not fit beside each other start in rows.
@@ -100,11 +128,17 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     variable_num_agents = True
 
     def scene(self) -> Scene:
-        params, agents = self.params, self.num_agents
+        params = self.params
+        agents = self.num_agents
         columns, behind = rows_of(agents, params.track_width)
-        spawn = SpawnArea(_SPAWN_LENGTH + behind, spawn_x=_SPAWN_LENGTH / 2 + behind, columns=columns)
-        gate = Gate(_GATE_LENGTH, width=params.gate_width, depth=_GATE_DEPTH, random=params.gate_random)
-        ends, goal_x = (0.0 - behind, _SPAWN_LENGTH + _GATE_LENGTH), _SPAWN_LENGTH + _GATE_LENGTH / 2
+        spawn = SpawnArea(
+            _SPAWN_LENGTH + behind, spawn_x=_SPAWN_LENGTH / 2 + behind, columns=columns
+        )
+        gate = Gate(
+            _GATE_LENGTH, width=params.gate_width, depth=_GATE_DEPTH, random=params.gate_random
+        )
+        ends = (0.0 - behind, _SPAWN_LENGTH + _GATE_LENGTH)
+        goal_x = _SPAWN_LENGTH + _GATE_LENGTH / 2
         track = Track(
             blocks=(spawn, gate, EndWall()),
             width=params.track_width,
@@ -118,11 +152,17 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Samples the box's initial position, and moves box and robots forward by the head start."""
+        """Samples the box's initial position, and moves box and robots forward by the head
+        start.
+        """
         params = self.params
         key, start_key = jax.random.split(key) if params.head_start else (key, key)
         noise = jax.random.uniform(key, (2,), minval=-params.box_noise, maxval=params.box_noise)
-        pose = jnp.array([params.box_x, 0.0, params.box.size[2] / 2, 1.0, 0.0, 0.0, 0.0]).at[:2].add(noise)
+        pose = (
+            jnp.array([params.box_x, 0.0, params.box.size[2] / 2, 1.0, 0.0, 0.0, 0.0])
+            .at[:2]
+            .add(noise)
+        )
         qpos = qpos.at[self.objects["box"].qpos].set(pose)
         if params.head_start:
             start = params.head_start * assistance * jax.random.uniform(start_key)
@@ -134,15 +174,22 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
         return PushBoxState(self.object_pose(state.data, "box")[0])
 
     def distances(self, now: Moment[PushBoxState]) -> tuple[jax.Array, jax.Array]:
-        """Returns the robots' summed distances to their places behind the box, and that of box and gate in y (), m."""
+        """Returns the robots' summed distances to their places behind the box, and that of box and
+        gate in y (), m.
+        """
         box = self.object_pose(now.state.data, "box")[:2]
         length, width, _ = self.params.box.size
         place = np.arange(self.num_agents)
-        row, first = place // _ABREAST, place // _ABREAST * _ABREAST
-        share = (place - first + 0.5) / np.minimum(_ABREAST, self.num_agents - first) - 0.5  # of the box's width
-        x, y = -0.5 * length - _BEHIND - _LENGTH * row, share * width
+        row = place // _ABREAST
+        first = place // _ABREAST * _ABREAST
+        # of the box's width
+        share = (place - first + 0.5) / np.minimum(_ABREAST, self.num_agents - first) - 0.5
+        x = -0.5 * length - _BEHIND - _LENGTH * row
+        y = share * width
         places = box + jnp.array(np.stack([x, y], axis=-1), jnp.float32)
-        behind = jnp.sum(now.robots.count(jnp.linalg.norm(now.robots.position_w[:, :2] - places, axis=-1)))
+        behind = jnp.sum(
+            now.robots.count(jnp.linalg.norm(now.robots.position_w[:, :2] - places, axis=-1))
+        )
         return behind, jnp.abs(box[1] - now.state.anchors[0, 1])
 
     @property
@@ -151,7 +198,8 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
         return ObservationLayout((*team_blocks(self.num_agents), GATE, *box))
 
     def observe(self, state: State[PushBoxState], robot_state: RobotState) -> dict[str, jax.Array]:
-        pose, agents = self.object_pose(state.data, "box"), self.num_agents
+        pose = self.object_pose(state.data, "box")
+        agents = self.num_agents
         return {
             **observe_team(robot_state.base_info),
             "gate": for_all(state.anchors, agents),
@@ -162,7 +210,8 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     def rewards(
         self, before: Moment[PushBoxState], after: Moment[PushBoxState], collision: jax.Array
     ) -> dict[str, jax.Array]:
-        (behind_before, offset_before), (behind, offset) = self.distances(before), self.distances(after)
+        (behind_before, offset_before) = self.distances(before)
+        (behind, offset) = self.distances(after)
         return {
             "progress": self.box_x(after.state) - self.box_x(before.state),
             "success": self.through(after.state).astype(jnp.float32),
@@ -178,6 +227,8 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
         """Returns whether the box is past the gate () bool."""
         return self.box_x(state) > state.anchors[0, 0] + self.params.past_gate
 
-    def outcome(self, state: State[PushBoxState], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State[PushBoxState], robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: the box is past the gate; `distance`: its displacement along x, m."""
         return {"success": self.through(state), "distance": self.box_x(state) - state.task.start}

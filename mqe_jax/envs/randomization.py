@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 @settings_class
 class Randomization:
-    """Domain randomisation; ranges are sampled uniformly at reset, independently per robot. None or 0 disables.
+    """Domain randomisation; ranges are sampled uniformly at reset, independently per robot.
+
+    None or 0 disables.
 
     Example:
         ```python
@@ -37,7 +39,8 @@ class Randomization:
     motor_offset: NonNegative = 0.0
     """Maximum offset of each joint target, rad."""
     joint_mechanics: Range | None = None
-    """Factor on rotor inertia, damping and dry friction of the joints; needs the task parameter `joint_mechanics`."""
+    """Factor on rotor inertia, damping and dry friction of the joints; needs the task parameter
+    `joint_mechanics`."""
     action_lag: Lag = 0
     """Maximum delay of the actuator targets, environment steps; one sample per environment."""
     push: NonNegative = 0.0
@@ -57,7 +60,9 @@ class Randomization:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RandomizedParams:
-    """Randomised physics parameters of one environment (R robots); the model's values if not randomised."""
+    """Randomised physics parameters of one environment (R robots); the model's values if not
+    randomised.
+    """
 
     friction: jax.Array
     """Sliding friction (R,)."""
@@ -70,7 +75,8 @@ class RandomizedParams:
     motor_offset: jax.Array
     """Offset of the joint targets (R, 12), rad; not in the privileged observation."""
     joint_mechanics: jax.Array
-    """Factor on rotor inertia, damping and dry friction of the joints (R,); not in the privileged observation."""
+    """Factor on rotor inertia, damping and dry friction of the joints (R,); not in the privileged
+    observation."""
     action_lag: jax.Array
     """Delay of the actuator targets, environment steps () int32."""
 
@@ -78,20 +84,36 @@ class RandomizedParams:
 class Randomizer:
     """Samples randomised physics parameters and applies them to the model."""
 
-    def __init__(self, random: Randomization, model: mujoco.MjModel, index: RobotIndex, friction: float) -> None:
-        self.random, self.model, self.index, self.friction = random, model, index, friction
+    def __init__(
+        self, random: Randomization, model: mujoco.MjModel, index: RobotIndex, friction: float
+    ) -> None:
+        self.random = random
+        self.model = model
+        self.index = index
+        self.friction = friction
         mass = float(model.body_mass[index.trunk_body].min())
         if random.payload is not None and random.payload[0] <= -mass:
-            fail("randomization.payload", random.payload, f"greater than -{mass:.3g} kg, the mass of the trunk")
+            fail(
+                "randomization.payload",
+                random.payload,
+                f"greater than -{mass:.3g} kg, the mass of the trunk",
+            )
         if random.joint_mechanics is not None and not model.dof_armature[index.joint_qvel].any():
-            fail("randomization.joint_mechanics", random.joint_mechanics, "none, unless joint_mechanics is true")
+            fail(
+                "randomization.joint_mechanics",
+                random.joint_mechanics,
+                "none, unless joint_mechanics is true",
+            )
 
     def sample(self, key: jax.Array) -> RandomizedParams:
         """Returns the parameters of one environment."""
-        random, robots = self.random, self.index.num_robots
+        random = self.random
+        robots = self.index.num_robots
         keys = jax.random.split(key, 5)
 
-        def uniform(key: jax.Array, span: Range | None, shape: tuple[int, ...], default: float) -> jax.Array:
+        def uniform(
+            key: jax.Array, span: Range | None, shape: tuple[int, ...], default: float
+        ) -> jax.Array:
             if span is None:
                 return jnp.full(shape, default, jnp.float32)
             return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
@@ -102,28 +124,46 @@ class Randomizer:
             payload=uniform(keys[1], random.payload, (robots,), 0.0),
             center_of_mass=uniform(keys[2], random.center_of_mass, (robots, 3), 0.0),
             motor_strength=uniform(keys[3], random.motor_strength, (robots,), 1.0),
-            motor_offset=uniform(jax.random.fold_in(key, 6), offset, self.index.joint_qpos.shape, 0.0),
-            joint_mechanics=uniform(jax.random.fold_in(key, 5), random.joint_mechanics, (robots,), 1.0),
+            motor_offset=uniform(
+                jax.random.fold_in(key, 6), offset, self.index.joint_qpos.shape, 0.0
+            ),
+            joint_mechanics=uniform(
+                jax.random.fold_in(key, 5), random.joint_mechanics, (robots,), 1.0
+            ),
             action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
         )
 
     def fields(self, params: RandomizedParams) -> dict[str, jax.Array]:
         """Returns the model fields that domain randomisation overrides for this environment."""
-        random, model, index = self.random, self.model, self.index
+        random = self.random
+        model = self.model
+        index = self.index
         fields = {}
-        as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+
+        def as_float(x):
+            return jnp.asarray(x, jnp.float32)
+
         if random.friction is not None:
-            fields["geom_friction"] = as_float(model.geom_friction).at[index.geoms, 0].set(params.friction[:, None])
+            fields["geom_friction"] = (
+                as_float(model.geom_friction).at[index.geoms, 0].set(params.friction[:, None])
+            )
         if random.payload is not None:
-            # The payload is distributed like the trunk's own mass: mass and inertia grow by the same factor.
+            # The payload is distributed like the trunk's own mass: mass and inertia grow by the
+            # same factor.
             trunk = index.trunk_body
             factor = 1.0 + params.payload / as_float(model.body_mass[trunk])
             fields["body_mass"] = as_float(model.body_mass).at[trunk].add(params.payload)
-            fields["body_inertia"] = as_float(model.body_inertia).at[trunk].multiply(factor[:, None])
+            fields["body_inertia"] = (
+                as_float(model.body_inertia).at[trunk].multiply(factor[:, None])
+            )
         if random.center_of_mass is not None:
-            fields["body_ipos"] = as_float(model.body_ipos).at[index.trunk_body].add(params.center_of_mass)
+            fields["body_ipos"] = (
+                as_float(model.body_ipos).at[index.trunk_body].add(params.center_of_mass)
+            )
         if random.motor_strength is not None:
-            strength = jnp.ones(model.nu).at[index.actuator].set(params.motor_strength[:, None])[:, None]
+            strength = (
+                jnp.ones(model.nu).at[index.actuator].set(params.motor_strength[:, None])[:, None]
+            )
             fields["actuator_gainprm"] = as_float(model.actuator_gainprm) * strength
             fields["actuator_biasprm"] = as_float(model.actuator_biasprm) * strength
         if random.joint_mechanics is not None:
@@ -133,11 +173,18 @@ class Randomizer:
         return fields
 
     def push(self, data: "mjx.Data", key: jax.Array, dt: float) -> "mjx.Data":
-        """Changes each trunk's horizontal velocity at random, on average once per `push_period`; `dt` in s."""
-        random, index = self.random, self.index
+        """Changes each trunk's horizontal velocity at random, on average once per `push_period`;
+        `dt` in s.
+        """
+        random = self.random
+        index = self.index
         if not random.push:
             return data
         when_key, size_key = jax.random.split(key)
         now = jax.random.bernoulli(when_key, dt / random.push_period, (index.num_robots, 1))
-        change = jax.random.uniform(size_key, (index.num_robots, 2), minval=-random.push, maxval=random.push)
-        return data.replace(qvel=data.qvel.at[index.base_qvel[:, :2]].add(jnp.where(now, change, 0.0)))
+        change = jax.random.uniform(
+            size_key, (index.num_robots, 2), minval=-random.push, maxval=random.push
+        )
+        return data.replace(
+            qvel=data.qvel.at[index.base_qvel[:, :2]].add(jnp.where(now, change, 0.0))
+        )

@@ -1,6 +1,7 @@
 """Registry of tasks and their scripted policies; a new task is one line in `SHIPPED`.
 
-A task's module is imported when its class is asked for, so that listing tasks imports neither JAX nor MuJoCo.
+A task's module is imported when its class is asked for, so that listing tasks imports neither JAX
+nor MuJoCo.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from mqe_jax.envs.base import QuadrupedEnv
 
 ScriptedPolicy: TypeAlias = "Callable[[dict[str, jax.Array]], jax.Array]"
-"""Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the `command` mode."""
+"""Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the
+`command` mode."""
 
 
 class Shipped(NamedTuple):
@@ -45,31 +47,86 @@ class Shipped(NamedTuple):
 
 SHIPPED = {
     "go1plane": Shipped("plane:Go1Plane", None, "Plane", (2,), 14, 91, 10.0, (1, 64)),
-    "go1gate": Shipped("gate:Go1Gate", "cooperative:plan_gate", "Narrow Gate", (2,), 16, 93, 10.0, (1, 64)),
-    "go1seesaw": Shipped("seesaw:Go1Seesaw", "cooperative:plan_seesaw", "Climb on Seesaw", (2,), 14, 93, 10.0),
+    "go1gate": Shipped(
+        "gate:Go1Gate", "cooperative:plan_gate", "Narrow Gate", (2,), 16, 93, 10.0, (1, 64)
+    ),
+    "go1seesaw": Shipped(
+        "seesaw:Go1Seesaw", "cooperative:plan_seesaw", "Climb on Seesaw", (2,), 14, 93, 10.0
+    ),
     "go1sheep-easy": Shipped(
-        "sheep:Go1SheepEasy", "cooperative:plan_sheep_easy", "Sheep Dog (Easy)", (2,), 18, 97, 15.0, (1, 64)
+        "sheep:Go1SheepEasy",
+        "cooperative:plan_sheep_easy",
+        "Sheep Dog (Easy)",
+        (2,),
+        18,
+        97,
+        15.0,
+        (1, 64),
     ),
     "go1sheep-hard": Shipped(
-        "sheep:Go1SheepHard", "cooperative:plan_sheep_hard", "Sheep Dog (Hard)", (2,), 34, 129, 15.0, (1, 64)
+        "sheep:Go1SheepHard",
+        "cooperative:plan_sheep_hard",
+        "Sheep Dog (Hard)",
+        (2,),
+        34,
+        129,
+        15.0,
+        (1, 64),
     ),
-    "go1pushbox": Shipped("pushbox:Go1PushBox", "cooperative:plan_pushbox", "Push Box", (2,), 22, 106, 15.0, (1, 64)),
+    "go1pushbox": Shipped(
+        "pushbox:Go1PushBox", "cooperative:plan_pushbox", "Push Box", (2,), 22, 106, 15.0, (1, 64)
+    ),
     "go1football-defender": Shipped(
-        "football_defender:Go1FootballDefender", "football:plan_defender", "Football (2 vs 1)", (2,), 20, 153, 20.0
+        "football_defender:Go1FootballDefender",
+        "football:plan_defender",
+        "Football (2 vs 1)",
+        (2,),
+        20,
+        153,
+        20.0,
     ),
     "go1tug": Shipped("tug:Go1Tug", "matches:plan_tug", "Push Cylinder", (1, 1), 10, 93, 15.0),
     "go1revolvingdoor": Shipped(
-        "door:Go1RevolvingDoor", "matches:plan_revolving_door", "Revolving Door", (1, 1), 12, 95, 5.0
+        "door:Go1RevolvingDoor",
+        "matches:plan_revolving_door",
+        "Revolving Door",
+        (1, 1),
+        12,
+        95,
+        5.0,
     ),
     "go1wrestling": Shipped(
-        "wrestling:Go1Wrestling", "matches:plan_wrestling", "Sumo Wrestling", (1, 1), 12, 91, 15.0, (2, 10)
+        "wrestling:Go1Wrestling",
+        "matches:plan_wrestling",
+        "Sumo Wrestling",
+        (1, 1),
+        12,
+        91,
+        15.0,
+        (2, 10),
     ),
-    "go1bridge": Shipped("bridge:Go1Bridge", "matches:plan_bridge", "Traverse Bridge", (1, 1), 12, 91, 20.0),
+    "go1bridge": Shipped(
+        "bridge:Go1Bridge", "matches:plan_bridge", "Traverse Bridge", (1, 1), 12, 91, 20.0
+    ),
     "go1football-1vs1": Shipped(
-        "football:Go1Football1vs1", "football:plan_match", "Football (1 vs 1)", (1, 1), 19, 108, 20.0, (2, 64)
+        "football:Go1Football1vs1",
+        "football:plan_match",
+        "Football (1 vs 1)",
+        (1, 1),
+        19,
+        108,
+        20.0,
+        (2, 64),
     ),
     "go1football-2vs2": Shipped(
-        "football:Go1Football2vs2", "football:plan_match", "Football (2 vs 2)", (2, 2), 32, 198, 20.0, (2, 64)
+        "football:Go1Football2vs2",
+        "football:plan_match",
+        "Football (2 vs 2)",
+        (2, 2),
+        32,
+        198,
+        20.0,
+        (2, 64),
     ),
 }
 """The package's tasks by id, with default parameters."""
@@ -93,12 +150,14 @@ TASKS = _Tasks(dict.fromkeys(SHIPPED))
 SCRIPTED: dict[str, ScriptedPolicy | str] = {
     name: task.scripted for name, task in SHIPPED.items() if task.scripted is not None
 }
-"""Scripted policies by task id; shipped ones as MODULE:FUNCTION, since `envs` does not import `policies`."""
+"""Scripted policies by task id; shipped ones as MODULE:FUNCTION, since `envs` does not import
+`policies`."""
 
 NAMED_SCRIPTED: dict[str, dict[str, ScriptedPolicy | str]] = {
     "go1sheep-hard": {"by-distance": "cooperative:plan_sheep_by_distance"}
 }
-"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`); shipped ones as in `SCRIPTED`."""
+"""Further scripted policies by task id and name (`--policy NAME`, `--opponent NAME`); shipped ones
+as in `SCRIPTED`."""
 
 
 @check_arguments(task=str, name=str, policy=Callable)
@@ -121,20 +180,31 @@ def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
 
 
 @check_arguments(scripted=Callable | None)
-def register_task(task: type[QuadrupedEnv], scripted: ScriptedPolicy | None = None) -> type[QuadrupedEnv]:
-    """Registers a task class under its `name` for `make` and the command line, with its scripted policy if it has one.
+def register_task(
+    task: type[QuadrupedEnv], scripted: ScriptedPolicy | None = None
+) -> type[QuadrupedEnv]:
+    """Registers a task class under its `name` for `make` and the command line, with its scripted
+    policy if it has one.
 
-    Also a class decorator. InputError if it is no class of tasks, has no name, or another class has that name.
+    Also a class decorator. InputError if it is no class of tasks, has no name, or another class has
+    that name.
     """
     from mqe_jax.envs.base import QuadrupedEnv
 
     if not (isinstance(task, type) and issubclass(task, QuadrupedEnv)):
         fail("task", task, "a class derived from QuadrupedEnv")
     if not task.name:
-        raise InputError(f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'")
+        raise InputError(
+            f"task {task.__name__}: its `name` is empty; give it an id such as 'go1catch'"
+        )
     known = TASKS.get(task.name)
-    if known is not None and (known.__module__, known.__qualname__) != (task.__module__, task.__qualname__):
-        raise InputError(f"task {task.__name__}: the id {task.name!r} is already registered by {known.__name__}")
+    if known is not None and (known.__module__, known.__qualname__) != (
+        task.__module__,
+        task.__qualname__,
+    ):
+        raise InputError(
+            f"task {task.__name__}: the id {task.name!r} is already registered by {known.__name__}"
+        )
     TASKS[task.name] = task
     if scripted is not None:
         SCRIPTED[task.name] = scripted

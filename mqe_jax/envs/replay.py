@@ -20,7 +20,9 @@ from mqe_jax.envs.state import State
 from mqe_jax.physics.engines import STATE_FIELDS
 
 # Fields on which a step depends; the others are recomputed by it.
-_FIELDS = tuple("step anchors control actuators randomized task assistance frozen_steps key active".split())
+_FIELDS = tuple(
+    "step anchors control actuators randomized task assistance frozen_steps key active".split()
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +33,8 @@ class Recording:
     params: dict[str, Any]  # the task's parameters as nested mappings
     impl: str  # physics engine
     control: str  # action mode
-    states: dict[str, np.ndarray]  # the fields of `State` on which a step depends, before each action, by path (T, ...)
+    # the fields of `State` on which a step depends, before each action, by path (T, ...)
+    states: dict[str, np.ndarray]
     actions: np.ndarray  # actions (T, A, D)
 
     def __post_init__(self) -> None:  # of a file
@@ -55,12 +58,23 @@ class Recording:
 
 
 @check_arguments(file=PathText, env=AnySingle)
-def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array) -> None:
-    """Writes the last episode of states of one environment (T, ...), each before an action (T, A, D), as .npz."""
+def save_recording(
+    file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array
+) -> None:
+    """Writes the last episode of states of one environment (T, ...), each before an action (T, A,
+    D), as .npz.
+    """
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
     first = int(np.flatnonzero(np.diff(steps, prepend=steps[0]) != 1)[-1])
-    about = {"task": env.name, "params": to_mapping(env.params), "impl": env.impl, "control": env.control}
-    arrays: dict[str, Any] = {f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()}
+    about = {
+        "task": env.name,
+        "params": to_mapping(env.params),
+        "impl": env.impl,
+        "control": env.control,
+    }
+    arrays: dict[str, Any] = {
+        f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()
+    }
     arrays |= {"about": np.array(json.dumps(about)), "actions": np.asarray(actions)[first:]}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
@@ -71,9 +85,16 @@ def save_recording(file: str | pathlib.Path, env: QuadrupedEnv, states: State, a
 def load_recording(file: str | pathlib.Path) -> Recording:
     """Reads a recording; InputError if the file is missing, damaged or not a recording."""
     path = pathlib.Path(file)
-    with archive(path, limits.RECORDING_BYTES, "a recording"), np.load(path, allow_pickle=False) as arrays:
+    with (
+        archive(path, limits.RECORDING_BYTES, "a recording"),
+        np.load(path, allow_pickle=False) as arrays,
+    ):
         about = parse_json(str(arrays["about"]), "about")
-        states = {name.removeprefix("states/"): arrays[name] for name in arrays if name.startswith("states/")}
+        states = {
+            name.removeprefix("states/"): arrays[name]
+            for name in arrays
+            if name.startswith("states/")
+        }
         try:
             return Recording(**about, states=states, actions=arrays["actions"])
         except InputError as error:
@@ -82,14 +103,19 @@ def load_recording(file: str | pathlib.Path) -> Recording:
 
 @check_arguments(recording=Recording, env=AnySingle | None)
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
-    """Replays a recording, by default on the recorded engine; returns the states after each action (T, ...)."""
+    """Replays a recording, by default on the recorded engine; returns the states after each action
+    (T, ...).
+    """
     env = recording.make_env() if env is None else env
     if (recording.task, recording.control) != (env.name, env.control):
         given = f"recording of {recording.task} with control {recording.control!r}"
         raise InputError(f"env: {env.name} with control {env.control!r} does not fit a {given}")
     actions = (env.num_agents, env.action_size)
-    if recording.actions.shape[1:] != actions or not np.isfinite(recording.actions[:-1]).all():  # the last may diverge
-        raise InputError(f"recording of {recording.task}: its actions are not finite, or not {actions}")
+    # the last may diverge
+    if recording.actions.shape[1:] != actions or not np.isfinite(recording.actions[:-1]).all():
+        raise InputError(
+            f"recording of {recording.task}: its actions are not finite, or not {actions}"
+        )
     start = _restore(env, recording)
 
     def advance(state: State, action: jax.Array) -> tuple[State, State]:
@@ -120,9 +146,13 @@ def _restore(env: QuadrupedEnv, recording: Recording) -> State:
         saved = recording.states.get(name)
         if saved is None or saved.shape[1:] != leaf.shape:
             found = "is missing" if saved is None else f"has shape {saved.shape[1:]}"
-            raise InputError(f"recording of {recording.task}: {name} {found}; expected shape {leaf.shape}")
+            raise InputError(
+                f"recording of {recording.task}: {name} {found}; expected shape {leaf.shape}"
+            )
         if not np.isfinite(saved[0]).all():
-            raise InputError(f"recording of {recording.task}: {name} of its first state is not finite")
+            raise InputError(
+                f"recording of {recording.task}: {name} of its first state is not finite"
+            )
         leaves.append(jnp.asarray(saved[0], leaf.dtype))
     fields = jax.tree.unflatten(jax.tree.structure(fields), leaves)
     data = blank.data.replace(**fields.pop("data"))

@@ -15,19 +15,31 @@ def weigh(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Returns the reward (A,), the weighted sum of the terms, and what is logged of it.
 
-    A term is () if it is shared by all agents, or (A,); the fields of `weights` have the same names. Logged are
-    `reward/<name>` () and their sum `average_step_reward`, of each team's first active agent, those of team 1 with the
-    prefix `team1/`. The reward of an agent that is not `active` (A,) is 0. ValueError if names or shapes differ.
+    A term is () if it is shared by all agents, or (A,); the fields of `weights` have the same
+    names. Logged are `reward/<name>` () and their sum `average_step_reward`, of each team's first
+    active agent, those of team 1 with the prefix `team1/`. The reward of an agent that is not
+    `active` (A,) is 0. ValueError if names or shapes differ.
     """
-    names, agents = [field.name for field in dataclasses.fields(weights)], sum(map(len, teams))
+    names = [field.name for field in dataclasses.fields(weights)]
+    agents = sum(map(len, teams))
     check_names("rewards", terms, names)
     shapes = ((), (agents,))
-    given = {name: check_shape(f"rewards: {name}", terms[name], *shapes).astype(jnp.float32) for name in names}
+    given = {
+        name: check_shape(f"rewards: {name}", terms[name], *shapes).astype(jnp.float32)
+        for name in names
+    }
     weighted = {name: getattr(weights, name) * term for name, term in given.items()}
-    total = sum((jnp.broadcast_to(value, (agents,)) for value in weighted.values()), jnp.zeros(agents))
-    values = {**{f"reward/{name}": value for name, value in weighted.items()}, "average_step_reward": total}
+    total = sum(
+        (jnp.broadcast_to(value, (agents,)) for value in weighted.values()), jnp.zeros(agents)
+    )
+    values = {
+        **{f"reward/{name}": value for name, value in weighted.items()},
+        "average_step_reward": total,
+    }
     logged = {
-        f"team{team}/{name}" if team else name: _first(value, agents, active) if value.ndim else value
+        f"team{team}/{name}" if team else name: _first(value, agents, active)
+        if value.ndim
+        else value
         for team, agents in enumerate(teams)
         for name, value in values.items()
     }
@@ -35,7 +47,9 @@ def weigh(
 
 
 def _first(value: jax.Array, agents: Sequence[int], active: jax.Array) -> jax.Array:
-    """Returns the value () of the first active one of some agents; without any, that of the last."""
+    """Returns the value () of the first active one of some agents; without any, that of the
+    last.
+    """
     *others, chosen = agents
     result = value[chosen]
     for agent in reversed(others):
@@ -43,14 +57,23 @@ def _first(value: jax.Array, agents: Sequence[int], active: jax.Array) -> jax.Ar
     return result
 
 
-def fade(terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float) -> dict[str, jax.Array]:
+def fade(
+    terms: Mapping[str, jax.Array], weights: Any, factor: jax.Array | float
+) -> dict[str, jax.Array]:
     """Returns the terms, those of weight 0 in `weights` times a factor ()."""
-    as_float = lambda term: jnp.asarray(term, jnp.float32)  # noqa: E731
-    return {name: term if getattr(weights, name) else factor * as_float(term) for name, term in terms.items()}
+
+    def as_float(term):
+        return jnp.asarray(term, jnp.float32)
+
+    return {
+        name: term if getattr(weights, name) else factor * as_float(term)
+        for name, term in terms.items()
+    }
 
 
 def crowding(position: jax.Array, active: jax.Array) -> jax.Array:
-    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below 0.5 m: (A, D) -> ().
+    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below 0.5 m: (A,
+    D) -> ().
 
     Example:
         ```python

@@ -1,4 +1,6 @@
-"""go1seesaw, the paper's Climb on Seesaw: one robot keeps a seesaw tilted while the other walks up to a platform."""
+"""go1seesaw, the paper's Climb on Seesaw: one robot keeps a seesaw tilted while the other walks up
+to a platform.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +30,8 @@ class SeesawRewards:
     progress: float = 5.0
     """Per m of the robots' summed displacement along x."""
     lateral_offset: float = -0.5
-    """Per m^2 of the robots' summed squared distances from the centre line above `lateral_offset_base`."""
+    """Per m^2 of the robots' summed squared distances from the centre line above
+    `lateral_offset_base`."""
     collision: float = -2.0
     """In steps with any trunk contact."""
     fall: float = -2.0
@@ -58,7 +61,8 @@ class SeesawParams(TaskParams):
     height_base: Coordinate = 0.56
     """Summed height of the robots at which the height term is zero, m."""
     lateral_offset_base: Coordinate = 0.5
-    """Summed squared distance from the centre line at which the `lateral_offset` term is zero, m^2."""
+    """Summed squared distance from the centre line at which the `lateral_offset` term is zero,
+    m^2."""
     rewards: SeesawRewards = SeesawRewards()
     """Weights of the reward terms."""
 
@@ -71,11 +75,13 @@ class SeesawParams(TaskParams):
 class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
     """Climb on Seesaw.
 
-    - Scene: a track 3 m wide with a balanced plank whose near end is on the ground and whose far end reaches a
-      platform 1 m high. A robot beyond the hinge tips the plank unless another stands on the near end.
+    - Scene: a track 3 m wide with a balanced plank whose near end is on the ground and whose far
+      end reaches a platform 1 m high. A robot beyond the hinge tips the plank unless another stands
+      on the near end.
     - Observation: one-hot 2, own base info 6, teammate's base info 6.
     - Reward: see `SeesawRewards`; shared.
-    - End: a fall, a trunk below 0.08 m, a collision, or 10 s. Success: a robot stands on the platform at the end.
+    - End: a fall, a trunk below 0.08 m, a collision, or 10 s. Success: a robot stands on the
+      platform at the end.
 
     Source: paper, section III and table of rewards.
     """
@@ -88,10 +94,14 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
     def scene(self) -> Scene:
         params = self.params
         blocks = (SpawnArea(2.0), Plane(8.0), EndWall())
-        ground = grounds.climb(10.0, params.track_width, params.platform.center, params.platform.size)
+        ground = grounds.climb(
+            10.0, params.track_width, params.platform.center, params.platform.size
+        )
         track = Track(blocks=blocks, width=params.track_width, ground=ground)
         # Plank and platform use the ground's collision bits.
-        return Scene(track, num_robots=2, objects={"seesaw": params.plank, "platform": params.platform})
+        return Scene(
+            track, num_robots=2, objects={"seesaw": params.plank, "platform": params.platform}
+        )
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
@@ -109,24 +119,36 @@ class Go1Seesaw(QuadrupedEnv[None, SeesawParams]):
     def on_platform(self, robot_state: RobotState) -> jax.Array:
         """Returns which active robots are on the platform (2,) bool."""
         x, z = self.params.on_platform
-        return robot_state.active & (robot_state.position_w[:, 0] > x) & (robot_state.position_w[:, 2] > z)
+        return (
+            robot_state.active
+            & (robot_state.position_w[:, 0] > x)
+            & (robot_state.position_w[:, 2] > z)
+        )
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         params = self.params
         robots = after.robots
         x, y, z = robots.position_w.T
-        roll, pitch = jnp.abs(robots.euler[:, 0]), jnp.abs(robots.euler[:, 1])
+        roll = jnp.abs(robots.euler[:, 0])
+        pitch = jnp.abs(robots.euler[:, 1])
         return {
             "success": jnp.sum(self.on_platform(robots)).astype(jnp.float32),
             "height": jnp.sum(robots.count(z)) - params.height_base,
             "progress": jnp.sum(robots.count(x - before.robots.position_w[:, 0])),
             "lateral_offset": jnp.sum(robots.count(jnp.square(y))) - params.lateral_offset_base,
             "collision": collision.astype(jnp.float32),
-            "fall": jnp.any(robots.count((roll > params.max_roll) | (pitch > params.max_pitch))).astype(jnp.float32),
+            "fall": jnp.any(
+                robots.count((roll > params.max_roll) | (pitch > params.max_pitch))
+            ).astype(jnp.float32),
             "crowding": reward.crowding(robots.position_w[:, :2], robots.active) / 2,
         }
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State, robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: a robot stands on the platform; `height`: height of the highest robot, m."""
         success = jnp.any(self.on_platform(robot_state)) & ~failed
-        return {"success": success, "height": jnp.max(robot_state.count(robot_state.position_w[:, 2]))}
+        return {
+            "success": success,
+            "height": jnp.max(robot_state.count(robot_state.position_w[:, 2])),
+        }

@@ -33,8 +33,12 @@ class Sensing:
 
     @property
     def action_size(self) -> int:
-        """Length of an agent's action: what moves the robot, then what sensors add, such as messages."""
-        return self.controller.action_size + sum(sensor.action_size for sensor in self.params.senses)
+        """Length of an agent's action: what moves the robot, then what sensors add, such as
+        messages.
+        """
+        return self.controller.action_size + sum(
+            sensor.action_size for sensor in self.params.senses
+        )
 
     def moving(self, action: jax.Array) -> jax.Array:
         """Returns the part of actions (..., action_size) that moves the robots."""
@@ -45,11 +49,15 @@ class Sensing:
         for sensor in self.params.senses:
             if sensor.engines and self.impl not in sensor.engines:
                 allowed = " or ".join(sensor.engines)
-                raise InputError(f"senses: {sensor.name!r} needs impl {allowed}; the engine here is {self.impl}")
+                raise InputError(
+                    f"senses: {sensor.name!r} needs impl {allowed}; the engine here is {self.impl}"
+                )
 
     @property
     def entities(self) -> tuple[Entity, ...]:
-        """What sensors tell apart besides robots and walls: by default the scene's objects and gaps."""
+        """What sensors tell apart besides robots and walls: by default the scene's objects and
+        gaps.
+        """
         return entities_of(self.compiled)
 
     @property
@@ -58,22 +66,30 @@ class Sensing:
         return False
 
     def own_frame(self, info: jax.Array) -> jax.Array:
-        """Maps the agents' base information (A, 6) to each agent's own (possibly mirrored) frame."""
+        """Maps the agents' base information (A, 6) to each agent's own (possibly mirrored)
+        frame.
+        """
         return info
 
     @functools.cached_property
     def suite(self) -> Suite:
         """The robots' sensors."""
-        sensed = SensedScene(self.compiled, self.entities, self.teams, self.action_size, self.dt, self.reflected)
+        sensed = SensedScene(
+            self.compiled, self.entities, self.teams, self.action_size, self.dt, self.reflected
+        )
         return Suite(sensed, self.params.senses)
 
     def snapshot(self, state: State[Any], robot_state: RobotState) -> Snapshot:
         """Returns what there is to sense in a state."""
         pose = self.own_frame(robot_state.base_info[: self.num_agents])[:, [0, 1, 5]]
-        action = state.senses.action if state.senses else jnp.zeros((self.num_agents, self.action_size))
+        action = (
+            state.senses.action if state.senses else jnp.zeros((self.num_agents, self.action_size))
+        )
         return self.suite.scene.snapshot(state.data, robot_state, state.anchors, pose, action)
 
     def marks(self, state: State[Any]) -> tuple[Marks, ...]:
         """Returns what shows the readings in a state that has the group `onboard`."""
         readings = self.groups[ONBOARD].split(state.groups[ONBOARD])
-        return self.suite.draw(self.snapshot(state, self.read(state.data, state.active)), state.senses, readings)
+        return self.suite.draw(
+            self.snapshot(state, self.read(state.data, state.active)), state.senses, readings
+        )

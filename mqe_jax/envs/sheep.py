@@ -1,4 +1,6 @@
-"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: robots, by default two, herd sheep through a gate."""
+"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: robots, by default two, herd sheep
+through a gate.
+"""
 
 import dataclasses
 import functools
@@ -9,10 +11,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.limits import Buffer, Coordinate, Distance, Few, FlockSize, Friction, Length, NonNegative, TimeLimit
+from mqe_jax.core.limits import (
+    Buffer,
+    Coordinate,
+    Distance,
+    Few,
+    FlockSize,
+    Friction,
+    Length,
+    NonNegative,
+    TimeLimit,
+)
 from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import GATE, ObservationLayout, entities, for_all, observe_team, team_blocks
+from mqe_jax.envs.observation import (
+    GATE,
+    ObservationLayout,
+    entities,
+    for_all,
+    observe_team,
+    team_blocks,
+)
 from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.sizes import Herd
 from mqe_jax.envs.state import Moment, State
@@ -41,11 +60,13 @@ class SheepRewards:
     progress: float = 2.0
     """Per m of the sheep's summed displacement along x."""
     nearness: float = 0.0
-    """Sum of exp(-distance to the gate's centre / 2 m) over the sheep that are not past the gate."""
+    """Sum of exp(-distance to the gate's centre / 2 m) over the sheep that are not past the
+    gate."""
     crossing: float = 0.0
     """Per sheep that passes the gate in a step, minus those that come back. For training only."""
     gathering: float = 0.0
-    """Per m of decrease of the sheep's summed distances to the gate's centre, 0 past it. For training only."""
+    """Per m of decrease of the sheep's summed distances to the gate's centre, 0 past it. For
+    training only."""
     failure: float = 0.0
     """In steps with a fall or a collision of a robot. For training only."""
 
@@ -75,16 +96,18 @@ class SheepEasyParams(TaskParams):
     num_sheep: FlockSize | None = None
     """Number of sheep, in about as many rows as columns; None: that of `flock`."""
     fewest_sheep: FlockSize | None = None
-    """Fewest sheep in an episode. Reset draws the number and parks the others. None: all take part."""
+    """Fewest sheep in an episode. Reset draws the number and parks the others. None: all take
+    part."""
     flock_center: tuple[Coordinate, Coordinate] = (3.0, 0.0)
     """Centre of the flock at reset, m."""
     flock_spacing: Distance = 1.5
-    """Distance between neighbouring sheep at reset, m; a flock of `num_sheep` is closer if there is no room."""
+    """Distance between neighbouring sheep at reset, m; a flock of `num_sheep` is closer if there is
+    no room."""
     flock_noise: Distance = 0.3
     """Half-width of the uniform noise on each sheep's position, m."""
     restlessness: NonNegative = 0.08
-    """Scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep of the released
-    system; in the paper sheep always move."""
+    """Scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep
+    of the released system; in the paper sheep always move."""
     sheep_friction: Friction = 1.0
     """Sliding friction between sheep and ground."""
     rewards: SheepRewards = SheepRewards()
@@ -95,14 +118,23 @@ class SheepEasyParams(TaskParams):
         check_gap("gate_width", self.gate_width, self.track_width)
         most = math.prod(self._most)
         if self.num_sheep is not None and self.num_sheep > most:
-            fail("num_sheep", self.num_sheep, f"at most {most}, for which there is room before the gate")
+            fail(
+                "num_sheep",
+                self.num_sheep,
+                f"at most {most}, for which there is room before the gate",
+            )
         if self.fewest_sheep is not None and self.fewest_sheep > self.flock_size:
-            fail("fewest_sheep", self.fewest_sheep, f"at most {self.flock_size}, the number of sheep")
+            fail(
+                "fewest_sheep", self.fewest_sheep, f"at most {self.flock_size}, the number of sheep"
+            )
 
     @property
     def _room(self) -> np.ndarray:
-        """Extents x, y (2,) of the ground on which the flock may stand at the start, about its centre, m."""
-        (x, y), gate = self.flock_center, sum(self.lengths[:2]) + _ROOM - self.gate_random[0]
+        """Extents x, y (2,) of the ground on which the flock may stand at the start, about its
+        centre, m.
+        """
+        (x, y) = self.flock_center
+        gate = sum(self.lengths[:2]) + _ROOM - self.gate_random[0]
         along = min(x - self.spawn_x - 2 * _ROOM, gate - x - _ROOM)
         return 2 * np.maximum([along, self.track_width / 2 - abs(y) - _ROOM], 0.0)
 
@@ -118,19 +150,27 @@ class SheepEasyParams(TaskParams):
         return math.prod(self.flock) if self.num_sheep is None else self.num_sheep
 
     def flock_grid(self) -> tuple[np.ndarray, float]:
-        """Returns the sheep's mean positions at the start (S, 2), and half the width of the noise on them, m."""
-        (rows, columns), spacing, noise = self.flock, self.flock_spacing, self.flock_noise
+        """Returns the sheep's mean positions at the start (S, 2), and half the width of the noise
+        on them, m.
+        """
+        (rows, columns) = self.flock
+        spacing = self.flock_spacing
+        noise = self.flock_noise
         if self.num_sheep is not None:
             most_rows, most_columns = self._most
             columns = max(
-                min(math.ceil(math.sqrt(self.flock_size)), most_columns), math.ceil(self.flock_size / most_rows)
+                min(math.ceil(math.sqrt(self.flock_size)), most_columns),
+                math.ceil(self.flock_size / most_rows),
             )
             rows = math.ceil(self.flock_size / columns)
             spacing = min(spacing, *(self._room / np.maximum([rows - 1, columns - 1], 1)).tolist())
             noise = min(noise, max(spacing / 2 - objects.Sheep().radius, 0.0))
         number = np.arange(self.flock_size)
-        count = np.minimum(columns, self.flock_size - number // columns * columns)  # of the sheep's row
-        grid = np.stack([number // columns - (rows - 1) / 2, number % columns - (count - 1) / 2], axis=-1)
+        # of the sheep's row
+        count = np.minimum(columns, self.flock_size - number // columns * columns)
+        grid = np.stack(
+            [number // columns - (rows - 1) / 2, number % columns - (count - 1) / 2], axis=-1
+        )
         return self.flock_center + spacing * grid, noise
 
 
@@ -155,11 +195,15 @@ class SheepHardParams(SheepEasyParams):
 class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
     """Sheep Dog: sheep flee from nearby robots and must be herded through a gate.
 
-    - Scene: a track with a gate whose centre is sampled at reset; one sheep (hard: nine) in front of it.
-    - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2, each sheep's x, y.
+    - Scene: a track with a gate whose centre is sampled at reset; one sheep (hard: nine) in front
+      of it.
+    - Observation: one-hot, own base info 6, each teammate's base info 6, gate centre 2, each
+      sheep's x, y.
     - Reward: see `SheepRewards`; shared.
-    - End: a fall, a collision, or 15 s. Success: the share of the sheep that are past the gate at the time limit.
-    - Sizes: any `num_agents` and `num_sheep`; robots that do not fit beside each other start in rows.
+    - End: a fall, a collision, or 15 s. Success: the share of the sheep that are past the gate at
+      the time limit.
+    - Sizes: any `num_agents` and `num_sheep`; robots that do not fit beside each other start in
+      rows.
 
     Source: paper, section III and table of rewards.
     """
@@ -187,13 +231,17 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return _CONTACTS * max(self.num_sheep - self.Params().flock_size, 0)
 
     def scene(self) -> Scene:
-        params, agents = self.params, self.num_agents
+        params = self.params
+        agents = self.num_agents
         before, middle, behind = params.lengths
         columns, rows = rows_of(agents, params.track_width)
         spacing = min(params.spawn_spacing, (params.track_width - LANE) / max(columns - 1, 1))
-        spawn = SpawnArea(before + rows, spawn_x=params.spawn_x + rows, spacing=spacing, columns=columns)
+        spawn = SpawnArea(
+            before + rows, spawn_x=params.spawn_x + rows, spacing=spacing, columns=columns
+        )
         gate = Gate(1.0, width=params.gate_width, random=params.gate_random)
-        ends, goal = (0.0 - rows, before + middle + behind + 1.0), before + middle + 0.5
+        ends = (0.0 - rows, before + middle + behind + 1.0)
+        goal = before + middle + 0.5
         track = Track(
             blocks=(spawn, Plane(middle), gate, Plane(behind), EndWall()),
             width=params.track_width,
@@ -209,11 +257,17 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Samples the sheep's initial positions."""
-        params, (start, spread) = self.params, self.params.flock_grid()
+        params = self.params
+        (start, spread) = self.params.flock_grid()
         if params.fewest_sheep is not None:
             sizes = range(params.fewest_sheep, self.num_sheep + 1)
-            grids = [dataclasses.replace(params, num_sheep=size, fewest_sheep=None).flock_grid() for size in sizes]
-            start, spread = self.herd.start(jax.random.fold_in(key, 1), grids, assistance * params.growing)
+            grids = [
+                dataclasses.replace(params, num_sheep=size, fewest_sheep=None).flock_grid()
+                for size in sizes
+            ]
+            start, spread = self.herd.start(
+                jax.random.fold_in(key, 1), grids, assistance * params.growing
+            )
         noise = jax.random.uniform(key, start.shape, minval=-spread, maxval=spread)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
 
@@ -227,7 +281,10 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return super().varies or self.params.fewest_sheep is not None
 
     def there(self, state: State) -> dict[str, jax.Array]:
-        return {**super().there(state), "sheep": for_all(self.herd.there(state.data), self.num_agents)}
+        return {
+            **super().there(state),
+            "sheep": for_all(self.herd.there(state.data), self.num_agents),
+        }
 
     def fields(self, state: State) -> dict[str, jax.Array]:
         return {} if self.params.fewest_sheep is None else self.herd.fields(state.data)
@@ -253,7 +310,9 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
 
     def _sheep(self, vector: str) -> np.ndarray:
         """Addresses of the sheep in qpos or qvel (S, 2)."""
-        return np.stack([getattr(self.objects[f"sheep{number}"], vector) for number in range(self.num_sheep)])
+        return np.stack(
+            [getattr(self.objects[f"sheep{number}"], vector) for number in range(self.num_sheep)]
+        )
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -261,7 +320,8 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return ObservationLayout((*team_blocks(self.num_agents), GATE, sheep))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        sheep, gate = (for_all(x, self.num_agents) for x in (self.sheep(state.data), state.anchors))
+        sheep = for_all(self.sheep(state.data), self.num_agents)
+        gate = for_all(state.anchors, self.num_agents)
         return {**observe_team(robot_state.base_info), "gate": gate, "sheep": sheep}
 
     def through(self, state: State) -> jax.Array:
@@ -270,25 +330,37 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         return past & self.herd.there(state.data)
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
-        (through_before, way_before), (through, way) = self._flock(before.state), self._flock(after.state)
+        (through_before, way_before) = self._flock(before.state)
+        (through, way) = self._flock(after.state)
         passed = jnp.sum(through).astype(jnp.float32)
         return {
             "success": passed,
-            "progress": jnp.sum(self.sheep(after.state.data)[:, 0] - self.sheep(before.state.data)[:, 0]),
-            "nearness": jnp.sum(jnp.where(through | ~self.herd.there(after.state.data), 0.0, jnp.exp(-way / 2.0))),
+            "progress": jnp.sum(
+                self.sheep(after.state.data)[:, 0] - self.sheep(before.state.data)[:, 0]
+            ),
+            "nearness": jnp.sum(
+                jnp.where(through | ~self.herd.there(after.state.data), 0.0, jnp.exp(-way / 2.0))
+            ),
             "crossing": passed - jnp.sum(through_before).astype(jnp.float32),
             "gathering": jnp.sum(way_before) - jnp.sum(way),
             "failure": collision | jnp.any(self.fallen(after.robots)),
         }
 
     def _flock(self, state: State) -> tuple[jax.Array, jax.Array]:
-        """Returns which sheep are past the gate (S,) bool and the others' distances to its centre (S,), m, else 0."""
-        through, there = self.through(state), self.herd.there(state.data)
+        """Returns which sheep are past the gate (S,) bool and the others' distances to its centre
+        (S,), m, else 0.
+        """
+        through = self.through(state)
+        there = self.herd.there(state.data)
         return through, jnp.where(
-            through | ~there, 0.0, jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1)
+            through | ~there,
+            0.0,
+            jnp.linalg.norm(self.sheep(state.data) - state.anchors[0], axis=-1),
         )
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State, robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: the share of the sheep that are past the gate, 0 after a fall or a collision.
 
         `through`: the share that are, however the episode ended.

@@ -1,7 +1,9 @@
-"""Episodes with fewer robots than the scene has: which take part, where the others are parked, what all observe.
+"""Episodes with fewer robots than the scene has: which take part, where the others are parked, what
+all observe.
 
-A parked robot is high above the scene, where it touches nothing. Every step begins with it at rest there and with
-neutral targets, so that nothing in the step depends on its earlier state or its actions. Objects are parked likewise.
+A parked robot is high above the scene, where it touches nothing. Every step begins with it at rest
+there and with neutral targets, so that nothing in the step depends on its earlier state or its
+actions. Objects are parked likewise.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
     from mqe_jax.physics.scene import CompiledScene
 
 ENTITIES = "entities"
-"""Group of observations of teams of any size: their blocks differ between sizes in the number of entities only."""
+"""Group of observations of teams of any size: their blocks differ between sizes in the number of
+entities only."""
 
 HIGH = 100.0
 """Height above which only parked robots are, m."""
@@ -32,22 +35,33 @@ HIGH = 100.0
 OUTSIDE = 2.0
 """Distance of parked objects from the end of the track, m."""
 
-_HEIGHT, _ABOVE = 2 * HIGH, 1.0  # m, of the first parked robot, and of each further one above it
+# m, of the first parked robot, and of each further one above it
+_HEIGHT = 2 * HIGH
+_ABOVE = 1.0
 _RAISED = 20.0  # m, of the body of the first parked object
-_PLACE = Block("place", 1, "the agent's place in its team: -1 the first, 1 the last, 0 if alone", categorical=True)
+_PLACE = Block(
+    "place",
+    1,
+    "the agent's place in its team: -1 the first, 1 the last, 0 if alone",
+    categorical=True,
+)
 _NEAR = 2  # entries that `observe_entities` adds to each entity
 _NO_MATES = entities("teammate", "robot", 1, 6 + _NEAR, "none in a team of one", masked=True)
 
 
 def draw(key: jax.Array, fewest: int, most: int, level: jax.Array | float = 0.0) -> jax.Array:
-    """Returns a number () int32 from `fewest` to `most`, uniformly; at a curriculum level () of 1 the fewest."""
+    """Returns a number () int32 from `fewest` to `most`, uniformly; at a curriculum level () of 1
+    the fewest.
+    """
     beyond = jnp.round(level * (most - fewest)).astype(jnp.int32)
     return jax.random.randint(key, (), fewest, most + 1 - beyond)
 
 
 def check_sizes(env: Any) -> None:
     """Raises an InputError if an environment's numbers of robots do not fit the task."""
-    params, expected, fewest = env.params, env.Params().num_agents, env.params.fewest_agents
+    params = env.params
+    expected = env.Params().num_agents
+    fewest = env.params.fewest_agents
     if not env.variable_num_agents:
         for name in ("num_agents", "fewest_agents"):
             if getattr(params, name) not in (expected, None):
@@ -56,17 +70,25 @@ def check_sizes(env: Any) -> None:
         even = ", and even, for two equal teams" if len(env.teams) > 1 else ""
         fail("fewest_agents", fewest, f"at most num_agents, {params.num_agents}{even}")
     if env.varies and params.senses:
-        fail("senses", [sensor.name for sensor in params.senses], "empty if teams or flocks vary in size")
+        fail(
+            "senses",
+            [sensor.name for sensor in params.senses],
+            "empty if teams or flocks vary in size",
+        )
 
 
 class Sizes:
     """The numbers of robots that may take part in an episode, equal for all teams."""
 
     def __init__(self, env: Any) -> None:
-        params, teams, index = env.params, env.teams, env.index
+        params = env.params
+        teams = env.teams
+        index = env.index
         fewest = env.num_agents if params.fewest_agents is None else params.fewest_agents
-        self._growing, self._count = params.growing, len(teams)
-        self._fewest, self._most = fewest // len(teams), env.num_agents // len(teams)
+        self._growing = params.growing
+        self._count = len(teams)
+        self._fewest = fewest // len(teams)
+        self._most = env.num_agents // len(teams)
         self._vary = self._fewest < self._most
         if not self._vary:
             return
@@ -83,10 +105,15 @@ class Sizes:
         qvel = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)[: env.num_agents]
         agents = np.arange(env.num_agents)[:, None]
         middle = env.compiled.scene.track.start + env.compiled.scene.track.length / 2
-        self._of_qpos, self._of_qvel = np.full(env.compiled.model.nq, -1), np.full(env.compiled.model.nv, -1)
-        self._of_qpos[qpos], self._of_qvel[qvel] = agents, agents  # the agent of each coordinate, -1 of others
+        self._of_qpos = np.full(env.compiled.model.nq, -1)
+        self._of_qvel = np.full(env.compiled.model.nv, -1)
+        # the agent of each coordinate, -1 of others
+        self._of_qpos[qpos] = agents
+        self._of_qvel[qvel] = agents
         self._parked = np.zeros(env.compiled.model.nq, np.float32)
-        upright = np.tile([middle, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *env.robot.default_joints], (env.num_agents, 1))
+        upright = np.tile(
+            [middle, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *env.robot.default_joints], (env.num_agents, 1)
+        )
         upright[:, 2] = _HEIGHT + _ABOVE * agents[:, 0]
         self._parked[qpos] = upright
 
@@ -98,7 +125,9 @@ class Sizes:
         return jnp.asarray(self._active)[size - self._fewest]
 
     def line_up(self, pose: jax.Array, active: jax.Array) -> jax.Array:
-        """Moves spawn poses x, y, z, yaw of all robots (R, 4) to those of a team of the active ones (A,)."""
+        """Moves spawn poses x, y, z, yaw of all robots (R, 4) to those of a team of the active ones
+        (A,).
+        """
         if not self._vary:
             return pose
         number = jnp.sum(active) // self._count - self._fewest
@@ -109,7 +138,8 @@ class Sizes:
         if not self._vary:
             return data
         absent = jnp.append(~active, False)  # the last: of coordinates that are no agent's
-        moved, still = absent[self._of_qpos], absent[self._of_qvel]
+        moved = absent[self._of_qpos]
+        still = absent[self._of_qvel]
         return data.replace(
             qpos=jnp.where(moved, self._parked, data.qpos),
             qvel=jnp.where(still, 0.0, data.qvel),
@@ -128,29 +158,37 @@ class Sizes:
 class Herd:
     """Objects that slide along x and y, of which the first ones take part in an episode.
 
-    The coordinates of the others are beyond the end of the track. Their bodies are above it, inside of its walls, which
-    have no ends.
+    The coordinates of the others are beyond the end of the track. Their bodies are above it, inside
+    of its walls, which have no ends.
     """
 
     def __init__(self, compiled: CompiledScene, names: Sequence[str]) -> None:
-        end, number = compiled.scene.track.start + compiled.scene.track.length, np.arange(len(names))
+        end = compiled.scene.track.start + compiled.scene.track.length
+        number = np.arange(len(names))
         objects = [compiled.objects[name] for name in names]
-        self._outside, self._rest = end + OUTSIDE, np.asarray(compiled.model.body_pos, np.float32)
-        self._bodies, self._x = np.array([each.body for each in objects]), np.array([each.qpos[0] for each in objects])
-        self._raised = np.stack([0 * number - 2 * OUTSIDE, 0 * number, number + _RAISED], axis=1).astype(np.float32)
+        self._outside = end + OUTSIDE
+        self._rest = np.asarray(compiled.model.body_pos, np.float32)
+        self._bodies = np.array([each.body for each in objects])
+        self._x = np.array([each.qpos[0] for each in objects])
+        self._raised = np.stack(
+            [0 * number - 2 * OUTSIDE, 0 * number, number + _RAISED], axis=1
+        ).astype(np.float32)
 
     def start(
         self, key: jax.Array, grids: Sequence[tuple[np.ndarray, float]], level: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Draws a number of objects; returns their positions (S, 2), m, and the half-width of their noise (S, 1), m.
+        """Draws a number of objects; returns their positions (S, 2), m, and the half-width of their
+        noise (S, 1), m.
 
         `grids` holds both for each number; `level` is as in `draw`.
         """
         most = len(grids[-1][0])
-        start, spread = np.zeros((len(grids), most, 2), np.float32), np.zeros((len(grids), most, 1), np.float32)
+        start = np.zeros((len(grids), most, 2), np.float32)
+        spread = np.zeros((len(grids), most, 1), np.float32)
         start[..., 0] = self._outside
         for row, (grid, noise) in enumerate(grids):
-            start[row, : len(grid)], spread[row, : len(grid)] = grid, noise
+            start[row, : len(grid)] = grid
+            spread[row, : len(grid)] = noise
         row = draw(key, 0, len(grids) - 1, level)
         return jnp.asarray(start)[row], jnp.asarray(spread)[row]
 
@@ -173,19 +211,29 @@ def _poses(env: Any, agents: int) -> np.ndarray:
     return np.array(other.spawn_poses())[:agents]
 
 
-def robots_there(teams: Sequence[Sequence[int]], mates: jax.Array, opponents: jax.Array) -> dict[str, jax.Array]:
+def robots_there(
+    teams: Sequence[Sequence[int]], mates: jax.Array, opponents: jax.Array
+) -> dict[str, jax.Array]:
     """Returns which of each agent's teammates and opponents take part (A, count) bool, by block.
 
     `mates` and `opponents` say which agents take part as such (A,) bool. Empty blocks are left out.
     """
-    own = np.array([[other for other in team if other != agent] for team in teams for agent in team], int)
-    others = [[other for rival in teams if rival is not team for other in rival] for team in teams for _ in team]
+    own = np.array(
+        [[other for other in team if other != agent] for team in teams for agent in team], int
+    )
+    others = [
+        [other for rival in teams if rival is not team for other in rival]
+        for team in teams
+        for _ in team
+    ]
     found = {"teammate": (mates, own), "opponents": (opponents, np.array(others, int))}
     return {name: there[agents] for name, (there, agents) in found.items() if agents.size}
 
 
 def hide(layout: ObservationLayout, obs: jax.Array, there: Mapping[str, jax.Array]) -> jax.Array:
-    """Returns observations (A, O) in which the entries of entities that are not there (A, count) are 0."""
+    """Returns observations (A, O) in which the entries of entities that are not there (A, count)
+    are 0.
+    """
     parts = []
     for block in layout.blocks:
         shown = there.get(block.name)
@@ -199,14 +247,17 @@ def hide(layout: ObservationLayout, obs: jax.Array, there: Mapping[str, jax.Arra
 def entity_layout(layout: ObservationLayout) -> ObservationLayout:
     """Returns the blocks of the group `entities` of a task, from those of its group `policy`.
 
-    An entity has its own entries, which begin with its x and y, m, then its x and y relative to the agent. A team of
-    one has an empty block of teammates. The one-hot is replaced by the agent's place in its team.
+    An entity has its own entries, which begin with its x and y, m, then its x and y relative to the
+    agent. A team of one has an empty block of teammates. The one-hot is replaced by the agent's
+    place in its team.
     """
     blocks = [_PLACE]
     for block in layout.blocks:
         if (of := block.entities) is not None:
             meaning = f"{block.meaning}; x, y from the agent, m"
-            blocks.append(entities(block.name, of.kind, of.count, of.width + _NEAR, meaning, masked=True))
+            blocks.append(
+                entities(block.name, of.kind, of.count, of.width + _NEAR, meaning, masked=True)
+            )
         elif not block.categorical:
             blocks.append(block)
         if block.name == "base" and "teammate" not in layout.names:
@@ -223,9 +274,11 @@ def observe_entities(
 ) -> dict[str, jax.Array]:
     """Returns the blocks (A, width) of `entity_layout(layout)` from those of the layout.
 
-    `there` says by block which entities are there (A, count) bool, by default all; a mask of the layout counts too.
+    `there` says by block which entities are there (A, count) bool, by default all; a mask of the
+    layout counts too.
     """
-    agents, members = len(active), [active[np.array(team)] for team in teams]
+    agents = len(active)
+    members = [active[np.array(team)] for team in teams]
     place = jnp.concatenate([jnp.cumsum(team) - 1 for team in members])  # among the active ones
     last = jnp.concatenate([jnp.full(len(team), jnp.sum(team) - 1) for team in members])
     own = jnp.where(active & (last > 0), 2.0 * place / jnp.maximum(last, 1) - 1.0, 0.0)
@@ -236,7 +289,9 @@ def observe_entities(
             shown = there.get(block.name, jnp.ones(rows.shape[:2], bool))
             shown = shown & (rows[..., -1] > 0.5) if of.masked else shown
             near = rows[..., :_NEAR] - blocks["base"][:, None, :_NEAR]
-            found[block.name] = by_entity(jnp.concatenate([rows[..., : of.width], near], axis=-1), shown)
+            found[block.name] = by_entity(
+                jnp.concatenate([rows[..., : of.width], near], axis=-1), shown
+            )
         elif not block.categorical:
             found[block.name] = blocks[block.name]
     if "teammate" not in layout.names:

@@ -18,21 +18,24 @@ S = TypeVar("S")
 """A task's own state."""
 
 ENDINGS = ("divergence", "fall", "collision", "task", "time_limit")
-"""Causes that end an episode; the first of them that holds in its last step counts. `task` is an end by the task's own
-rules, which decides a match."""
+"""Causes that end an episode; the first of them that holds in its last step counts. `task` is an
+end by the task's own rules, which decides a match."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentState:
-    """Fields of every environment's state (`mqe_jax.core.types.VectorEnv`); a batch has leading axes."""
+    """Fields of every environment's state (`mqe_jax.core.types.VectorEnv`); a batch has leading
+    axes.
+    """
 
     obs: jax.Array
     """The agents' observations (A, O); after an auto-reset, those of the new episode."""
     privileged_obs: jax.Array
-    """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new episode."""
+    """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new
+    episode."""
     final_obs: Any
-    """Observations at the end of the last step (A, O), which differ from `obs` only after an auto-reset; None in a
-    batch without them (`VectorEnv.final`)."""
+    """Observations at the end of the last step (A, O), which differ from `obs` only after an
+    auto-reset; None in a batch without them (`VectorEnv.final`)."""
     final_privileged_obs: Any
     """Privileged observation at the end of the last step (P,), or None."""
     reward: jax.Array
@@ -46,7 +49,8 @@ class EnvironmentState:
     metrics: dict[str, jax.Array]
     """`reward/<name>` and the task's own, () each."""
     step: jax.Array
-    """Environment steps counted towards the time limit () int32; a trainer may set it to a random offset."""
+    """Environment steps counted towards the time limit () int32; a trainer may set it to a random
+    offset."""
     assistance: jax.Array
     """Curriculum level () in [0, 1]; 0 is the unmodified task."""
     key: jax.Array
@@ -64,8 +68,9 @@ class EnvironmentState:
 class State(EnvironmentState, Generic[S]):
     """State of one environment with A agents, R robots and G anchors.
 
-    Its metrics include `average_step_reward`, `collision`, `diverged` and `overflow` (1 where the physics engine may
-    have dropped contacts or constraints in any physics step of this step). Its outcome has the `ENDINGS`.
+    Its metrics include `average_step_reward`, `collision`, `diverged` and `overflow` (1 where the
+    physics engine may have dropped contacts or constraints in any physics step of this step). Its
+    outcome has the `ENDINGS`.
 
     Example:
         ```python
@@ -95,7 +100,11 @@ class State(EnvironmentState, Generic[S]):
 
 def with_final(state: Any) -> Any:
     """Returns a state whose observations are also those at the end of its step."""
-    final = {"final_obs": state.obs, "final_privileged_obs": state.privileged_obs, "final_groups": state.groups}
+    final = {
+        "final_obs": state.obs,
+        "final_privileged_obs": state.privileged_obs,
+        "final_groups": state.groups,
+    }
     return dataclasses.replace(state, **final)
 
 

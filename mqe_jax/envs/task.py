@@ -1,4 +1,6 @@
-"""Interface of a task, in this order: parameters, scene, initial state, observation, reward terms, ending."""
+"""Interface of a task, in this order: parameters, scene, initial state, observation, reward terms,
+ending.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,8 @@ if TYPE_CHECKING:
 class Task(Sensing, Generic[S, P]):
     """Interface of a task and its defaults; `QuadrupedEnv` steps it.
 
-    A task must override `scene`, `observation_layout`, `observe` and `rewards`, and may override the others. All
-    methods are functions of one environment.
+    A task must override `scene`, `observation_layout`, `observe` and `rewards`, and may override
+    the others. All methods are functions of one environment.
     """
 
     name: ClassVar[str] = ""
@@ -44,7 +46,8 @@ class Task(Sensing, Generic[S, P]):
     aim: ClassVar[str] = ""
     """What a team has to do, in one line, for somebody who drives a robot."""
     labels: ClassVar[Mapping[str, str]] = {}
-    """Words for the further results of `outcome` that are rates, by name: `mqe eval` prints these with intervals."""
+    """Words for the further results of `outcome` that are rates, by name: `mqe eval` prints these
+    with intervals."""
     Params: ClassVar[type[Any]] = TaskParams
     """Class of the task's parameters, P."""
     npc_varied: ClassVar[tuple[str, ...]] = ()
@@ -99,29 +102,41 @@ class Task(Sensing, Generic[S, P]):
         return 0
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
-        """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the track's blocks."""
+        """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the
+        track's blocks.
+        """
         return self.compiled.layout.spawn
 
     def spawn(self, key: jax.Array) -> jax.Array:
         """Samples spawn poses x, y, z, yaw of all robots (R, 4), m and rad."""
         params = self.params
-        pose = np.array([(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()], np.float32)
-        noise = jax.random.uniform(key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise)
+        pose = np.array(
+            [(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()], np.float32
+        )
+        noise = jax.random.uniform(
+            key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise
+        )
         return jnp.asarray(pose).at[:, :2].add(noise)
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,), at a curriculum level ()."""
+        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,), at a
+        curriculum level ().
+        """
         return qpos, qvel
 
     def reset_task(self, key: jax.Array, state: State[Any], robot_state: RobotState) -> S:
-        """Returns the task's own state fields, not yet in `state`, at the start of an episode; by default None."""
+        """Returns the task's own state fields, not yet in `state`, at the start of an episode; by
+        default None.
+        """
         none: Any = None
         return none
 
     def npc_commands(self, state: State[S], robot_state: RobotState) -> jax.Array | None:
-        """Returns commands (R - A, C) of `npc_skill` for the NPC robots, or None if there are none."""
+        """Returns commands (R - A, C) of `npc_skill` for the NPC robots, or None if there are
+        none.
+        """
         return None
 
     def acting(self, state: State[S]) -> jax.Array:
@@ -129,7 +144,9 @@ class Task(Sensing, Generic[S, P]):
         return state.active
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
-        """Maps actions (A, action_size) from each agent's own (possibly mirrored) frame to the robots' frame."""
+        """Maps actions (A, action_size) from each agent's own (possibly mirrored) frame to the
+        robots' frame.
+        """
         return action
 
     def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
@@ -152,7 +169,9 @@ class Task(Sensing, Generic[S, P]):
         return self.params.fewest_agents is not None
 
     def there(self, state: State[S]) -> dict[str, jax.Array]:
-        """Returns which entities of a block take part (A, count) bool, by the block's name; of other blocks all do."""
+        """Returns which entities of a block take part (A, count) bool, by the block's name; of
+        other blocks all do.
+        """
         return robots_there(self.teams, self.observed(state), state.active)
 
     def observed(self, state: State[S]) -> jax.Array:
@@ -179,7 +198,9 @@ class Task(Sensing, Generic[S, P]):
 
     @property
     def sized_layout(self) -> ObservationLayout:
-        """Blocks of the group `entities`, which differ between sizes only in the number of entities."""
+        """Blocks of the group `entities`, which differ between sizes only in the number of
+        entities.
+        """
         return self.observation_layout
 
     def observe_sized(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
@@ -188,7 +209,9 @@ class Task(Sensing, Generic[S, P]):
 
     @property
     def groups(self) -> Mapping[str, ObservationLayout]:
-        """Layouts of further groups of observations by name, which are computed if a policy or a critic names them."""
+        """Layouts of further groups of observations by name, which are computed if a policy or a
+        critic names them.
+        """
         sensed = {ONBOARD: ObservationLayout(self.suite.blocks)} if self.params.senses else {}
         sized = {ENTITIES: entity_layout(self.sized_layout)} if self.variable_num_agents else {}
         return {"proprioception": PROPRIOCEPTION, **sensed, **sized}
@@ -196,40 +219,64 @@ class Task(Sensing, Generic[S, P]):
     @property
     def group_sizes(self) -> dict[str, int]:
         """Lengths of an agent's observations by group."""
-        return {"policy": self.observation_size, **{name: layout.size for name, layout in self.groups.items()}}
+        return {
+            "policy": self.observation_size,
+            **{name: layout.size for name, layout in self.groups.items()},
+        }
 
     def describe(self, group: str) -> dict[str, Any]:
-        """Returns what policies that see a group of observations need of the task, beside its name and sizes."""
+        """Returns what policies that see a group of observations need of the task, beside its name
+        and sizes.
+        """
         layout = {"policy": self.observation_layout, **self.groups}[group]
         blocks = tuple(dataclasses.replace(block, meaning="") for block in layout.blocks)
-        senses = tuple(to_mapping(sensor) for sensor in self.params.senses) if group == ONBOARD else ()
+        senses = (
+            tuple(to_mapping(sensor) for sensor in self.params.senses) if group == ONBOARD else ()
+        )
         described = {"version": self.version, **self.params.actions(self.control), "senses": senses}
         return {**described, "layout": str(layout), "blocks": blocks}
 
-    def observe_group(self, name: str, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
+    def observe_group(
+        self, name: str, state: State[S], robot_state: RobotState
+    ) -> dict[str, jax.Array]:
         """Returns the blocks of one of `groups` by name (A, width)."""
         if name == ENTITIES:
-            blocks, there = self.observe_sized(state, robot_state), self.there(state) if self.varies else {}
-            return observe_entities(self.sized_layout, blocks, there, self.teams, self.observed(state))
+            blocks = self.observe_sized(state, robot_state)
+            there = self.there(state) if self.varies else {}
+            return observe_entities(
+                self.sized_layout, blocks, there, self.teams, self.observed(state)
+            )
         sensed = jax.tree.map(lambda x: x[: self.num_agents], robot_state.proprioception)
         joints = sensed.joint_position - self.robot.default_joints
-        return {"gravity": sensed.gravity_b, "joint_position": joints, "joint_velocity": sensed.joint_velocity}
+        return {
+            "gravity": sensed.gravity_b,
+            "joint_position": joints,
+            "joint_velocity": sensed.joint_velocity,
+        }
 
     def step_task(self, before: Moment[S], after: Moment[S]) -> S:
         """Returns the task's own state fields after a step; `after` still has those before it."""
         return before.state.task
 
-    def rewards(self, before: Moment[S], after: Moment[S], collision: jax.Array) -> dict[str, jax.Array]:
-        """Returns the unweighted reward terms of a step, () or (A,); `collision` (): an agent's trunk is touched."""
+    def rewards(
+        self, before: Moment[S], after: Moment[S], collision: jax.Array
+    ) -> dict[str, jax.Array]:
+        """Returns the unweighted reward terms of a step, () or (A,); `collision` (): an agent's
+        trunk is touched.
+        """
         raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
 
     def score(
         self, before: Moment[S], after: Moment[S], collision: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Returns the reward (A,) of a step and what is logged of it, as `weigh`; arguments as of `rewards`."""
+        """Returns the reward (A,) of a step and what is logged of it, as `weigh`; arguments as of
+        `rewards`.
+        """
         terms = self.rewards(before, after, collision)
         if (floor := self.params.shaping_floor) < 1.0:
-            terms = fade(terms, weights_of(self.Params()), floor + (1.0 - floor) * after.state.assistance)
+            terms = fade(
+                terms, weights_of(self.Params()), floor + (1.0 - floor) * after.state.assistance
+            )
         return weigh(terms, self.weights, self.teams, after.state.active)
 
     def ending(self, state: State[S], robot_state: RobotState) -> jax.Array:
@@ -241,7 +288,9 @@ class Task(Sensing, Generic[S, P]):
         """Whether a fallen robot ends the episode."""
         return True
 
-    def outcome(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State[S], robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Returns `success` () and further results by name () of an episode that ends here.
 
         `failed` () says whether a fall, a collision or diverged physics ends it.
@@ -249,7 +298,9 @@ class Task(Sensing, Generic[S, P]):
         return {"success": jnp.zeros(())}
 
     def fields(self, state: State[S]) -> dict[str, jax.Array]:
-        """Returns further model fields that differ between environments, by their `mjModel` names."""
+        """Returns further model fields that differ between environments, by their `mjModel`
+        names.
+        """
         return {}
 
     def external_forces(self, state: State[S]) -> jax.Array | None:

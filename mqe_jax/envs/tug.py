@@ -1,4 +1,6 @@
-"""go1tug, the paper's Push Cylinder: two robots push a cylinder, which slides along one axis, towards each other."""
+"""go1tug, the paper's Push Cylinder: two robots push a cylinder, which slides along one axis,
+towards each other.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,7 +33,8 @@ class TugRewards:
     """Weights of the reward terms; each is a robot's own term minus the opponent's."""
 
     push: float = 10.0
-    """Per m of the cylinder's position on the opponent's half, in every step; halved in steps in which it moves back.
+    """Per m of the cylinder's position on the opponent's half, in every step; halved in steps in
+    which it moves back.
     """
     approach: float = 2.0
     """Per m of decrease of the distance to the cylinder's axis."""
@@ -45,13 +48,16 @@ class TugParams(TaskParams):
     spawn_height: Length = 0.34
     spawn_noise: Distance = 0.0
     cylinder: Cylinder = Cylinder()
-    """The cylinder. The arena is centred on it; its side walls are where the cylinder's reach ends."""
+    """The cylinder. The arena is centred on it; its side walls are where the cylinder's reach
+    ends."""
     spawn_x: Distance = 1.0
     """Half-width of the range of the robots' initial x about the arena's centre, m."""
     spawn_y: Distance = 2.5
-    """Distance of the robots from the centre line, m; the first robot is on the side of negative y."""
+    """Distance of the robots from the centre line, m; the first robot is on the side of negative
+    y."""
     win_distance: Distance = 0.1
-    """Minimum distance of the cylinder on the opponent's half at the end of the episode for a win, m."""
+    """Minimum distance of the cylinder on the opponent's half at the end of the episode for a win,
+    m."""
     rewards: TugRewards = TugRewards()
     """Weights of the reward terms."""
 
@@ -73,10 +79,11 @@ class Go1Tug(Duel[TugState, TugParams]):
     """Push Cylinder.
 
     - Scene: a closed arena with a cylinder of 3 kg that slides along y; a robot on each side of it.
-    - Observation, in the agent's own frame: own base info 6, the cylinder's y and its velocity, distance to its axis,
-      its previous y.
+    - Observation, in the agent's own frame: own base info 6, the cylinder's y and its velocity,
+      distance to its axis, its previous y.
     - Reward: see `TugRewards`; zero-sum.
-    - End: a fall, or 15 s. Win: the cylinder is on the opponent's half at the end, or the opponent falls.
+    - End: a fall, or 15 s. Win: the cylinder is on the opponent's half at the end, or the opponent
+      falls.
 
     Source: paper, section III.
     """
@@ -93,14 +100,18 @@ class Go1Tug(Duel[TugState, TugParams]):
 
     def scene(self) -> Scene:
         cylinder = self.params.cylinder
-        length, width = 2 * (cylinder.x - _START_X), 2 * (cylinder.reach + cylinder.radius)
+        length = 2 * (cylinder.x - _START_X)
+        width = 2 * (cylinder.reach + cylinder.radius)
         ground = grounds.halves((_START_X, _START_X + length), (-width / 2, width / 2))
-        track = Track(blocks=(Plane(_START_X), SpawnArea(length), EndWall()), width=width, ground=ground)
+        track = Track(
+            blocks=(Plane(_START_X), SpawnArea(length), EndWall()), width=width, ground=ground
+        )
         return Scene(track, num_robots=2, objects={"cylinder": cylinder}, colors=(0, 2))
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """One robot on each side, facing the centre."""
-        x, apart = self.center[0], self.params.spawn_y
+        x = self.center[0]
+        apart = self.params.spawn_y
         return (x, -apart, 0.5 * np.pi), (x, apart, -0.5 * np.pi)
 
     def spawn(self, key: jax.Array) -> jax.Array:
@@ -146,8 +157,11 @@ class Go1Tug(Duel[TugState, TugParams]):
             "previous_cylinder": (side * state.task.previous_y)[:, None],
         }
 
-    def rewards(self, before: Moment[TugState], after: Moment[TugState], collision: jax.Array) -> dict[str, jax.Array]:
-        y, side = self.cylinder_y(after.state.data), jnp.array([1.0, -1.0])
+    def rewards(
+        self, before: Moment[TugState], after: Moment[TugState], collision: jax.Array
+    ) -> dict[str, jax.Array]:
+        y = self.cylinder_y(after.state.data)
+        side = jnp.array([1.0, -1.0])
         back = side * (y - self.cylinder_y(before.state.data)) < 0
         return {
             "push": self.zero_sum(jnp.maximum(side * y, 0.0) * jnp.where(back, 0.5, 1.0)),

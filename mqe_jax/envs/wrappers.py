@@ -26,9 +26,15 @@ class Outer(EnvBatch):
     """A batch of environments around another one, `inner`, which has all further attributes."""
 
     def __init__(self, inner: Any) -> None:
-        self.inner, self.env, self.name, self.num_envs = inner, inner.env, inner.name, inner.num_envs
-        self.num_agents, self.teams, self.action_size = inner.num_agents, inner.teams, inner.action_size
-        self.observation_size, self.group_sizes = inner.observation_size, getattr(inner, "group_sizes", {})
+        self.inner = inner
+        self.env = inner.env
+        self.name = inner.name
+        self.num_envs = inner.num_envs
+        self.num_agents = inner.num_agents
+        self.teams = inner.teams
+        self.action_size = inner.action_size
+        self.observation_size = inner.observation_size
+        self.group_sizes = getattr(inner, "group_sizes", {})
         self.privileged_observation_size = inner.privileged_observation_size
         self.max_episode_steps = inner.max_episode_steps
 
@@ -47,11 +53,15 @@ class Wrapper(Outer):
     def reset(self, key: jax.Array) -> WrappedState:
         """Returns the initial states of all environments."""
         inner = self.inner.reset(key)
-        return self._state(inner, jnp.zeros((self.num_envs, self.num_agents, self.action_size)), inner.step)
+        return self._state(
+            inner, jnp.zeros((self.num_envs, self.num_agents, self.action_size)), inner.step
+        )
 
     @single
     def step(self, state: WrappedState, action: jax.Array) -> WrappedState:
-        """Advances all environments by one step with actions (N, A, action_size); errors as of `VectorEnv`."""
+        """Advances all environments by one step with actions (N, A, action_size); errors as of
+        `VectorEnv`.
+        """
         self.check_step(state, action, WrappedState)
         action = self.pass_on(action)
         inner = dataclasses.replace(state.inner, step=state.step, assistance=state.assistance)
@@ -62,16 +72,21 @@ class Wrapper(Outer):
         return action
 
     def view(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
-        """Returns the fields that differ from the wrapped states'; `reached` (N,) are the steps before any reset."""
+        """Returns the fields that differ from the wrapped states'; `reached` (N,) are the steps
+        before any reset.
+        """
         return {}
 
     def _state(self, inner: Any, action: jax.Array, reached: jax.Array) -> WrappedState:
-        fields = {field.name: getattr(inner, field.name) for field in dataclasses.fields(EnvironmentState)}
+        fields = {
+            field.name: getattr(inner, field.name) for field in dataclasses.fields(EnvironmentState)
+        }
         return WrappedState(**{**fields, **self.view(inner, reached)}, inner=inner, action=action)
 
 
 class Deadline(Wrapper):
-    """The time limit terminates episodes; the privileged observation has one more number, the share of time left.
+    """The time limit terminates episodes; the privileged observation has one more number, the share
+    of time left.
 
     Time-outs are terminal, without bootstrapping (Pardo et al., arXiv 1712.00378).
     """
@@ -82,11 +97,15 @@ class Deadline(Wrapper):
 
     def view(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
         def add_time(privileged: jax.Array, step: jax.Array) -> jax.Array:
-            return jnp.concatenate([privileged, 1.0 - step[:, None] / self.max_episode_steps], axis=1)
+            return jnp.concatenate(
+                [privileged, 1.0 - step[:, None] / self.max_episode_steps], axis=1
+            )
 
         return {
             "privileged_obs": add_time(inner.privileged_obs, inner.step),
-            "final_privileged_obs": jax.tree.map(lambda x: add_time(x, reached), inner.final_privileged_obs),
+            "final_privileged_obs": jax.tree.map(
+                lambda x: add_time(x, reached), inner.final_privileged_obs
+            ),
             "terminated": inner.terminated | inner.truncated,
             "truncated": jnp.zeros_like(inner.truncated),
         }

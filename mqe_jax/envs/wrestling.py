@@ -1,4 +1,6 @@
-"""go1wrestling, the paper's Sumo Wrestling: teams, by default of one, push each other out of a ring, or over."""
+"""go1wrestling, the paper's Sumo Wrestling: teams, by default of one, push each other out of a
+ring, or over.
+"""
 
 from collections.abc import Sequence
 
@@ -29,11 +31,14 @@ class WrestlingRewards:
     """Weights of the reward terms; `win` is zero-sum, the others are for training only."""
 
     win: float = 10.0
-    """When all opponents have fallen or left the ring, which ends the episode; minus the same of the opponents."""
+    """When all opponents have fallen or left the ring, which ends the episode; minus the same of
+    the opponents."""
     push: float = 0.0
-    """Per m of increase of the opponents' summed distances from the ring's centre; only of those still in."""
+    """Per m of increase of the opponents' summed distances from the ring's centre; only of those
+    still in."""
     approach: float = 0.0
-    """Per m of decrease of the distance between a robot and the nearest opponent that is still in."""
+    """Per m of decrease of the distance between a robot and the nearest opponent that is still
+    in."""
 
 
 @settings_class
@@ -44,18 +49,18 @@ class WrestlingParams(TaskParams):
     spawn_height: Length = 0.74
     max_roll: Positive = 0.4 * np.pi
     platform: Platform = Platform(center=(3.1, 0.0, 0.4), size=(4.37, 4.37, 0.5))
-    """The platform, with the ring in its centre; its lower part is below the ground. Robots dropped from the spawn
-    height land on their feet."""
+    """The platform, with the ring in its centre; its lower part is below the ground. Robots dropped
+    from the spawn height land on their feet."""
     ring_radius: Length = 1.7
     """Radius of the ring, m."""
     ring_depth: Distance = 0.2
     """Distance of a trunk below the platform's top at which the robot counts as out, m."""
     spawn_y: Distance = 1.0
-    """Distance of the robots from the ring's centre, m; the first team is on the side of negative y. A team that has no
-    room on this arc stands further out."""
+    """Distance of the robots from the ring's centre, m; the first team is on the side of negative
+    y. A team that has no room on this arc stands further out."""
     head_start: Distance = 0.0
-    """Curriculum: both robots start up to head_start x `State.assistance` further along y, m, to a side drawn at
-    random, so that one is near the edge of the ring. Inactive at assistance 0."""
+    """Curriculum: both robots start up to head_start x `State.assistance` further along y, m, to a
+    side drawn at random, so that one is near the edge of the ring. Inactive at assistance 0."""
     rewards: WrestlingRewards = WrestlingRewards()
     """Weights of the reward terms."""
 
@@ -68,11 +73,17 @@ class WrestlingParams(TaskParams):
         check_teams(self.num_agents, most, room)
         room = self.ring_radius - self.arc[0] - self.spawn_noise
         if self.head_start > max(room, 0.0):
-            fail("head_start", self.head_start, f"at most {room:.2f}, the distance of the robots from the ring's edge")
+            fail(
+                "head_start",
+                self.head_start,
+                f"at most {room:.2f}, the distance of the robots from the ring's edge",
+            )
 
     @property
     def arc(self) -> tuple[float, float]:
-        """Radius, m, and angle between neighbours, rad, of the arc on which each team stands at the start."""
+        """Radius, m, and angle between neighbours, rad, of the arc on which each team stands at the
+        start.
+        """
         gaps = self.num_agents // 2 - 1
         radius = max(self.spawn_y, _APART / 2 / np.sin(_ARC / gaps / 2)) if gaps else self.spawn_y
         return radius, 2 * np.arcsin(_APART / 2 / max(radius, _APART / 2))
@@ -81,12 +92,15 @@ class WrestlingParams(TaskParams):
 class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
     """Sumo Wrestling; its own state says which robots have been out (A,) bool.
 
-    - Scene: a platform with a ring of 3.4 m diameter marked on it; the robots face each other, 2 m apart.
-    - Observation, in the agent's own frame: own base info 6, the opponent's base info 6. In larger teams: one-hot
-      within the team, own base info 6, those of the teammates and of the opponents, each with 1 while it is in, else 0.
+    - Scene: a platform with a ring of 3.4 m diameter marked on it; the robots face each other, 2 m
+      apart.
+    - Observation, in the agent's own frame: own base info 6, the opponent's base info 6. In larger
+      teams: one-hot within the team, own base info 6, those of the teammates and of the opponents,
+      each with 1 while it is in, else 0.
     - Reward: see `WrestlingRewards`.
     - End: all robots of a team have fallen or left the ring, or 15 s. Win: only the opponents have.
-    - Sizes: any even `num_agents` for which the ring has room. A robot that is out stands still and remains out.
+    - Sizes: any even `num_agents` for which the ring has room. A robot that is out stands still and
+      remains out.
 
     Source: paper, section III.
     """
@@ -108,15 +122,22 @@ class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
         ground = grounds.dohyo(params.platform.center, params.platform.size, params.ring_radius)
         blocks = (SpawnArea(2.0, back_wall=False), Plane(4.2))
         track = Track(blocks=blocks, width=6.0, walled=False, ground=ground)
-        objects, colors = {"platform": params.platform, "ring": ring}, team_colors(self.num_agents // 2)
+        objects = {"platform": params.platform, "ring": ring}
+        colors = team_colors(self.num_agents // 2)
         return Scene(track, num_robots=self.num_agents, objects=objects, colors=colors)
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
         """Two arcs, whose robots face the ring's centre."""
-        (x, y), (radius, apart), team = self.center, self.params.arc, self.num_agents // 2
+        (x, y) = self.center
+        (radius, apart) = self.params.arc
+        team = self.num_agents // 2
         turns = [(place - (team - 1) / 2) * apart for place in range(team)]
-        places = [(radius * np.sin(turn), radius * np.cos(turn), 0.5 * np.pi + turn) for turn in turns]
-        return *((x + a, y - b, yaw) for a, b, yaw in places), *((x - a, y + b, yaw - np.pi) for a, b, yaw in places)
+        places = [
+            (radius * np.sin(turn), radius * np.cos(turn), 0.5 * np.pi + turn) for turn in turns
+        ]
+        return *((x + a, y - b, yaw) for a, b, yaw in places), *(
+            (x - a, y + b, yaw - np.pi) for a, b, yaw in places
+        )
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
@@ -153,35 +174,49 @@ class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
     def observe(self, state: State[jax.Array], robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (A, width), each in its agent's own frame."""
         duel = self.num_agents == 2
-        return super().observe(state, robot_state) if duel else self.observe_sized(state, robot_state)
+        return (
+            super().observe(state, robot_state) if duel else self.observe_sized(state, robot_state)
+        )
 
     @property
     def sized_layout(self) -> ObservationLayout:
         return ObservationLayout(self.teams_blocks(masked=True))
 
-    def observe_sized(self, state: State[jax.Array], robot_state: RobotState) -> dict[str, jax.Array]:
-        blocks, agents = self.observe_teams(robot_state), self.num_agents
+    def observe_sized(
+        self, state: State[jax.Array], robot_state: RobotState
+    ) -> dict[str, jax.Array]:
+        blocks = self.observe_teams(robot_state)
+        agents = self.num_agents
         teams = self.acting(state).reshape(2, -1)
         there = {
             "teammate": jax.vmap(others)(teams[..., None]).reshape(agents, -1),
             "opponents": teams[::-1][self.team_of],
         }
-        masked = {name: by_entity(blocks[name].reshape(agents, -1, 6), there[name]) for name in there if name in blocks}
+        masked = {
+            name: by_entity(blocks[name].reshape(agents, -1, 6), there[name])
+            for name in there
+            if name in blocks
+        }
         return {**blocks, **masked}
 
     def rewards(
         self, before: Moment[jax.Array], after: Moment[jax.Array], collision: jax.Array
     ) -> dict[str, jax.Array]:
         still_in = self.acting(before.state)  # all that were in at the beginning of the step
-        outward = jnp.where(still_in, self.distance(after.robots) - self.distance(before.robots), 0.0)
+        outward = jnp.where(
+            still_in, self.distance(after.robots) - self.distance(before.robots), 0.0
+        )
         pushed = jnp.sum(outward.reshape(2, -1), axis=1)[::-1]
         gaps = [self.gap(now.robots, still_in) for now in (before, after)]
         wins = self.zero_sum(self.wins(after.state, after.robots))
         return {"win": wins, "push": pushed[self.team_of], "approach": gaps[0] - gaps[1]}
 
     def gap(self, robot_state: RobotState, still_in: jax.Array) -> jax.Array:
-        """Returns each robot's distance to the nearest opponent that is still in (A,), m; 0 if one of them is not."""
-        position, team = robot_state.position_w, self.team_of
+        """Returns each robot's distance to the nearest opponent that is still in (A,), m; 0 if one
+        of them is not.
+        """
+        position = robot_state.position_w
+        team = self.team_of
         apart = jnp.linalg.norm(position[:, None] - position, axis=-1)
         meets = (team[:, None] != team) & still_in & still_in[:, None]
         nearest = jnp.min(jnp.where(meets, apart, jnp.inf), axis=1)
@@ -200,7 +235,8 @@ class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
 
     def eliminated(self, state: State[jax.Array], robot_state: RobotState) -> jax.Array:
         """Returns which teams have no robot left (2,) bool."""
-        active, out = robot_state.active, state.task | self.beaten(robot_state)
+        active = robot_state.active
+        out = state.task | self.beaten(robot_state)
         active, gone = (x.reshape(2, -1) for x in (active, out | ~active))
         return jnp.any(active, axis=1) & jnp.all(gone, axis=1)
 

@@ -21,20 +21,28 @@ STEPS = 100
 LARGEST_ERROR = 1e-4
 """Largest error of a graph's outputs."""
 CYCLES = {"gait": 1.0, "obs": 2 * np.pi}
-"""Ends of the names of outputs with cyclic entries, gait phase and yaw, whose errors are cyclic too: ONNX has no signed
-zero at +-pi."""
+"""Ends of the names of outputs with cyclic entries, gait phase and yaw, whose errors are cyclic
+too: ONNX has no signed zero at +-pi."""
 
 Arrays = dict[str, np.ndarray]
 
 
 def verify_policy(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
-    """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above `LARGEST_ERROR`."""
+    """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above
+    `LARGEST_ERROR`.
+    """
     model = to_onnx(policy, env)
-    return model, check_errors(model, *record_actions(policy, env, STEPS), f"{STEPS} steps of {env.name}")
+    return model, check_errors(
+        model, *record_actions(policy, env, STEPS), f"{STEPS} steps of {env.name}"
+    )
 
 
-def verify(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays) -> onnx.ModelProto:
-    """Returns the graph of a function, compared with it for inputs with leading axis N; errors as `verify_policy`."""
+def verify(
+    function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays
+) -> onnx.ModelProto:
+    """Returns the graph of a function, compared with it for inputs with leading axis N; errors as
+    `verify_policy`.
+    """
     model = translate(function, shapes, name)
     expected = jax.device_get(jax.jit(jax.vmap(function))(inputs))
     check_errors(model, inputs, expected, name)
@@ -42,19 +50,25 @@ def verify(function: Function, shapes: Mapping[str, tuple[int, ...]], name: str,
 
 
 def check_errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays, where: str) -> float:
-    """Returns the largest error of a graph, for arguments as of `errors`; InputError above `LARGEST_ERROR`."""
+    """Returns the largest error of a graph, for arguments as of `errors`; InputError above
+    `LARGEST_ERROR`.
+    """
     error, output = max((error, name) for name, error in errors(model, inputs, expected).items())
     if not error <= LARGEST_ERROR:
         raise InputError(
-            f"export: nothing is written, because in {where} the graph's output {output!r} differs from JAX by "
+            f"export: nothing is written, because in {where} the graph's output {output!r} "
+            "differs from JAX by "
             f"{error:.1e}; at most {LARGEST_ERROR:g} is allowed"
         )
     return error
 
 
 def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
-    """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and idle opponents."""
-    shapes, group = input_shapes(policy, env), policy.needs.group
+    """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and
+    idle opponents.
+    """
+    shapes = input_shapes(policy, env)
+    group = policy.needs.group
 
     @jax.jit
     def advance(state: Any, memory: dict[str, Any]) -> tuple[Any, Any, Any]:
@@ -64,13 +78,17 @@ def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arra
         }
         inputs = {name: x[: policy.agents] for name, x in sensed.items() if name in shapes} | memory
         outputs = policy_step(policy, env, inputs)
-        action = jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"])
+        action = (
+            jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"])
+        )
         return inputs, outputs, env.with_observations(env.advance(state, action), [group])
 
     @jax.jit
     def start(key: jax.Array) -> tuple[Any, Any]:
         state = env.with_observations(env.begin(key), [group])
-        return state, {name: jnp.zeros(s) for name, s in shapes.items() if name not in ("obs", *SENSED)}
+        return state, {
+            name: jnp.zeros(s) for name, s in shapes.items() if name not in ("obs", *SENSED)
+        }
 
     rows: list[tuple[Any, Any]] = []
     state, memory = start(jax.random.PRNGKey(0))
@@ -86,19 +104,27 @@ def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arra
 
 
 def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str, float]:
-    """Returns the largest absolute error of each output, for inputs and expected outputs (T, ...) as one batch."""
+    """Returns the largest absolute error of each output, for inputs and expected outputs (T, ...)
+    as one batch.
+    """
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     try:
-        session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(
+            model.SerializeToString(), options, ["CPUExecutionProvider"]
+        )
         names = [output.name for output in session.get_outputs()]
         found = dict(zip(names, session.run(names, inputs), strict=True))
     except Exception as error:  # onnxruntime's errors have no common class
         raise InputError(f"export: onnxruntime cannot run the graph: {error}") from None
-    differences = {name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names}
+    differences = {
+        name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names
+    }
     for name, cycle in itertools.product(differences, CYCLES):
         if name.endswith(cycle):
-            differences[name] = np.minimum(differences[name], np.abs(CYCLES[cycle] - differences[name]))
+            differences[name] = np.minimum(
+                differences[name], np.abs(CYCLES[cycle] - differences[name])
+            )
     return {name: float(x.max()) for name, x in differences.items()}

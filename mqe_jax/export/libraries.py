@@ -1,4 +1,6 @@
-"""The page's browser libraries: npm packages at pinned versions, checked by SHA-256 and kept in the user's cache."""
+"""The page's browser libraries: npm packages at pinned versions, checked by SHA-256 and kept in the
+user's cache.
+"""
 
 import hashlib
 import shutil
@@ -32,7 +34,11 @@ PACKAGES = (
         "onnxruntime-web",
         "1.30.0",
         "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71",
-        ("dist/ort.wasm.min.mjs", "dist/ort-wasm-simd-threaded.mjs", "dist/ort-wasm-simd-threaded.wasm"),
+        (
+            "dist/ort.wasm.min.mjs",
+            "dist/ort-wasm-simd-threaded.mjs",
+            "dist/ort-wasm-simd-threaded.wasm",
+        ),
     ),
     Package(
         "three",
@@ -55,8 +61,12 @@ def add_libraries(folder: Path, source: Path | None = None) -> None:
         for file in package.files:
             name = Path(file).name
             if source is not None and not (source / name).is_file():
-                raise InputError(f"libraries: {source} has no {name}, of {package.name}@{package.version}")
-            contents[name] = _member(_archive(package), file) if source is None else (source / name).read_bytes()
+                raise InputError(
+                    f"libraries: {source} has no {name}, of {package.name}@{package.version}"
+                )
+            contents[name] = (
+                _member(_archive(package), file) if source is None else (source / name).read_bytes()
+            )
     for name, content in contents.items():
         write_atomically(folder / name, content)
 
@@ -64,7 +74,11 @@ def add_libraries(folder: Path, source: Path | None = None) -> None:
 def _archive(package: Package) -> Path:
     """Returns the archive of a package, fetched if the cache lacks it."""
     title = f"{package.name}@{package.version}"
-    archive = user_cache() / "play" / f"{package.name.lstrip('@').replace('/', '-')}-{package.version}.tgz"
+    archive = (
+        user_cache()
+        / "play"
+        / f"{package.name.lstrip('@').replace('/', '-')}-{package.version}.tgz"
+    )
     if not archive.is_file():
         _fetch(title, archive)
     if hashlib.sha256(archive.read_bytes()).hexdigest() != package.sha256:
@@ -83,16 +97,31 @@ def _member(archive: Path, name: str) -> bytes:
 def _fetch(title: str, archive: Path) -> None:
     npm = shutil.which("npm")
     if npm is None:
-        raise InputError("libraries: npm is not installed; install it, or name a folder that holds them (docs/play.md)")
+        raise InputError(
+            "libraries: npm is not installed; install it, or name a folder that holds them "
+            "(docs/play.md)"
+        )
     archive.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=archive.parent) as temporary:
-        command = [npm, "pack", "--loglevel=error", "--fetch-retries=0", "--pack-destination", temporary, title]
+        command = [
+            npm,
+            "pack",
+            "--loglevel=error",
+            "--fetch-retries=0",
+            "--pack-destination",
+            temporary,
+            title,
+        ]
         try:
-            done = subprocess.run(command, cwd=temporary, capture_output=True, text=True, timeout=300)
+            done = subprocess.run(
+                command, cwd=temporary, capture_output=True, text=True, timeout=300
+            )
         except subprocess.TimeoutExpired:
             raise InputError(f"libraries: {title}: npm pack took more than 300 s") from None
         found = list(Path(temporary).glob("*.tgz"))
         if done.returncode or not found:
-            reason = next((line for line in done.stderr.splitlines() if "error" in line.lower()), "no archive")
+            reason = next(
+                (line for line in done.stderr.splitlines() if "error" in line.lower()), "no archive"
+            )
             raise InputError(f"libraries: {title}: npm pack failed ({reason.strip()})")
         found[0].replace(archive)

@@ -1,8 +1,9 @@
-"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control, skill.
+"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control,
+skill.
 
-Every input and output has a leading batch axis N. The input `obs` (N, A, O) is the policy's group of observations.
-Recurrent states are initialised to zero, and each output `next_X` is the input `X` of the next step. Of a match, the
-graph is that of team 0.
+Every input and output has a leading batch axis N. The input `obs` (N, A, O) is the policy's group
+of observations. Recurrent states are initialised to zero, and each output `next_X` is the input `X`
+of the next step. Of a match, the graph is that of team 0.
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|
@@ -10,11 +11,13 @@ graph is that of team 0.
 | `position` | `joint_target` (N, A, 12), rad |
 | `torque` | `torque` (N, A, 12), N m |
 
-Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vector in the trunk frame, `joint_position`
-and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: those of the skill, of the walk policy `walk_history`
-(N, A, 30, 70), `walk_action`, `walk_previous_action` (N, A, 12) and `walk_gait` (N, A), and those of the network:
-`memory` if it is one array, else `memory_NAME`. A mixture's graph has those of all members, and `memory_member` (N,),
-the number of the member that acts, from 1. Draw it by the weights at an episode's start; 0 is the heaviest member.
+Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vector in the trunk
+frame, `joint_position` and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: those of
+the skill, of the walk policy `walk_history` (N, A, 30, 70), `walk_action`, `walk_previous_action`
+(N, A, 12) and `walk_gait` (N, A), and those of the network: `memory` if it is one array, else
+`memory_NAME`. A mixture's graph has those of all members, and `memory_member` (N,), the number of
+the member that acts, from 1. Draw it by the weights at an episode's start; 0 is the heaviest
+member.
 """
 
 import functools
@@ -37,13 +40,18 @@ from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import Skill
 from mqe_jax.train.policy import check_policy
 
-SENSED: dict[str, tuple[int, ...]] = {"gravity": (3,), "joint_position": (NUM_JOINTS,), "joint_velocity": (NUM_JOINTS,)}
+SENSED: dict[str, tuple[int, ...]] = {
+    "gravity": (3,),
+    "joint_position": (NUM_JOINTS,),
+    "joint_velocity": (NUM_JOINTS,),
+}
 """Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
 
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)
 def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
-    """Returns the graph of a policy with its mean actions; its task defines control mode, robot and walk policy.
+    """Returns the graph of a policy with its mean actions; its task defines control mode, robot and
+    walk policy.
 
     Example:
         ```python
@@ -54,11 +62,14 @@ def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
         ```
 
     Raises:
-        InputError: for another task than the policy's, or a network with an operation that has no translation.
+        InputError: for another task than the policy's, or a network with an operation that has no
+            translation.
     """
     check_policy(policy, env)
     step = functools.partial(policy_step, policy, env)
-    return translate(step, input_shapes(policy, env), env.name.replace("-", "_"), properties(policy, env))
+    return translate(
+        step, input_shapes(policy, env), env.name.replace("-", "_"), properties(policy, env)
+    )
 
 
 def input_shapes(policy: Trained, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
@@ -66,30 +77,48 @@ def input_shapes(policy: Trained, env: QuadrupedEnv) -> dict[str, tuple[int, ...
     robots: dict[str, tuple[int, ...]] = {"obs": (policy.needs.dims.observation,)}
     if env.control == "command":
         skill, _ = skill_of(env)
-        robots |= SENSED | {name: x.shape for name, x in name_arrays(skill.name, skill.init_memory()).items()}
+        robots |= SENSED | {
+            name: x.shape for name, x in name_arrays(skill.name, skill.init_memory()).items()
+        }
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
-    return shapes | {name: x.shape for name, x in name_arrays("memory", policy.initial_memory()).items()}
+    return shapes | {
+        name: x.shape for name, x in name_arrays("memory", policy.initial_memory()).items()
+    }
 
 
-def policy_step(policy: Trained, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    """Returns the outputs of one step of one environment by name, the function that the graph maps over N."""
-    action, memory = policy.act(inputs["obs"], fill_arrays("memory", policy.initial_memory(), inputs))
+def policy_step(
+    policy: Trained, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]
+) -> dict[str, jax.Array]:
+    """Returns the outputs of one step of one environment by name, the function that the graph maps
+    over N.
+    """
+    action, memory = policy.act(
+        inputs["obs"], fill_arrays("memory", policy.initial_memory(), inputs)
+    )
     outputs = {"action": action} | name_arrays("next_memory", memory)
     moving = env.moving(action)
     if env.control == "torque":
         return outputs | {"torque": moving * env.robot.torque_limit}
     if env.control == "position":
-        return outputs | {"joint_target": env.robot.joint_targets(moving, env.params.position_scale)}
+        return outputs | {
+            "joint_target": env.robot.joint_targets(moving, env.params.position_scale)
+        }
     skill, params = skill_of(env)
     commands = env.controller.skill_commands(moving)
     sensed = Proprioception(*(inputs[name] for name in SENSED))
     act = jax.vmap(functools.partial(skill.targets, params))
     target, memory = act(fill_arrays(skill.name, skill.init_memory(), inputs), commands, sensed)
-    return outputs | {"commands": commands, "joint_target": target} | name_arrays(f"next_{skill.name}", memory)
+    return (
+        outputs
+        | {"commands": commands, "joint_target": target}
+        | name_arrays(f"next_{skill.name}", memory)
+    )
 
 
 def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
-    """Returns the skill of a task's robots for any commands, with its parameters as they are in the file."""
+    """Returns the skill of a task's robots for any commands, with its parameters as they are in the
+    file.
+    """
     skill = skills.make(env.params.skill, env.robot)
     return skill, skill.load_params(env.params.skill_weights)
 
@@ -97,19 +126,27 @@ def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
 def name_arrays(prefix: str, memory: Any) -> dict[str, Any]:
     """Returns the arrays of a recurrent state by name."""
     leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
-    return {"_".join([prefix, *(jax.tree_util.keystr((k,), simple=True) for k in path)]): x for path, x in leaves}
+    return {
+        "_".join([prefix, *(jax.tree_util.keystr((k,), simple=True) for k in path)]): x
+        for path, x in leaves
+    }
 
 
 def fill_arrays(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
     """Returns a recurrent state of the structure of `memory` with the arrays of the inputs."""
-    return jax.tree.unflatten(jax.tree.structure(memory), [inputs[name] for name in name_arrays(prefix, memory)])
+    return jax.tree.unflatten(
+        jax.tree.structure(memory), [inputs[name] for name in name_arrays(prefix, memory)]
+    )
 
 
 def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
     """Returns the shapes of a model's inputs and outputs by name; the batch axis is 'N'."""
 
     def of(values: Any) -> dict[str, list[Any]]:
-        return {v.name: [d.dim_param or d.dim_value for d in v.type.tensor_type.shape.dim] for v in values}
+        return {
+            v.name: [d.dim_param or d.dim_value for d in v.type.tensor_type.shape.dim]
+            for v in values
+        }
 
     return {"inputs": of(model.graph.input), "outputs": of(model.graph.output)}
 

@@ -1,10 +1,13 @@
-"""The program of one robot: an exported graph turns its readings into its actions. Needs numpy and onnxruntime only.
+"""The program of one robot: an exported graph turns its readings into its actions.
 
-`python -m mqe_jax.export.robot FILE [SEED]` acts for the robot in N episodes at once until its standard input ends. The
-file is what `mqe export` writes with `--per-robot`. In each environment step the program reads a frame (N, 1 + O):
-whether the row's episode starts, 1 or 0, then the robot's readings. It answers with the frame of its actions (N, D). A
-frame is the number of rows and of columns as little-endian uint32, then the numbers as float32. The seed is that of the
-normal numbers with which a graph samples.
+Needs numpy and onnxruntime only.
+
+`python -m mqe_jax.export.robot FILE [SEED]` acts for the robot in N episodes at once until its
+standard input ends. The file is what `mqe export` writes with `--per-robot`. In each environment
+step the program reads a frame (N, 1 + O): whether the row's episode starts, 1 or 0, then the
+robot's readings. It answers with the frame of its actions (N, D). A frame is the number of rows and
+of columns as little-endian uint32, then the numbers as float32. The seed is that of the normal
+numbers with which a graph samples.
 """
 
 import struct
@@ -38,11 +41,15 @@ class Robot:
         self.properties = self._session.get_modelmeta().custom_metadata_map
 
     def act(self, readings: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        """Returns the actions (N, D) for readings (N, O); `starts` (N,) is 1 where an episode starts, else 0."""
+        """Returns the actions (N, D) for readings (N, O); `starts` (N,) is 1 where an episode
+        starts, else 0.
+        """
         count = len(readings)
         inputs = {"obs": readings.reshape(count, *self._shapes["obs"])}
         if "noise" in self._shapes:
-            inputs["noise"] = self._random.standard_normal((count, *self._shapes["noise"]), np.float32)
+            inputs["noise"] = self._random.standard_normal(
+                (count, *self._shapes["noise"]), np.float32
+            )
         for name in self._shapes.keys() - inputs:
             zero = np.zeros((count, *self._shapes[name]), np.float32)
             kept = self._memory.get(name, zero)
@@ -66,7 +73,11 @@ def read_frame(stream: IO[bytes]) -> np.ndarray | None:
         return None
     rows, columns = _HEAD.unpack(head)
     content = stream.read(4 * rows * columns)
-    return np.frombuffer(content, "<f4").reshape(rows, columns) if len(content) == 4 * rows * columns else None
+    return (
+        np.frombuffer(content, "<f4").reshape(rows, columns)
+        if len(content) == 4 * rows * columns
+        else None
+    )
 
 
 def main(file: str, seed: str = "0") -> None:

@@ -1,8 +1,9 @@
-"""The graph of one robot: the part of a team's policy that turns its own readings into its own actions.
+"""The graph of one robot: the part of a team's policy that turns its own readings into its own
+actions.
 
 | input | output | |
 |---|---|---|
-| `obs` (N, 1, O) | `action` (N, 1, D) | the robot's row of the policy's group of observations; actions in [-1, 1] |
+| `obs` (N, 1, O) | `action` (N, 1, D) | the robot's row of the policy's group; actions in [-1, 1] |
 | `noise` (N, K) | | standard normal numbers, of a policy that samples |
 | `memory`, `memory_NAME` | `next_memory`, ... | recurrent state, zero at an episode's start |
 """
@@ -30,11 +31,12 @@ from mqe_jax.train.policy import check_policy
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)
 def robot_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
-    """Returns the graph of any robot of a policy's team; its actions are means if those of the policy are.
+    """Returns the graph of any robot of a policy's team; its actions are means if those of the
+    policy are.
 
     Raises:
-        InputError: for another task than the policy's, a policy whose robots do not share a network, or an operation
-            that has no translation.
+        InputError: for another task than the policy's, a policy whose robots do not share a
+            network, or an operation that has no translation.
     """
     check_policy(policy, env)
     act, sizes = readings_function(_one_robot(policy), policy.needs.dims.observation)
@@ -49,22 +51,32 @@ def verify_robot(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, f
     """Returns the graph of `robot_onnx` and its largest error against JAX in `STEPS` steps.
 
     Raises:
-        InputError: as `robot_onnx`, for a policy whose robots need what others sense, or an error above
-            `LARGEST_ERROR`.
+        InputError: as `robot_onnx`, for a policy whose robots need what others sense, or an error
+            above `LARGEST_ERROR`.
     """
     model = robot_onnx(policy, env)
     inputs, outputs, apart = _record(policy, env)
     if apart > LARGEST_ERROR:
-        fail("network", policy.config.network.name, "one whose robots act on their own readings only (--per-robot)")
+        fail(
+            "network",
+            policy.config.network.name,
+            "one whose robots act on their own readings only (--per-robot)",
+        )
     return model, check_errors(model, inputs, outputs, f"{STEPS} steps of {env.name}")
 
 
 def _one_robot(policy: Trained) -> Trained:
-    """Returns the policy of a team of one, which acts as each robot of a team whose robots do not see each other."""
+    """Returns the policy of a team of one, which acts as each robot of a team whose robots do not
+    see each other.
+    """
     if policy.agents == 1:
         return policy
     if isinstance(policy, Mixture):
-        fail("policy", policy, "one without members (--per-robot): a mixture draws one member for all its robots")
+        fail(
+            "policy",
+            policy,
+            "one without members (--per-robot): a mixture draws one member for all its robots",
+        )
     needs = dataclasses.replace(policy.needs, dims=policy.dims._replace(agents=1, values=1))
     try:
         return dataclasses.replace(policy, needs=needs)
@@ -75,12 +87,18 @@ def _one_robot(policy: Trained) -> Trained:
 def _record(policy: Trained, env: QuadrupedEnv) -> tuple[Arrays, Arrays, float]:
     """Returns inputs and outputs of a robot's function by name, leading axis robots and steps.
 
-    The third value is the largest difference of its actions from those that the policy computes for the team.
+    The third value is the largest difference of its actions from those that the policy computes for
+    the team.
     """
-    agents, size, group = policy.agents, policy.needs.dims.observation, policy.needs.group
+    agents = policy.agents
+    size = policy.needs.dims.observation
+    group = policy.needs.group
     batch = VectorEnv(env, 1, final=()).with_groups(policy.groups)
-    (team, team_sizes), (robot, sizes) = (readings_function(p, size) for p in (policy, _one_robot(policy)))
-    empty = lambda sizes, *lead: {n: jnp.zeros((*lead, *x)) for n, x in sizes.items() if n.startswith("memory")}  # noqa: E731
+    (team, team_sizes) = readings_function(policy, size)
+    (robot, sizes) = readings_function(_one_robot(policy), size)
+
+    def empty(sizes, *lead):
+        return {n: jnp.zeros((*lead, *x)) for n, x in sizes.items() if n.startswith("memory")}
 
     @jax.jit
     def advance(state: Any, memories: Any, noise: jax.Array) -> Any:
@@ -90,13 +108,20 @@ def _record(policy: Trained, env: QuadrupedEnv) -> tuple[Arrays, Arrays, float]:
         outputs = jax.vmap(robot)(inputs)
         drawn = {"noise": noise.reshape(-1)} if drawn else {}
         together = team({"obs": seen, **drawn, **memories[1]})
-        action = jnp.zeros((1, env.num_agents, env.action_size)).at[0, :agents].set(together["action"])
+        action = (
+            jnp.zeros((1, env.num_agents, env.action_size)).at[0, :agents].set(together["action"])
+        )
         state = batch.step(state, action)
         kept = 1.0 - (state.terminated | state.truncated)[0]
-        after = [{n: kept * x[f"next_{n}"] for n in m} for x, m in zip((outputs, together), memories, strict=True)]
+        after = [
+            {n: kept * x[f"next_{n}"] for n in m}
+            for x, m in zip((outputs, together), memories, strict=True)
+        ]
         return inputs, outputs, together["action"], state, after
 
-    random, rows, apart = np.random.default_rng(0), [], 0.0
+    random = np.random.default_rng(0)
+    rows = []
+    apart = 0.0
     state = jax.jit(batch.reset)(jax.random.PRNGKey(0))
     memories = [empty(sizes, agents), empty(team_sizes)]
     for _ in range(STEPS):

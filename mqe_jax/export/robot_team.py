@@ -1,4 +1,6 @@
-"""A team whose robots are separate processes, each with an exported graph and its own readings only."""
+"""A team whose robots are separate processes, each with an exported graph and its own readings
+only.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,8 @@ _CLOSING = 10.0  # s, after which a process that does not end is killed
 class RobotTeam:
     """A policy that asks a process per robot for its actions; `open_team` starts and ends them.
 
-    A process gets its row of the observations and whether an episode starts. It keeps its recurrent state, so that the
-    one of `act` only says whether the episode has started.
+    A process gets its row of the observations and whether an episode starts. It keeps its recurrent
+    state, so that the one of `act` only says whether the episode has started.
     """
 
     file: Path  # the graph of one robot
@@ -47,9 +49,14 @@ class RobotTeam:
     failure: str  # why a process ended, if one did
 
     def __init__(self, file: Path, needs: Needs, deterministic: bool, seed: int) -> None:
-        self.file, self.needs, self.deterministic, self.failure = file, needs, deterministic, ""
+        self.file = file
+        self.needs = needs
+        self.deterministic = deterministic
+        self.failure = ""
         self.config = build(TrainConfig, {"group": needs.group})
-        self.task, self.agents, self.groups = needs.task, needs.dims.agents, (needs.group,)
+        self.task = needs.task
+        self.agents = needs.dims.agents
+        self.groups = (needs.group,)
         seeds = np.random.SeedSequence(seed).generate_state(self.agents)
         self._processes = [_Process(file, number, int(own)) for number, own in enumerate(seeds)]
 
@@ -61,12 +68,17 @@ class RobotTeam:
         return jnp.zeros(num_envs)
 
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-        """Returns the actions of all robots; see `Policy`. The processes draw their own random numbers."""
+        """Returns the actions of all robots; see `Policy`.
+
+        The processes draw their own random numbers.
+        """
         seen = Observations.at(obs)
         readings = seen.group(self.needs.group) if isinstance(obs, Observations) else seen.obs
         readings = check_obs(readings, self.agents, self.needs.dims.observation)
         kind = jax.ShapeDtypeStruct((*readings.shape[:-1], self.needs.dims.action), jnp.float32)
-        action = jax.pure_callback(self._exchange, kind, readings, memory, vmap_method="broadcast_all")
+        action = jax.pure_callback(
+            self._exchange, kind, readings, memory, vmap_method="broadcast_all"
+        )
         return action, jnp.ones_like(memory)
 
     def close(self) -> None:
@@ -75,7 +87,9 @@ class RobotTeam:
             process.close()
 
     def _exchange(self, readings: Any, started: Any) -> np.ndarray:
-        """Sends every robot its readings (..., A, O) and returns the actions (..., A, D) that they answer."""
+        """Sends every robot its readings (..., A, O) and returns the actions (..., A, D) that they
+        answer.
+        """
         readings = np.asarray(readings)
         rows = readings.reshape(-1, *readings.shape[-2:])
         starts = 1.0 - np.asarray(started).reshape(-1, 1)
@@ -99,7 +113,11 @@ class _Process:
         command = [sys.executable, "-m", _PROGRAM, str(file), str(seed)]
         # Ctrl-C must reach the parent only; this process sees its end.
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            start_new_session=True,
         )
 
     def send(self, frame: np.ndarray) -> None:
@@ -136,13 +154,15 @@ class _Process:
 @contextlib.contextmanager
 @check_arguments(file=PathText, seed=limits.Seed)
 def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
-    """Starts the processes of a team of robots that all have one file, written with `--per-robot`; yields its policy.
+    """Starts the processes of a team of robots that all have one file, written with `--per-robot`;
+    yields its policy.
 
     Example:
         ```python
         from mqe_jax.export.robot_team import open_team
 
-        with open_team("gate.onnx") as team:  # written by mqe export go1gate --per-robot --onnx gate.onnx
+        # written by mqe export go1gate --per-robot --onnx gate.onnx
+        with open_team("gate.onnx") as team:
             print(mqe_jax.evaluate("go1gate", team).success)
         ```
 
@@ -151,7 +171,8 @@ def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
         ConnectionError: at the end, if a process ended before.
     """
     team = _read(Path(file), seed)
-    logger = logging.getLogger("jax._src.callback")  # which prints the traceback of an error in a callback
+    # which prints the traceback of an error in a callback
+    logger = logging.getLogger("jax._src.callback")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:
@@ -173,7 +194,11 @@ def _read(file: Path, seed: int) -> RobotTeam:
     with parsing(file, "an ONNX graph"):
         about = Robot(str(file)).properties
     if not {"needs", "actions"} <= about.keys():
-        fail("export", str(file), "the graph of one robot: mqe export TASK|RUN --per-robot --onnx FILE")
+        fail(
+            "export",
+            str(file),
+            "the graph of one robot: mqe export TASK|RUN --per-robot --onnx FILE",
+        )
     with parsing(file, "the graph of one robot"):
         needs = build(Needs, parse_json(about["needs"], "needs"))
     return RobotTeam(file, needs, about["actions"] == "mean", seed)

@@ -1,4 +1,6 @@
-"""A task's scene for other programs: MJCF, and the numbers that stepping and drawing need beside it."""
+"""A task's scene for other programs: MJCF, and the numbers that stepping and drawing need beside
+it.
+"""
 
 from typing import Any
 
@@ -35,16 +37,19 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
 
     | entry | content |
     |---|---|
-    | `task`, `title`, `aim`, `robot`, `mujoco` | names; what a team has to do; version that wrote the scene |
-    | `dt`, `substeps`, `max_steps` | environment step, physics steps in it, environment steps until the time limit |
+    | `task`, `title`, `aim`, `robot`, `mujoco` | names; what a team has to do; version of MuJoCo |
+    | `dt`, `substeps`, `max_steps` | environment step, s; physics steps in it; time limit, steps |
     | `teams`, `commands` | agents of each team; names of the action's commands, in order |
-    | `robots` | of each of the R robots, colour and addresses in qpos, qvel and ctrl as in `RobotIndex` |
+    | `robots` | of each of the R robots, colour and addresses as in `RobotIndex` |
     | `track` | x of its `start`, `length` and `width`, m |
-    | `motors` | of all joints, constants and inputs of `mqe_jax.physics.robots.motors`, which MJCF cannot hold |
+    | `motors` | of all joints, what `mqe_jax.physics.robots.motors` needs and MJCF lacks |
     """
-    index, scene = env.index, env.compiled.scene
+    index = env.index
+    scene = env.compiled.scene
     tables = ("base_qpos", "joint_qpos", "joint_qvel", "actuator")
-    rows = [{name: getattr(index, name)[i].tolist() for name in tables} for i in range(index.num_robots)]
+    rows = [
+        {name: getattr(index, name)[i].tolist() for name in tables} for i in range(index.num_robots)
+    ]
     colors = scene.colors or range(index.num_robots)
     return {
         "task": env.name,
@@ -61,13 +66,18 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
             {**row, "color": list(ROBOT_COLORS[color % len(ROBOT_COLORS)][:3])}
             for row, color in zip(rows, colors, strict=True)
         ],
-        "track": {"start": scene.track.start, "length": scene.track.length, "width": scene.track.width},
+        "track": {
+            "start": scene.track.start,
+            "length": scene.track.length,
+            "width": scene.track.width,
+        },
         "motors": _motors(env),
     }
 
 
 def _motors(env: QuadrupedEnv) -> dict[str, Any]:
-    model, table = env.compiled.model, env.compiled.motors
+    model = env.compiled.model
+    table = env.compiled.motors
     arrays = ("speed", "torque", "stall", "response")
     return {
         **{name: getattr(table, name).tolist() for name in arrays},

@@ -1,8 +1,9 @@
-"""The web page on which policies play in the reader's browser: its files, and a folder for every task.
+"""The web page on which policies play in the reader's browser: its files, and a folder for every
+task.
 
-A task's folder has `scene.xml` (MJCF), `scene.json` (`mqe_jax.export.scene`, and the entries of `Entry.settings`), the
-graphs of `mqe_jax.export.task`, and `starts.bin`: `STARTS` initial states sampled by the task's own `reset`. Skills are
-shared by all tasks, as files named by their content.
+A task's folder has `scene.xml` (MJCF), `scene.json` (`mqe_jax.export.scene`, and the entries of
+`Entry.settings`), the graphs of `mqe_jax.export.task`, and `starts.bin`: `STARTS` initial states
+sampled by the task's own `reset`. Skills are shared by all tasks, as files named by their content.
 """
 
 import dataclasses
@@ -41,7 +42,10 @@ PAGE = Path(__file__).parent / "page"
 """Files of the page."""
 STARTS = 200
 """Initial states of each task."""
-LARGER = ("go1football-1vs1:num_agents=10", "go1sheep-hard:num_agents=4,num_sheep=30,episode_length=45")
+LARGER = (
+    "go1football-1vs1:num_agents=10",
+    "go1sheep-hard:num_agents=4,num_sheep=30,episode_length=45",
+)
 """Tasks of other sizes that the page has by default, played by their scripted policies."""
 _SIZED = re.compile(r"([\w-]+):(\w+=\d{1,9}(?:,\w+=\d{1,9})*)")
 
@@ -55,12 +59,18 @@ class Entry:
     policies: dict[str, Policy]  # of a team; `idle` is always possible on the page
 
     def write(self, folder: Path) -> None:
-        """Writes the task's files into its folder in a site; InputError for a graph that differs from JAX."""
-        own, env = folder / "tasks" / self.name, self.env
+        """Writes the task's files into its folder in a site; InputError for a graph that differs
+        from JAX.
+        """
+        own = folder / "tasks" / self.name
+        env = self.env
         own.mkdir(parents=True, exist_ok=True)
-        functions, starts = TaskFunctions(env), start_states(env)
+        functions = TaskFunctions(env)
+        starts = start_states(env)
         graphs = {
-            "control": _graph(functions.control, functions.control_inputs, f"{self.name}_control", starts),
+            "control": _graph(
+                functions.control, functions.control_inputs, f"{self.name}_control", starts
+            ),
             "judge": _graph(functions.judge, functions.judge_inputs, f"{self.name}_judge", starts),
         }
         files = {f"{name}.onnx": graph for name, graph in graphs.items()}
@@ -86,13 +96,17 @@ class Entry:
 
 
 def write_site(
-    sources: Sequence[str], folder: Path, libraries: Path | None = None, say: Callable[[str], None] = lambda text: None
+    sources: Sequence[str],
+    folder: Path,
+    libraries: Path | None = None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> list[Entry]:
     """Writes the page with its tasks and libraries into a folder; returns the tasks.
 
-    `sources` are tasks, also with sizes (`TASK:num_agents=4,num_sheep=30`), run folders and policy files, by default
-    all tasks that have a policy and those of `LARGER`. `libraries` is a folder of the browser libraries' files, by
-    default fetched with npm. `say` receives what is done next, in a line.
+    `sources` are tasks, also with sizes (`TASK:num_agents=4,num_sheep=30`), run folders and policy
+    files, by default all tasks that have a policy and those of `LARGER`. `libraries` is a folder of
+    the browser libraries' files, by default fetched with npm. `say` receives what is done next, in
+    a line.
 
     Example:
         ```python
@@ -111,7 +125,10 @@ def write_site(
         entry.write(folder)
     for file in PAGE.iterdir():
         write_atomically(folder / file.name, file.read_bytes())
-    tasks = [{"name": entry.name, "title": title} for entry, title in zip(found, titles(found), strict=True)]
+    tasks = [
+        {"name": entry.name, "title": title}
+        for entry, title in zip(found, titles(found), strict=True)
+    ]
     write_atomically(folder / "site.json", json.dumps({"tasks": tasks}).encode())
     write_atomically(folder / "package.json", b'{"type": "module"}\n')  # for Node
     return found
@@ -127,14 +144,19 @@ def entries(sources: Sequence[str]) -> list[Entry]:
         entry = next((entry for *key, entry in found if key == [task, params]), None)
         if entry is None:
             count = sum(known == task for known, *_ in found)
-            own = {name: value for name, value in params.items() if not name.startswith("randomization")}
+            own = {
+                name: value
+                for name, value in params.items()
+                if not name.startswith("randomization")
+            }
             env = make(task, num_envs=1, randomization=Randomization(), **own)
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
             if policy.needs.group not in ("policy", ONBOARD):
                 raise InputError(
-                    f"{source}: sees the group {policy.needs.group!r}; the page has 'policy' and {ONBOARD!r}"
+                    f"{source}: sees the group {policy.needs.group!r}; the page has 'policy' and "
+                    f"{ONBOARD!r}"
                 )
             if images := [block.name for block in policy.needs.dims.blocks if block.image]:
                 raise InputError(f"{source}: sees {images[0]}; the page has no images")
@@ -147,7 +169,9 @@ def entries(sources: Sequence[str]) -> list[Entry]:
 
 
 def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, Trained]]:
-    """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a source stands for."""
+    """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a
+    source stands for.
+    """
     if sized := _SIZED.fullmatch(source):
         pairs = (pair.split("=") for pair in sized[2].split(","))
         return _source(sized[1], playable)[0], {name: int(value) for name, value in pairs}, {}
@@ -155,45 +179,79 @@ def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], 
     if os.sep not in source and (task in playable or not Path(source).exists()):
         if task not in playable:
             hint = nearest(task, playable)
-            kinds = "a run folder, a policy file, a task's id, one with sizes such as go1gate:num_agents=4"
+            kinds = (
+                "a run folder, a policy file, a task's id, one with sizes such as "
+                "go1gate:num_agents=4"
+            )
             raise InputError(f"run: {source!r} is not allowed{hint}; allowed: {kinds}")
-        return task, parameters_for(task, task), {"shipped": zoo.load(task)} if task in zoo.names() else {}
+        return (
+            task,
+            parameters_for(task, task),
+            {"shipped": zoo.load(task)} if task in zoo.names() else {},
+        )
     policy = load_policy(source)
     if policy.task not in TASKS:
-        raise InputError(f"{source}: its task {policy.task!r} is unknown; allowed: {', '.join(TASKS)}")
+        raise InputError(
+            f"{source}: its task {policy.task!r} is unknown; allowed: {', '.join(TASKS)}"
+        )
     return policy.task, dict(policy.config.env), {str(Path(source).resolve()): policy}
 
 
 def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
-    """Returns a task's parameters with the walk policy and the agile skill, one of which policies and keys choose."""
-    plain = override(TASKS[task].Params(), {name: value for name, value in params.items() if name != "control"})
+    """Returns a task's parameters with the walk policy and the agile skill, one of which policies
+    and keys choose.
+    """
+    plain = override(
+        TASKS[task].Params(), {name: value for name, value in params.items() if name != "control"}
+    )
     known = [command.name for command in AgileSkill.commands]
-    if plain.skill not in ("walk", "agile") or plain.skill_weights or not {*plain.commands} <= {*known}:
+    if (
+        plain.skill not in ("walk", "agile")
+        or plain.skill_weights
+        or not {*plain.commands} <= {*known}
+    ):
         return params
-    ranges = dict(zip(known, AgileSkill(robots.get(plain.robot)).trained_ranges(known).tolist(), strict=True))
-    params = {name: value for name, value in params.items() if (name, value) != ("gait", None)}  # any skill's default
-    each = [plain.actions("command"), *({"skill": name, "command_ranges": ranges} for name in ("walk", "agile"))]
+    ranges = dict(
+        zip(known, AgileSkill(robots.get(plain.robot)).trained_ranges(known).tolist(), strict=True)
+    )
+    # any skill's default
+    params = {name: value for name, value in params.items() if (name, value) != ("gait", None)}
+    each = [
+        plain.actions("command"),
+        *({"skill": name, "command_ranges": ranges} for name in ("walk", "agile")),
+    ]
     return {**params, **together(each)}
 
 
 def _short(path: Path, taken: Iterable[str]) -> str:
-    """Returns the name of a run on the page: the last part of its path, or the last two if that is taken."""
+    """Returns the name of a run on the page: the last part of its path, or the last two if that is
+    taken.
+    """
     last = path.name if path.is_dir() else path.stem
     names = (last, f"{path.parent.name}/{last}")
     if free := [name for name in names if name not in {*taken, "shipped", "scripted", "idle"}]:
         return free[0]
-    fail("run", str(path), f"a path whose last parts differ from {' and '.join(names)}, which are taken")
+    fail(
+        "run",
+        str(path),
+        f"a path whose last parts differ from {' and '.join(names)}, which are taken",
+    )
 
 
 def titles(found: Sequence[Entry]) -> list[str]:
     """Returns the titles of tasks, with a number if an earlier one is equal."""
     headings = [entry.env.heading for entry in found]
     before = [headings[:place].count(heading) for place, heading in enumerate(headings)]
-    return [f"{heading} {count + 1}" if count else heading for heading, count in zip(headings, before, strict=True)]
+    return [
+        f"{heading} {count + 1}" if count else heading
+        for heading, count in zip(headings, before, strict=True)
+    ]
 
 
 def start_states(env: QuadrupedEnv) -> dict[str, np.ndarray]:
-    """Returns `STARTS` initial states by name, leading axis `STARTS`: the state, `mocap_pos` and `obs`."""
+    """Returns `STARTS` initial states by name, leading axis `STARTS`: the state, `mocap_pos` and
+    `obs`.
+    """
 
     def start(key: jax.Array) -> dict[str, jax.Array]:
         state = env.reset(key)
@@ -206,7 +264,8 @@ def start_states(env: QuadrupedEnv) -> dict[str, np.ndarray]:
 def pack(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
     """Returns the columns of states that vary (N, K), and what restores them.
 
-    `fields` are name and size of each array in a row, `constant` is the first row, `varying` the columns' positions.
+    `fields` are name and size of each array in a row, `constant` is the first row, `varying` the
+    columns' positions.
     """
     rows = np.concatenate([x.reshape(len(x), -1) for x in states.values()], axis=1)
     varying = np.flatnonzero((rows != rows[0]).any(axis=0))
@@ -216,7 +275,9 @@ def pack(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
-    """Writes the skill of a task's robots unless it is there; returns its file and the shapes of its graph."""
+    """Writes the skill of a task's robots unless it is there; returns its file and the shapes of
+    its graph.
+    """
     graph = _graph(*skill_function(env), env.controller.skill.name, {})
     content = graph.SerializeToString()
     name = f"{env.controller.skill.name}-{hashlib.sha256(content).hexdigest()[:8]}.onnx"
@@ -228,7 +289,9 @@ def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
 def _graph(
     function: Function, inputs: dict[str, tuple[int, ...]], name: str, states: dict[str, np.ndarray]
 ) -> onnx.ModelProto:
-    """Returns the graph of a function, checked on initial states if they have its inputs, else on random numbers."""
+    """Returns the graph of a function, checked on initial states if they have its inputs, else on
+    random numbers.
+    """
     random = np.random.default_rng(0)
     known = {**states, **{f"before_{key}": np.roll(x, 1, axis=0) for key, x in states.items()}}
 

@@ -1,18 +1,21 @@
-"""A task as functions of arrays by name, and their ONNX graphs: all of an episode but physics and random numbers.
+"""A task as functions of arrays by name, and their ONNX graphs: all of an episode but physics and
+random numbers.
 
-In an environment step the graphs run in this order; the physics steps are between `skill` and `judge`.
+In an environment step the graphs run in this order; the physics steps are between `skill` and
+`judge`.
 
 | graph | of | inputs |
 |---|---|---|
-| `policy` | a team | `obs` (A, O), or with sensors the state and `team` (); `noise` (K,), recurrent states |
+| `policy` | a team | `obs` (A, O), or state and `team` (); `noise` (K,), recurrent states |
 | `control` | the task | state, `action` (A, D), `drive` (A, D), `driven` (A,), `noise` (K,) |
-| `skill` | a robot | `command` (C,), `gravity` (3,), `joint_position`, `joint_velocity` (12,), recurrent states |
+| `skill` | a robot | `command` (C,), `gravity` (3,), joint states (12,), recurrent states |
 | `judge` | the task | state after the step, `before_qpos`, `before_qvel`, `before_sensordata` |
 
-The policy's output is `action` (A, D), the skill's `joint_target` (12,), rad; `TaskFunctions` has those of the task.
-The state is `qpos`, `qvel`, `sensordata`, `step` (environment steps since the reset), and where the task has them
-`anchors` and its own fields as `task_NAME`. Every array has a leading batch axis N. `noise` are standard
-normal numbers. The next value of an input X is the output `next_X`; recurrent states start at zero.
+The policy's output is `action` (A, D), the skill's `joint_target` (12,), rad; `TaskFunctions` has
+those of the task. The state is `qpos`, `qvel`, `sensordata`, `step` (environment steps since the
+reset), and where the task has them `anchors` and its own fields as `task_NAME`. Every array has a
+leading batch axis N. `noise` are standard normal numbers. The next value of an input X is the
+output `next_X`; recurrent states start at zero.
 """
 
 import contextlib
@@ -60,25 +63,34 @@ class TaskFunctions:
 
     def __init__(self, env: QuadrupedEnv) -> None:
         if env.control != "command":
-            raise InputError(f"control: {env.control!r} is not allowed; graphs of tasks need 'command'")
+            raise InputError(
+                f"control: {env.control!r} is not allowed; graphs of tasks need 'command'"
+            )
         if env.params.actuator_network is not None:
             raise InputError("actuator_network: not allowed; graphs of tasks need PD control")
-        if env.controller.npc and env.npc_skill not in [part.name for part in env.controller.skill.parts]:
+        if env.controller.npc and env.npc_skill not in [
+            part.name for part in env.controller.skill.parts
+        ]:
             raise InputError(
-                f"skill: {env.params.skill!r} is not allowed; graphs of tasks need that of the NPC robots, "
+                f"skill: {env.params.skill!r} is not allowed; graphs of tasks need that of the "
+                "NPC robots, "
                 f"{env.npc_skill!r}, alone or among several"
             )
         self.env = env
         self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
         robots = env.read(self._start.data)
-        self.outcomes: list[str] = list(env.result(self._start, robots, jnp.zeros((), bool)).by_name())
+        self.outcomes: list[str] = list(
+            env.result(self._start, robots, jnp.zeros((), bool)).by_name()
+        )
         self._noise = _noise_size(lambda: env.step_npcs(self._start.data, robots, self._start.key))
 
     @property
     def control_inputs(self) -> Shapes:
         actions = (self.env.num_agents, self.env.action_size)
         noise = {"noise": (self._noise,)} if self._noise else {}
-        return self.state_inputs | {"action": actions, "drive": actions, "driven": actions[:1]} | noise
+        return (
+            self.state_inputs | {"action": actions, "drive": actions, "driven": actions[:1]} | noise
+        )
 
     @property
     def judge_inputs(self) -> Shapes:
@@ -87,18 +99,22 @@ class TaskFunctions:
     def control(self, inputs: Arrays) -> dict[str, jax.Array]:
         """Returns what the skill and the physics get in a step.
 
-        `command` (R, C), `gravity` (R, 3), `joint_position` and `joint_velocity` (R, 12) are the skill's inputs for the
-        R robots. Only tasks that have them return `next_qvel` (nv,), the velocities with those of NPCs, and
-        `xfrc_applied` (nbody, 6), external forces, N and N m. `drive` replaces the actions of the agents where `driven`
-        is 1, in the robot's own frame.
+        `command` (R, C), `gravity` (R, 3), `joint_position` and `joint_velocity` (R, 12) are the
+        skill's inputs for the R robots. Only tasks that have them return `next_qvel` (nv,), the
+        velocities with those of NPCs, and `xfrc_applied` (nbody, 6), external forces, N and N m.
+        `drive` replaces the actions of the agents where `driven` is 1, in the robot's own frame.
         """
-        env, state = self.env, self.state(inputs)
+        env = self.env
+        state = self.state(inputs)
         robots = env.read(state.data)
         action = env.unmirror_action(env.moving(jnp.clip(inputs["action"], -1.0, 1.0)))
         action = jnp.where(inputs["driven"][:, None] > 0.5, env.moving(inputs["drive"]), action)
-        commands, npcs = env.controller.skill_commands(action), env.npc_commands(state, robots)
+        commands = env.controller.skill_commands(action)
+        npcs = env.npc_commands(state, robots)
         if npcs is not None:
-            commands = jnp.concatenate([commands, env.controller.skill.with_choice(env.npc_skill, npcs)])
+            commands = jnp.concatenate(
+                [commands, env.controller.skill.with_choice(env.npc_skill, npcs)]
+            )
         outputs = {"command": commands, **dict(zip(SENSED, robots.proprioception, strict=True))}
         with normal_numbers(inputs.get("noise")):
             data = env.step_npcs(state.data, robots, state.key)
@@ -111,11 +127,12 @@ class TaskFunctions:
     def judge(self, inputs: Arrays) -> dict[str, jax.Array]:
         """Returns the observation, the result and the task's next fields after a step.
 
-        Outputs are `obs` (A, O), `outcome` (the values of `outcomes` as if the episode ended here) and
-        `next_task_NAME`. `terminated`, `truncated`, `fell` and `collided` are 0 or 1; the last two say whether a fall
-        or a collision ended the episode.
+        Outputs are `obs` (A, O), `outcome` (the values of `outcomes` as if the episode ended here)
+        and `next_task_NAME`. `terminated`, `truncated`, `fell` and `collided` are 0 or 1; the last
+        two say whether a fall or a collision ended the episode.
         """
-        env, after = self.env, self.state(inputs)
+        env = self.env
+        after = self.state(inputs)
         before = self.state({**inputs, **{name: inputs[f"before_{name}"] for name in PHYSICS}})
         before = dataclasses.replace(before, step=after.step - 1)
         robots = env.read(after.data)
@@ -134,10 +151,14 @@ class TaskFunctions:
 
     def state(self, inputs: Arrays) -> State:
         """Returns the environment's state with the arrays of the inputs."""
-        start, task = self._start, self._start.task
+        start = self._start
+        task = self._start.task
         data = start.data.replace(**{name: inputs[name] for name in PHYSICS})
-        task = jax.tree.map(lambda x, like: x.astype(like.dtype), fill_arrays("task", task, inputs), task)
-        anchors, step = inputs.get("anchors", start.anchors), inputs["step"].astype(jnp.int32)
+        task = jax.tree.map(
+            lambda x, like: x.astype(like.dtype), fill_arrays("task", task, inputs), task
+        )
+        anchors = inputs.get("anchors", start.anchors)
+        step = inputs["step"].astype(jnp.int32)
         return dataclasses.replace(start, data=data, anchors=anchors, task=task, step=step)
 
     @property
@@ -149,15 +170,26 @@ class TaskFunctions:
 def state_arrays(state: State) -> dict[str, jax.Array]:
     """Returns the arrays of a state by name, float32; the inverse of `TaskFunctions.state`."""
     physics = {name: getattr(state.data, name) for name in PHYSICS}
-    arrays = {**physics, "anchors": state.anchors, "step": state.step, **name_arrays("task", state.task)}
+    arrays = {
+        **physics,
+        "anchors": state.anchors,
+        "step": state.step,
+        **name_arrays("task", state.task),
+    }
     return {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items() if x.size}
 
 
 def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
-    """Returns the skill of a task's robots as a function of one robot, and the shapes of its inputs."""
+    """Returns the skill of a task's robots as a function of one robot, and the shapes of its
+    inputs.
+    """
     skill, params = skill_of(env)
     memory = name_arrays(skill.name, skill.init_memory())
-    shapes = {"command": (len(skill.commands),), **SENSED, **{name: x.shape for name, x in memory.items()}}
+    shapes = {
+        "command": (len(skill.commands),),
+        **SENSED,
+        **{name: x.shape for name, x in memory.items()},
+    }
 
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         sensed = Proprioception(*(inputs[name] for name in SENSED))
@@ -169,14 +201,20 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
 
 
 def policy_function(policy: Policy, functions: TaskFunctions) -> tuple[Function, Shapes]:
-    """Returns a policy as a function of one team, and the shapes of its inputs; it samples where `policy` does."""
+    """Returns a policy as a function of one team, and the shapes of its inputs; it samples where
+    `policy` does.
+    """
     sensed = groups_of(policy) == {ONBOARD}
-    act, shapes = _act_on_readings(policy, functions.env.group_sizes[ONBOARD if sensed else "policy"])
+    act, shapes = _act_on_readings(
+        policy, functions.env.group_sizes[ONBOARD if sensed else "policy"]
+    )
     return _with_noise(*(_sensing(act, shapes, functions) if sensed else (act, shapes)))
 
 
 def readings_function(policy: Policy, size: int) -> tuple[Function, Shapes]:
-    """Returns a policy as a function of the observations `obs` (A, size) of one team; see `policy_function`."""
+    """Returns a policy as a function of the observations `obs` (A, size) of one team; see
+    `policy_function`.
+    """
     return _with_noise(*_act_on_readings(policy, size))
 
 
@@ -187,13 +225,19 @@ def _act_on_readings(policy: Policy, size: int) -> tuple[Function, Shapes]:
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         state = jax.tree.map(lambda x: x[None], fill_arrays("memory", memory, inputs))
         action, state = policy.act(inputs["obs"][None], state, key)
-        return {"action": action[0]} | {name: x[0] for name, x in name_arrays("next_memory", state).items()}
+        return {"action": action[0]} | {
+            name: x[0] for name, x in name_arrays("next_memory", state).items()
+        }
 
-    return act, {"obs": (policy.agents, size)} | {n: x.shape for n, x in name_arrays("memory", memory).items()}
+    return act, {"obs": (policy.agents, size)} | {
+        n: x.shape for n, x in name_arrays("memory", memory).items()
+    }
 
 
 def _with_noise(act: Function, shapes: Shapes) -> tuple[Function, Shapes]:
-    """Returns a function whose normal numbers are the input `noise` (K,), and its inputs; itself if it draws none."""
+    """Returns a function whose normal numbers are the input `noise` (K,), and its inputs; itself if
+    it draws none.
+    """
 
     def act_with_noise(inputs: Arrays) -> dict[str, jax.Array]:
         with normal_numbers(inputs["noise"]):
@@ -204,10 +248,11 @@ def _with_noise(act: Function, shapes: Shapes) -> tuple[Function, Shapes]:
 
 
 def _sensing(choose: Function, shapes: Shapes, functions: TaskFunctions) -> tuple[Function, Shapes]:
-    """Returns the function of a state that senses and then chooses the actions of the team `team` (), and its inputs.
+    """Returns the function of a state that senses and then chooses the actions of the team `team`
+    (), and its inputs.
 
-    `choose` with its inputs is a policy that sees sensors. The recurrent states `sense_NAME` are those of all agents'
-    sensors; the last actions among them are right for the team's own.
+    `choose` with its inputs is a policy that sees sensors. The recurrent states `sense_NAME` are
+    those of all agents' sensors; the last actions among them are right for the team's own.
     """
     env = functions.env
     first = env.suite.reset()
@@ -215,38 +260,60 @@ def _sensing(choose: Function, shapes: Shapes, functions: TaskFunctions) -> tupl
 
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         arrays = {name: inputs.get(name, x) for name, x in name_arrays("sense", first).items()}
-        senses = jax.tree.map(lambda x, like: x.astype(like.dtype), fill_arrays("sense", first, arrays), first)
+        senses = jax.tree.map(
+            lambda x, like: x.astype(like.dtype), fill_arrays("sense", first, arrays), first
+        )
         state = dataclasses.replace(functions.state(inputs), senses=senses)
-        blocks, senses = env.suite.observe(env.snapshot(state, env.read(state.data)), senses, state.key)
+        blocks, senses = env.suite.observe(
+            env.snapshot(state, env.read(state.data)), senses, state.key
+        )
         every = finite(env.groups[ONBOARD].pack(blocks, env.num_agents))
         teams = [every[team[0] : team[-1] + 1] for team in env.teams]
         outputs = choose({**inputs, "obs": jnp.where(inputs["team"] < 0.5, teams[0], teams[-1])})
-        senses = senses._replace(action=jnp.tile(jnp.clip(outputs["action"], -1.0, 1.0), (len(teams), 1)))
-        after = {name: x.astype(jnp.float32) for name, x in name_arrays("next_sense", senses).items() if x.size}
+        senses = senses._replace(
+            action=jnp.tile(jnp.clip(outputs["action"], -1.0, 1.0), (len(teams), 1))
+        )
+        after = {
+            name: x.astype(jnp.float32)
+            for name, x in name_arrays("next_sense", senses).items()
+            if x.size
+        }
         return {**outputs, **after}
 
-    return act, functions.state_inputs | {"team": ()} | {n: x for n, x in shapes.items() if n != "obs"} | own
+    return act, functions.state_inputs | {"team": ()} | {
+        n: x for n, x in shapes.items() if n != "obs"
+    } | own
 
 
 @contextlib.contextmanager
-def normal_numbers(noise: jax.Array | None, used: Callable[[int], None] = lambda size: None) -> Iterator[None]:
-    """Within it, `jax.random.normal` returns the numbers of `noise` (K,) in order, or zeros without them.
+def normal_numbers(
+    noise: jax.Array | None, used: Callable[[int], None] = lambda size: None
+) -> Iterator[None]:
+    """Within it, `jax.random.normal` returns the numbers of `noise` (K,) in order, or zeros without
+    them.
 
-    `uniform` and `bernoulli` are made of such numbers. A graph has no random keys, so its noise is an input. Nothing is
-    compiled within, as JAX would keep it.
+    `uniform` and `bernoulli` are made of such numbers. A graph has no random keys, so its noise is
+    an input. Nothing is compiled within, as JAX would keep it.
     """
     position = 0
 
     def normal(key: jax.Array, shape: tuple[int, ...] = (), dtype: Any = jnp.float32) -> jax.Array:
         nonlocal position
-        first, position = position, position + math.prod(shape)
+        first = position
+        position = position + math.prod(shape)
         used(position)
         return jnp.zeros(shape, dtype) if noise is None else noise[first:position].reshape(shape)
 
     def uniform(
-        key: jax.Array, shape: tuple[int, ...] = (), dtype: Any = jnp.float32, minval: Any = 0.0, maxval: Any = 1.0
+        key: jax.Array,
+        shape: tuple[int, ...] = (),
+        dtype: Any = jnp.float32,
+        minval: Any = 0.0,
+        maxval: Any = 1.0,
     ) -> jax.Array:
-        return minval + (maxval - minval) * 0.5 * (1.0 + jax.lax.erf(normal(key, shape, dtype) / math.sqrt(2.0)))
+        return minval + (maxval - minval) * 0.5 * (
+            1.0 + jax.lax.erf(normal(key, shape, dtype) / math.sqrt(2.0))
+        )
 
     def bernoulli(key: jax.Array, p: Any, shape: tuple[int, ...]) -> jax.Array:
         return uniform(key, shape) < p

@@ -37,17 +37,24 @@ REPLACED: dict[str, Callable[..., jax.Array]] = {
 
 
 def translate(
-    function: Function, inputs: Mapping[str, Sequence[int]], name: str, properties: Mapping[str, str] | None = None
+    function: Function,
+    inputs: Mapping[str, Sequence[int]],
+    name: str,
+    properties: Mapping[str, str] | None = None,
 ) -> onnx.ModelProto:
     """Returns the graph of a function of float32 arrays, batched over a leading axis N.
 
-    Arrays that the function closes over become constants; `inputs` are the shapes of its inputs by name, without N, and
-    `properties` the metadata of the model. InputError for an operation that jax2onnx cannot translate.
+    Arrays that the function closes over become constants; `inputs` are the shapes of its inputs by
+    name, without N, and `properties` the metadata of the model. InputError for an operation that
+    jax2onnx cannot translate.
     """
-    # Traced here, as jax2onnx replaces functions of jax.numpy while it traces, some of which fail under `vmap`.
+    # Traced here, as jax2onnx replaces functions of jax.numpy while it traces, some of which fail
+    # under `vmap`.
     specs = {key: jax.ShapeDtypeStruct(tuple(shape), np.float32) for key, shape in inputs.items()}
     # An output that is an input would have two names, so it is copied.
-    copied = jax.make_jaxpr(lambda values: jax.tree.map(jnp.copy, function(values)), return_shape=True)
+    copied = jax.make_jaxpr(
+        lambda values: jax.tree.map(jnp.copy, function(values)), return_shape=True
+    )
     with jax.disable_jit():  # also unrolls scans, in which jax2onnx loses N
         closed, outputs = copied(specs)
 
@@ -70,14 +77,18 @@ def translate(
 
 
 def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-    """Evaluates a jaxpr, at once where equations do not depend on the inputs; jax2onnx fails for some of these."""
+    """Evaluates a jaxpr, at once where equations do not depend on the inputs; jax2onnx fails for
+    some of these.
+    """
     known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *inputs), strict=True))
 
     def read(variable: Any) -> Any:
         return variable.val if isinstance(variable, Literal) else known[variable]
 
     for equation in jaxpr.eqns:
-        values, name, params = [read(v) for v in equation.invars], equation.primitive.name, equation.params
+        values = [read(v) for v in equation.invars]
+        name = equation.primitive.name
+        params = equation.params
         inner = params.get("call_jaxpr", params.get("jaxpr"))
         outputs: list[Any] = [v.aval for v in equation.outvars]
         if name == "concatenate":
@@ -85,9 +96,15 @@ def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[Any]) -> 
         if all(0 in getattr(x, "shape", ()) for x in outputs):  # graphs have no empty arrays
             results = [np.zeros(x.shape, x.dtype) for x in outputs]
         elif inner is not None and name != "reduce":  # whose jaxpr is that of its operator
-            results = _evaluate(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values)
+            results = _evaluate(
+                getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values
+            )
         elif any(isinstance(x, jax.core.Tracer) for x in values):
-            results = REPLACED[name](*values) if name in REPLACED else equation.primitive.bind(*values, **params)
+            results = (
+                REPLACED[name](*values)
+                if name in REPLACED
+                else equation.primitive.bind(*values, **params)
+            )
         else:
             with jax.ensure_compile_time_eval():
                 results = equation.primitive.bind(*values, **params)
@@ -97,11 +114,17 @@ def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[Any]) -> 
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Stores large constants that float16 represents exactly as such, with a cast: half the size."""
+    """Stores large constants that float16 represents exactly as such, with a cast: half the
+    size.
+    """
     for stored in graph.initializer:
         array = numpy_helper.to_array(stored)
-        half = array.astype(np.float16) if array.dtype == np.float32 and array.size > 1000 else array
+        half = (
+            array.astype(np.float16) if array.dtype == np.float32 and array.size > 1000 else array
+        )
         if half is not array and np.array_equal(half, array):
             whole = stored.name
             stored.CopyFrom(numpy_helper.from_array(half, f"{whole}_half"))
-            graph.node.insert(0, helper.make_node("Cast", [stored.name], [whole], to=TensorProto.FLOAT))
+            graph.node.insert(
+                0, helper.make_node("Cast", [stored.name], [whole], to=TensorProto.FLOAT)
+            )

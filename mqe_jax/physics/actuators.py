@@ -23,7 +23,8 @@ ActuatorParams = dict[str, dict[str, jax.Array]]
 
 
 def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
-    """Reads an actuator network (6-32-32-1, softsign) from safetensors: `0.weight` (32, 6), `0.bias`, `2...`, `4...`.
+    """Reads an actuator network (6-32-32-1, softsign) from safetensors: `0.weight` (32, 6),
+    `0.bias`, `2...`, `4...`.
 
     InputError if the file is missing, damaged, or holds other names or shapes.
     """
@@ -31,26 +32,34 @@ def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
     if not file.is_file():
         raise InputError(f"actuator_network: no file {file}")
     flat = read_tensors(file, "actuator_network")
-    layers = linear_layers(f"actuator_network {file}", flat, {"0": (6, 32), "2": (32, 32), "4": (32, 1)})
+    layers = linear_layers(
+        f"actuator_network {file}", flat, {"0": (6, 32), "2": (32, 32), "4": (32, 1)}
+    )
     return jax.tree.map(jnp.asarray, layers)
 
 
 def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Returns joint torques (...), N m, from joint position minus target, rad, and joint velocity, rad/s (3, ...).
+    """Returns joint torques (...), N m, from joint position minus target, rad, and joint velocity,
+    rad/s (3, ...).
 
     The three are of this physics step and the two before.
     """
     x = jnp.moveaxis(jnp.concatenate([error, velocity]), 0, -1)
     for layer in ("0", "2"):
-        x = jax.nn.soft_sign(jnp.matmul(x, params[layer]["weight"].T, precision="highest") + params[layer]["bias"])
-    return (jnp.matmul(x, params["4"]["weight"].T, precision="highest") + params["4"]["bias"])[..., 0]
+        x = jax.nn.soft_sign(
+            jnp.matmul(x, params[layer]["weight"].T, precision="highest") + params[layer]["bias"]
+        )
+    return (jnp.matmul(x, params["4"]["weight"].T, precision="highest") + params["4"]["bias"])[
+        ..., 0
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
 class NetworkActuators:
     """An actuator network, which computes torques from joint targets at every physics step.
 
-    Its recurrent state: joint position errors (rad) and velocities (rad/s) of the last two physics steps (2, R, 12).
+    Its recurrent state: joint position errors (rad) and velocities (rad/s) of the last two physics
+    steps (2, R, 12).
     """
 
     physics: Engine
@@ -71,7 +80,9 @@ class NetworkActuators:
         fields: Mapping[str, jax.Array],
         xfrc_applied: jax.Array | None,
     ) -> "tuple[mjx.Data, Any, jax.Array]":
-        """Advances the physics by one environment step under joint targets (R, 12), rad; returns as `Engine.step`."""
+        """Advances the physics by one environment step under joint targets (R, 12), rad; returns as
+        `Engine.step`.
+        """
 
         def substep(carry: Any, _: None) -> Any:
             data, (errors, velocities) = carry
@@ -80,8 +91,12 @@ class NetworkActuators:
             limit = self.robot.torque_limit
             torque = jnp.clip(actuator_torque(self.params, errors, velocities), -limit, limit)
             ctrl = scatter(np.zeros(self.physics.model.nu), self.index.actuator, torque)
-            data, overflow = self.physics.step(data, ctrl, fields=fields, xfrc_applied=xfrc_applied, num_substeps=1)
+            data, overflow = self.physics.step(
+                data, ctrl, fields=fields, xfrc_applied=xfrc_applied, num_substeps=1
+            )
             return (data, (errors[:2], velocities[:2])), overflow
 
-        (data, memory), overflow = jax.lax.scan(substep, (data, memory), None, self.physics.num_substeps)
+        (data, memory), overflow = jax.lax.scan(
+            substep, (data, memory), None, self.physics.num_substeps
+        )
         return data, memory, jnp.any(overflow)

@@ -1,7 +1,7 @@
 """Poses of bodies from generalised coordinates, equal on all engines.
 
-The engines' states hold no poses (`engines.STATE_FIELDS`); MuJoCo's C engine returns none and MJX's are those before
-the last physics step.
+The engines' states hold no poses (`engines.STATE_FIELDS`); MuJoCo's C engine returns none and MJX's
+are those before the last physics step.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,9 @@ class Poses(NamedTuple):
 
 
 def poses(model: mujoco.MjModel, data: "mjx.Data", bodies: Sequence[int] | np.ndarray) -> Poses:
-    """Returns the poses of bodies, given by their ids; quaternions in `data.qpos` are taken to be normalised."""
+    """Returns the poses of bodies, given by their ids; quaternions in `data.qpos` are taken to be
+    normalised.
+    """
     found: dict[int, tuple[Any, Any]] = {0: (jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]))}
 
     def place(body: int) -> tuple[Any, Any]:
@@ -40,23 +42,29 @@ def poses(model: mujoco.MjModel, data: "mjx.Data", bodies: Sequence[int] | np.nd
     return Poses(jnp.stack(positions), jnp.stack(quaternions))
 
 
-def _place(model: mujoco.MjModel, data: "mjx.Data", body: int, position: Any, quaternion: Any) -> tuple[Any, Any]:
+def _place(
+    model: mujoco.MjModel, data: "mjx.Data", body: int, position: Any, quaternion: Any
+) -> tuple[Any, Any]:
     """Returns the pose of a body in the pose of its parent."""
     if (number := int(model.body_mocapid[body])) >= 0:
         return data.mocap_pos[number], data.mocap_quat[number]
     position = position + rotate(quaternion, _single(model.body_pos[body]))
     quaternion = compose(quaternion, _single(model.body_quat[body]))
     for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
-        address, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
+        address = int(model.jnt_qposadr[joint])
+        kind = int(model.jnt_type[joint])
         if kind == _JOINT.mjJNT_FREE:
             return data.qpos[address : address + 3], data.qpos[address + 3 : address + 7]
-        axis, anchor = _single(model.jnt_axis[joint]), _single(model.jnt_pos[joint])
+        axis = _single(model.jnt_axis[joint])
+        anchor = _single(model.jnt_pos[joint])
         moved = data.qpos[address] - _single(model.qpos0[address])
         if kind == _JOINT.mjJNT_SLIDE:
             position = position + rotate(quaternion, axis) * moved
             continue
         ball = kind == _JOINT.mjJNT_BALL
-        turned = compose(quaternion, data.qpos[address : address + 4] if ball else rotation(axis, moved))
+        turned = compose(
+            quaternion, data.qpos[address : address + 4] if ball else rotation(axis, moved)
+        )
         if anchor.any():
             position = position + rotate(quaternion, anchor) - rotate(turned, anchor)
         quaternion = turned

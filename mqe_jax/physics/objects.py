@@ -1,4 +1,7 @@
-"""Scene objects: settings classes that add one body each to a scene; SI units. A task's parameters may nest them."""
+"""Scene objects: settings classes that add one body each to a scene; SI units.
+
+A task's parameters may nest them.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -15,7 +18,8 @@ from mqe_jax.physics.collision import GROUND_BIT, OBJECT_BIT, WALL_BIT
 GRAVITY = 9.81  # m/s^2
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Size = tuple[Length, Length, Length]
-_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+_GEOM = mujoco.mjtGeom
+_JOINT = mujoco.mjtJoint
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 # Collides with ground, walls, other objects and robots.
 _FREE = {"contype": OBJECT_BIT, "conaffinity": GROUND_BIT | WALL_BIT | OBJECT_BIT}
@@ -52,14 +56,22 @@ class Object:
         return None
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the body `name` to a scene, with its purely visual geoms if `visual`; no actuator, no mocap body."""
+        """Adds the body `name` to a scene, with its purely visual geoms if `visual`; no actuator,
+        no mocap body.
+        """
         raise NotImplementedError(f"object {type(self).__name__}: add() is not defined")
 
 
-def add_body(spec: mujoco.MjSpec, name: str, position: Sequence[float], mass: float, inertia: Any) -> Any:
-    """Adds a body at a position (3,), m, of a mass, kg, and principal moments of inertia (3,), kg m^2."""
+def add_body(
+    spec: mujoco.MjSpec, name: str, position: Sequence[float], mass: float, inertia: Any
+) -> Any:
+    """Adds a body at a position (3,), m, of a mass, kg, and principal moments of inertia (3,), kg
+    m^2.
+    """
     body = spec.worldbody.add_body(name=name, pos=position)
-    body.explicitinertial, body.mass, body.inertia = True, mass, inertia
+    body.explicitinertial = True
+    body.mass = mass
+    body.inertia = inertia
     body.ipos = (0, 0, 0)  # if unset, MuJoCo offsets the centre of mass by `position`
     return body
 
@@ -70,7 +82,9 @@ def add_slides(body: Any, axes: str, damping: float = 0.0) -> None:
         _add_joint(body, axis, _JOINT.mjJNT_SLIDE, damping, axis=_AXES[axis])
 
 
-def add_solid(body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **options: Any) -> None:
+def add_solid(
+    body: Any, kind: Any, color: Color, friction: float = 1.0, group: int = 1, **options: Any
+) -> None:
     """Adds the collision geom of a body."""
     sliding = (friction, 0.005, 0.0001)
     solid = {"name": body.name, "type": kind, "rgba": color, "friction": sliding, "group": group}
@@ -83,7 +97,9 @@ def _add_joint(body: Any, suffix: str, kind: Any, damping: float = 0.0, **option
 
 @settings_class
 class Box(Object):
-    """A movable box. Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
+    """A movable box.
+
+    Coordinates: position 3, quaternion 4; velocity linear 3 (world), angular 3 (body).
 
     Example:
         ```python
@@ -106,7 +122,9 @@ class Box(Object):
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         x, y, z = np.square(self.size)
-        body = add_body(spec, name, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12)
+        body = add_body(
+            spec, name, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12
+        )
         _add_joint(body, "free", _JOINT.mjJNT_FREE)
         half = np.array(self.size) / 2
         add_solid(body, _GEOM.mjGEOM_BOX, WOOD, self.friction, size=half, **_FREE)
@@ -132,18 +150,24 @@ class Ball(Object):
         return Circle(self.radius)
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        # A thin shell on three slides and a ball joint: a free joint has a single damping coefficient.
+        # A thin shell on three slides and a ball joint: a free joint has a single damping
+        # coefficient.
         body = add_body(spec, name, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
         add_slides(body, "xyz", self.damping)
         _add_joint(body, "turn", _JOINT.mjJNT_BALL, self.angular_damping)
-        add_solid(body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE)
+        add_solid(
+            body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE
+        )
         if visual:
             bodies.football(body, self.radius)
 
 
 @settings_class
 class Cylinder(Object):
-    """An upright cylinder that slides along y only, with the ground's friction. Coordinate: y, m; velocity likewise."""
+    """An upright cylinder that slides along y only, with the ground's friction.
+
+    Coordinate: y, m; velocity likewise.
+    """
 
     x: Coordinate = 1.6
     """X of the axis, m."""
@@ -175,7 +199,10 @@ class Cylinder(Object):
 
 @settings_class
 class Door(Object):
-    """A revolving door: a panel on a vertical hinge at its centre. Coordinate: angle, rad, 0 along y."""
+    """A revolving door: a panel on a vertical hinge at its centre.
+
+    Coordinate: angle, rad, 0 along y.
+    """
 
     position: tuple[Coordinate, Coordinate] = (2.6, 0.0)
     """Position of the hinge (x, y), m."""
@@ -193,9 +220,12 @@ class Door(Object):
         return Rectangle(*self.size[:2])
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        body = add_body(spec, name, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia))
+        body = add_body(
+            spec, name, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia)
+        )
         _add_joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
-        half, group = np.array(self.size) / 2, HIDDEN_GROUP if visual else 1
+        half = np.array(self.size) / 2
+        group = HIDDEN_GROUP if visual else 1
         add_solid(body, _GEOM.mjGEOM_BOX, WOOD, group=group, size=half, **_HELD)
         if visual:
             bodies.door(body, half)
@@ -203,7 +233,10 @@ class Door(Object):
 
 @settings_class
 class Seesaw(Object):
-    """A balanced plank on a hinge across the track. Coordinate: pitch, rad, negative with the near end down."""
+    """A balanced plank on a hinge across the track.
+
+    Coordinate: pitch, rad, negative with the near end down.
+    """
 
     hinge: Vector = (5.6, 0.0, 0.545)
     """Position of the hinge (x, y, z), m."""
@@ -212,13 +245,15 @@ class Seesaw(Object):
     behind: Coordinate = 0.103
     """Distance of the plank's centre from the hinge, towards the near end, m."""
     mass: Mass = 100.0
-    """Mass, kg; the centre of mass is at the hinge, so that the plank is in equilibrium at every angle."""
+    """Mass, kg; the centre of mass is at the hinge, so that the plank is in equilibrium at every
+    angle."""
     inertia: Mass = 100.0
     """Inertia about the hinge, kg m^2."""
     limit: Length = 0.254
     """Maximum |angle|, rad; at the lower limit the near end is on the ground."""
     damping: Damping = 1000.0
-    """Damping of the hinge, N m s/rad: a Go1 (111 N) at the far end, 1.9 m from it, turns it at 0.21 rad/s."""
+    """Damping of the hinge, N m s/rad: a Go1 (111 N) at the far end, 1.9 m from it, turns it at
+    0.21 rad/s."""
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         body = add_body(spec, name, self.hinge, self.mass, (self.inertia,) * 3)
@@ -289,7 +324,10 @@ class Ring(Object):
 
 @settings_class
 class Sheep(Object):
-    """An upright sheep that slides without friction or rotation (see `flock`). Coordinates: x, y; velocity likewise."""
+    """An upright sheep that slides without friction or rotation (see `flock`).
+
+    Coordinates: x, y; velocity likewise.
+    """
 
     radius: Length = 0.2
     """Radius, m."""
@@ -303,10 +341,13 @@ class Sheep(Object):
         return Circle(self.radius)
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        # The lower end of the capsule is below the ground, so that it is cylindrical at ground level.
+        # The lower end of the capsule is below the ground, so that it is cylindrical at ground
+        # level.
         body = add_body(spec, name, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
         add_slides(body, "xy")
         shape = {"size": (self.radius, 0, 0), "fromto": (0, 0, 0, 0, 0, self.height - self.radius)}
-        add_solid(body, _GEOM.mjGEOM_CAPSULE, STONE, group=HIDDEN_GROUP if visual else 1, **shape, **_HELD)
+        add_solid(
+            body, _GEOM.mjGEOM_CAPSULE, STONE, group=HIDDEN_GROUP if visual else 1, **shape, **_HELD
+        )
         if visual:
             bodies.sheep(body, self.radius, self.height)

@@ -1,4 +1,6 @@
-"""A scene: a track, N robots and movable objects, compiled to a MuJoCo model with its index tables."""
+"""A scene: a track, N robots and movable objects, compiled to a MuJoCo model with its index
+tables.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
@@ -36,11 +38,13 @@ class Scene:
     objects: Mapping[str, Object] = dataclasses.field(default_factory=dict)
     """Movable and fixed objects by name, added after the robots as bodies `object/<name>`."""
     colors: tuple[int, ...] = ()
-    """Colours of the robots, as indices of `mqe_jax.physics.appearance.ROBOT_COLORS`; in order if empty."""
+    """Colours of the robots, as indices of `mqe_jax.physics.appearance.ROBOT_COLORS`; in order if
+    empty."""
     friction: float = 1.0
     """Sliding friction of the robots' collision geoms and the ground."""
     torque_robots: int = 0
-    """Number of robots, the first ones, whose actuators take torques (N m), not PD joint targets (rad)."""
+    """Number of robots, the first ones, whose actuators take torques (N m), not PD joint targets
+    (rad)."""
     joint_mechanics: bool = False
     """Whether the robots' joints have rotor inertia, damping and dry friction."""
     foot_sensors: bool = False
@@ -52,14 +56,20 @@ class Scene:
     solver_iterations: int = 4
     """Maximum Newton iterations per physics step."""
     max_contacts: int = 32
-    """Maximum active contacts per environment on MJX-JAX (deepest first). Without the cap MJX allocates constraints for
-    every candidate geom pair, which halves CPU throughput. The other engines keep all."""
+    """Maximum active contacts per environment on MJX-JAX (deepest first). Without the cap MJX
+    allocates constraints for every candidate geom pair, which halves CPU throughput. The other
+    engines keep all."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_robots <= MAX_ROBOTS:
-            raise InputError(f"Scene.num_robots: {self.num_robots} must be between 1 and {MAX_ROBOTS}")
+            raise InputError(
+                f"Scene.num_robots: {self.num_robots} must be between 1 and {MAX_ROBOTS}"
+            )
         if self.colors and len(self.colors) != self.num_robots:
-            raise InputError(f"Scene.colors: {self.colors} must have a colour for each of {self.num_robots} robots")
+            raise InputError(
+                f"Scene.colors: {self.colors} must have a colour for each of {self.num_robots} "
+                "robots"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +104,12 @@ class CompiledScene:
     def sample_anchors(self, key: jax.Array) -> jax.Array:
         """Samples the anchors' positions (G, 2), m."""
         anchors = self.layout.anchors
-        mean, spread = np.array([(a.position, a.spread) for a in anchors]).reshape(-1, 2, 2).swapaxes(0, 1)
-        return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(key, mean.shape, minval=-1.0)
+        mean, spread = (
+            np.array([(a.position, a.spread) for a in anchors]).reshape(-1, 2, 2).swapaxes(0, 1)
+        )
+        return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(
+            key, mean.shape, minval=-1.0
+        )
 
     def wall_positions(self, anchors: jax.Array) -> jax.Array:
         """Places the moving walls (W, 3) around anchors (G, 2), m: values for `mocap_pos`."""
@@ -122,8 +136,11 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
     spec.option.ls_iterations = 8
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    # Without islands the C engine's solver iterates over the whole scene, as MJX does, and the engines agree.
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_ISLAND
+    # Without islands the C engine's solver iterates over the whole scene, as MJX does, and the
+    # engines agree.
+    spec.option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_ISLAND
+    )
     spec.add_numeric(name="max_contact_points", size=1, data=[scene.max_contacts])
     layout = build_terrain(spec, scene.track, visual=visual)
     for number in range(scene.num_robots):
@@ -150,17 +167,26 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> None:
-    """Adds an object, which may bring bodies, geoms, joints, sensors, tendons and equality constraints."""
+    """Adds an object, which may bring bodies, geoms, joints, sensors, tendons and equality
+    constraints.
+    """
 
     def counts() -> dict[str, float]:
         mocap = sum(body.mocap for body in spec.bodies)
-        return {"actuators": len(spec.actuators), "mocap bodies": mocap, "timestep": spec.option.timestep}
+        return {
+            "actuators": len(spec.actuators),
+            "mocap bodies": mocap,
+            "timestep": spec.option.timestep,
+        }
 
-    what, before = f"objects: {name}: {type(item).__name__}.add()", counts()
+    what = f"objects: {name}: {type(item).__name__}.add()"
+    before = counts()
     item.add(spec, f"object/{name}", visual)
     for key, value in counts().items():
         if value != before[key]:
-            raise InputError(f"{what} changes the scene's {key} from {before[key]:g} to {value:g}; it must not")
+            raise InputError(
+                f"{what} changes the scene's {key} from {before[key]:g} to {value:g}; it must not"
+            )
     if spec.body(f"object/{name}") is None:
         raise InputError(f"{what} adds no body 'object/{name}'; it must")
 
@@ -179,7 +205,9 @@ def compile_scene(scene: Scene) -> CompiledScene:
     """
     model, layout = build_model(scene, visual=False)
     moving = [wall for wall in layout.walls if wall.anchor is not None]
-    index = index_robots(model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors)
+    index = index_robots(
+        model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors
+    )
     return CompiledScene(
         scene=scene,
         model=model,
@@ -198,12 +226,16 @@ def _index_objects(model: mujoco.MjModel, names: Iterable[str]) -> Mapping[str, 
         body = model.body(f"object/{name}")
         joints = range(body.jntadr[0], body.jntadr[0] + body.jntnum[0]) if body.jntnum[0] else ()
         widths = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
-        qpos, qvel = [], []
+        qpos = []
+        qvel = []
         for joint in joints:
             coordinates, speeds = widths.get(mujoco.mjtJoint(model.jnt_type[joint]), (1, 1))
             qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
             qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
-        as_int = lambda rows: np.asarray(rows, np.int32)  # noqa: E731
+
+        def as_int(rows):
+            return np.asarray(rows, np.int32)
+
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"object/{name}")
         found[name] = ObjectIndex(as_int(qpos), as_int(qvel), int(body.id), geom)
     return found

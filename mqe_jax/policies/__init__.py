@@ -31,7 +31,8 @@ from mqe_jax.train.needs import Needs
 from mqe_jax.train.policy import Composed, Policy, TrainedPolicy, check_obs, check_policy
 
 NAMES = ("scripted", "random", "idle", "forward")
-"""Policies that need no file: the task's scripted one, uniform random actions, zero actions, and half speed ahead."""
+"""Policies that need no file: the task's scripted one, uniform random actions, zero actions, and
+half speed ahead."""
 
 _FORWARD = 0.25
 """The first action of `forward`."""
@@ -84,12 +85,15 @@ class BothTeams(Composed):
 
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions of all agents; see `Policy`."""
-        seen, size = Observations.at(obs), self.first.agents
+        seen = Observations.at(obs)
+        size = self.first.agents
         check_obs(seen.obs, self.agents)
         if not isinstance(memory, tuple) or len(memory) != 2:
             fail("memory", memory, "that of `initial_memory`, one for each team")
         keys = jax.random.split(check("key", key, RandomKey))
-        first, first_memory = self.first.act(seen.of(slice(size)).to(self.first), memory[0], keys[0])
+        first, first_memory = self.first.act(
+            seen.of(slice(size)).to(self.first), memory[0], keys[0]
+        )
         others = seen.of(slice(size, None)).to(self.second)
         second, second_memory = self.second.act(others, memory[1], keys[1])
         return jnp.concatenate([first, second], axis=1), (first_memory, second_memory)
@@ -99,8 +103,8 @@ class BothTeams(Composed):
 class MixedTeam(Composed):
     """A team whose agents follow different policies of the whole team, as one policy.
 
-    Each agent takes its own action from what its policy does for all. Trained policies of equal architecture are
-    exchanged as arrays, so that a compiled program serves all seats.
+    Each agent takes its own action from what its policy does for all. Trained policies of equal
+    architecture are exchanged as arrays, so that a compiled program serves all seats.
     """
 
     policies: tuple[Policy, ...]
@@ -112,7 +116,9 @@ class MixedTeam(Composed):
 
     @functools.cached_property
     def _kinds(self) -> list[list[int]]:
-        """Returns the indices of the policies that can be exchanged for each other, by their architectures."""
+        """Returns the indices of the policies that can be exchanged for each other, by their
+        architectures.
+        """
         kinds: dict[Any, list[int]] = {}
         for index, policy in enumerate(self.policies):
             kind = repr(policy.architecture) if isinstance(policy, TrainedPolicy) else index
@@ -129,14 +135,22 @@ class MixedTeam(Composed):
         seen = Observations.at(obs)
         check_obs(seen.obs, self.agents)
         keys = jax.random.split(check("key", key, RandomKey), (self.agents, len(self._kinds)))
-        seats, actions, memories = jnp.asarray(self.seats), [], []
+        seats = jnp.asarray(self.seats)
+        actions = []
+        memories = []
         for agent in range(self.agents):
-            action, after = 0.0, []
+            action = 0.0
+            after = []
             for indices, now, own in zip(self._kinds, memory[agent], keys[agent], strict=True):
-                chosen, (first, *more) = jnp.asarray(indices) == seats[agent], [self.policies[i] for i in indices]
+                chosen = jnp.asarray(indices) == seats[agent]
+                (first, *more) = [self.policies[i] for i in indices]
                 if isinstance(first, TrainedPolicy):
                     place = jnp.argmax(chosen)
-                    each = [policy.arrays for policy in (first, *more) if isinstance(policy, TrainedPolicy)]
+                    each = [
+                        policy.arrays
+                        for policy in (first, *more)
+                        if isinstance(policy, TrainedPolicy)
+                    ]
                     arrays = jax.tree.map(lambda *x: jnp.stack(x)[place], *each)  # noqa: B023
                     team, now = first.act_with(arrays, seen, now, own)
                 else:
@@ -151,36 +165,42 @@ class MixedTeam(Composed):
 @overload
 def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> Any: ...
 @overload
-def load_policy(source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy: ...
+def load_policy(
+    source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False
+) -> Policy: ...
 @check_arguments(source=PathText, env=AnyEnvironment | None, deterministic=bool)
-def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False) -> Policy:
+def load_policy(
+    source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False
+) -> Policy:
     """Returns the policy of a name, a run folder or a policy file.
 
     Example:
         ```python
         env = mqe_jax.make("go1gate")
         team = mqe_jax.load_policy("go1gate", env)  # the shipped one
-        action, memory = team.act(jax.numpy.zeros((1, 2, 16)), team.initial_memory(1), jax.random.PRNGKey(0))
+        obs = jax.numpy.zeros((1, 2, 16))
+        action, memory = team.act(obs, team.initial_memory(1), jax.random.PRNGKey(0))
         ```
 
     Args:
         source: one of `NAMES`, of the task's `NAMED_SCRIPTED`, a task with a shipped policy
-            (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path. A folder with one of these
-            names is ./NAME.
-        env: the task; in a match the policy acts for one team. Names need it, and policies of paths are checked against
-            it.
-        deterministic: whether a trained policy acts with its mean actions. It also does if its file or a shipped
-            policy's card says so.
+            (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or a path. A
+            folder with one of these names is ./NAME.
+        env: the task; in a match the policy acts for one team. Names need it, and policies of paths
+            are checked against it.
+        deterministic: whether a trained policy acts with its mean actions. It also does if its file
+            or a shipped policy's card says so.
 
     Returns:
         A `TrainedPolicy` or a `Mixture` for a shipped one or a path, else a `SimplePolicy`.
 
     Raises:
-        InputError: for an unknown name, a file that cannot be read, a policy of another task, or a task without a
-            scripted policy.
+        InputError: for an unknown name, a file that cannot be read, a policy of another task, or a
+            task without a scripted policy.
     """
     env = getattr(env, "env", env)  # of a batch
-    given, source = str(source), source if env is None else population.resolve(source, env.name)
+    given = str(source)
+    source = source if env is None else population.resolve(source, env.name)
     further = () if env is None else tuple(NAMED_SCRIPTED.get(env.name, ()))
     if str(source) in (*NAMES, *further):
         if env is None:
@@ -199,7 +219,8 @@ def load_policy(source: str | Path, env: QuadrupedEnv | None = None, *, determin
 
 
 def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool = False) -> Policy:
-    """Returns the policy of a setting or argument, which errors name: a policy, its `act`, or what `load_policy` takes.
+    """Returns the policy of a setting or argument, which errors name: a policy, its `act`, or what
+    `load_policy` takes.
 
     A function has no recurrent state, and acts for one team.
     """
@@ -209,7 +230,9 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
         else:
             policy = check("policy", source, PolicyOrAct)
             if isinstance(policy, Trained):
-                policy = translate(policy.acting(True) if deterministic else policy, env, repr(policy))
+                policy = translate(
+                    policy.acting(True) if deterministic else policy, env, repr(policy)
+                )
             elif hasattr(policy, "task"):
                 check_policy(policy, env, repr(policy))
     except InputError as error:
@@ -222,13 +245,14 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
 
 
 def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
-    """Returns the parameters and the control mode that policies need and that differ from a task's defaults.
+    """Returns the parameters and the control mode that policies need and that differ from a task's
+    defaults.
 
     These include the sensors of policies that see them.
 
-    Policies of different skills get parameters with which they can meet. The sources are policies, or what
-    `load_policy` accepts. Only trained policies of the task need something, and the scripted member of a population: it
-    always has the task's default skill.
+    Policies of different skills get parameters with which they can meet. The sources are policies,
+    or what `load_policy` accepts. Only trained policies of the task need something, and the
+    scripted member of a population: it always has the task's default skill.
     """
     params: dict[str, Any] = {}
     every: list[Needs] = []
@@ -238,7 +262,9 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
         if isinstance(source, str | Path) and str(source) not in NAMES:
             with contextlib.suppress(InputError):  # `load_as` raises it if it matters
                 policy = population.resolve(source, task)
-                scripted = [TASKS[task].Params().actions("command")] if policy == "scripted" else scripted
+                scripted = (
+                    [TASKS[task].Params().actions("command")] if policy == "scripted" else scripted
+                )
                 policy = load_policy(policy)
         needs: Any = getattr(policy, "needs", None)
         if isinstance(needs, Needs) and needs.control is not None and needs.task == task:
@@ -253,7 +279,8 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
 
 
 def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:
-    """Returns the policy of all agents of a task: of a match, that of both teams; without opponent, team 1 is idle.
+    """Returns the policy of all agents of a task: of a match, that of both teams; without opponent,
+    team 1 is idle.
 
     Raises:
         InputError: for an opponent in a task that is not a match.
@@ -266,7 +293,9 @@ def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None
 
 
 def _plan(name: str, env: QuadrupedEnv) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Returns the function of observations (N, A, O) and a key that is the policy of a name; it can be pickled."""
+    """Returns the function of observations (N, A, O) and a key that is the policy of a name; it can
+    be pickled.
+    """
     if name not in NAMES or name == "scripted":
         return _scripted(env, name)
     shape = (len(env.teams[0]), env.action_size)
@@ -276,7 +305,9 @@ def _plan(name: str, env: QuadrupedEnv) -> Callable[[jax.Array, jax.Array], jax.
 
 
 def _uniform(shape: tuple[int, ...], obs: jax.Array, key: jax.Array) -> jax.Array:
-    return devices.rows(lambda n: jax.random.uniform(key, (n, *shape), minval=-1.0, maxval=1.0), len(obs))
+    return devices.rows(
+        lambda n: jax.random.uniform(key, (n, *shape), minval=-1.0, maxval=1.0), len(obs)
+    )
 
 
 def _constant(shape: tuple[int, ...], first: float, obs: jax.Array, key: jax.Array) -> jax.Array:
@@ -292,12 +323,17 @@ def _act_scripted(env: QuadrupedEnv, name: str, obs: jax.Array, key: jax.Array) 
 
 
 def _scripted(env: QuadrupedEnv, name: str) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Returns a scripted policy of the task for a batch: observations (N, A, O) and a key to actions (N, A, 3)."""
+    """Returns a scripted policy of the task for a batch: observations (N, A, O) and a key to
+    actions (N, A, 3).
+    """
     scripted_policy(env, name)  # which raises if it is missing
     if env.control != "command":
         raise InputError(
-            f"policy: {name!r} outputs walk commands; control is {env.control!r}, use another, such as random"
+            f"policy: {name!r} outputs walk commands; control is {env.control!r}, use another, "
+            "such as random"
         )
     if tuple(env.params.commands) != TaskParams.commands:
-        raise InputError(f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}")
+        raise InputError(
+            f"commands: {env.params.commands}; policy {name!r} outputs {TaskParams.commands}"
+        )
     return functools.partial(_act_scripted, env, name)

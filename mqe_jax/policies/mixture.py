@@ -39,19 +39,23 @@ MEMBERS = 4
 class Mixture:
     """A policy that draws one of its members for each episode.
 
-    Its recurrent state holds the number of the member, 0 until the first `act` of an episode draws it, and the states
-    of all members, which act in every step. Without a random key the member with the largest weight acts.
+    Its recurrent state holds the number of the member, 0 until the first `act` of an episode draws
+    it, and the states of all members, which act in every step. Without a random key the member with
+    the largest weight acts.
     """
 
     members: tuple[TrainedPolicy, ...]
-    """Policies with equal needs; each samples its actions or acts with the means, as its file says."""
+    """Policies with equal needs; each samples its actions or acts with the means, as its file
+    says."""
     weights: tuple[float, ...]
     """Probability of each member; the sum is 1."""
     metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Further entries of the file, such as the card of a shipped mixture."""
 
     def __post_init__(self) -> None:
-        members = check("members", self.members, Annotated[tuple[Any, ...], MinLen(1), MaxLen(MEMBERS)])
+        members = check(
+            "members", self.members, Annotated[tuple[Any, ...], MinLen(1), MaxLen(MEMBERS)]
+        )
         if not all(isinstance(member, TrainedPolicy) for member in members):
             fail("members", members, "trained policies")
         weights = check("weights", self.weights, tuple[Fraction, ...])
@@ -90,11 +94,15 @@ class Mixture:
 
     def acting(self, deterministic: bool) -> Self:
         """Returns the mixture whose members act with their mean actions, or sample them."""
-        return dataclasses.replace(self, members=tuple(member.acting(deterministic) for member in self.members))
+        return dataclasses.replace(
+            self, members=tuple(member.acting(deterministic) for member in self.members)
+        )
 
     def at_size(self, env: Any) -> Self:
         """Returns the mixture whose members act in an environment; see `TrainedPolicy`."""
-        return dataclasses.replace(self, members=tuple(member.at_size(env) for member in self.members))
+        return dataclasses.replace(
+            self, members=tuple(member.at_size(env) for member in self.members)
+        )
 
     @property
     def task(self) -> str:
@@ -115,24 +123,38 @@ class Mixture:
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the recurrent state at an episode's start; see `TrainedPolicy`."""
         member = jnp.zeros(() if num_envs is None else num_envs)
-        return {"member": member, "members": tuple(each.initial_memory(num_envs) for each in self.members)}
+        return {
+            "member": member,
+            "members": tuple(each.initial_memory(num_envs) for each in self.members),
+        }
 
     @single
-    def act(self, obs: Any, memory: Memory, key: jax.Array | None = None) -> tuple[jax.Array, Memory]:
+    def act(
+        self, obs: Any, memory: Memory, key: jax.Array | None = None
+    ) -> tuple[jax.Array, Memory]:
         """Returns the actions of the drawn members; see `TrainedPolicy`."""
         check("key", key, RandomKey | None)
         if jax.tree.structure(memory) != jax.tree.structure(self.initial_memory()):
             fail("memory", memory, "the recurrent state of this mixture, that of `initial_memory`")
         draw_key, key = (None, None) if key is None else jax.random.split(key)
-        member = jnp.where(memory["member"] < 0.5, self._draw(jnp.shape(memory["member"]), draw_key), memory["member"])
-        acts = [each.act(obs, own, key) for each, own in zip(self.members, memory["members"], strict=True)]
+        member = jnp.where(
+            memory["member"] < 0.5,
+            self._draw(jnp.shape(memory["member"]), draw_key),
+            memory["member"],
+        )
+        acts = [
+            each.act(obs, own, key)
+            for each, own in zip(self.members, memory["members"], strict=True)
+        ]
         action = acts[-1][0]
         for number in range(len(acts) - 1, 0, -1):
             action = jnp.where(member[..., None, None] < number + 0.5, acts[number - 1][0], action)
         return action, {"member": member, "members": tuple(own for _, own in acts)}
 
     def _draw(self, shape: tuple[int, ...], key: jax.Array | None) -> jax.Array:
-        """Returns the numbers of members, from 1, drawn for environments by normal numbers, which graphs have too."""
+        """Returns the numbers of members, from 1, drawn for environments by normal numbers, which
+        graphs have too.
+        """
         if key is None:
             return jnp.full(shape, 1.0 + int(np.argmax(self.weights)))
         last = max(i for i, weight in enumerate(self.weights) if weight > 0)
@@ -147,14 +169,18 @@ Trained = TrainedPolicy | Mixture
 
 
 @check_arguments(folder=PathText, mixture=Mixture, name=PathText, half=bool)
-def save_mixture(folder: str | Path, mixture: Mixture, name: str = POLICY_FILE, *, half: bool = False) -> Path:
+def save_mixture(
+    folder: str | Path, mixture: Mixture, name: str = POLICY_FILE, *, half: bool = False
+) -> Path:
     """Writes a mixture as one file, its members as `save_policy` does; errors as there."""
     arrays, records = zip(*(file_content(member, half) for member in mixture.members), strict=True)
     metadata = {**mixture.metadata, "members": records, "weights": mixture.weights}
     return write_policy(folder, name, {"members": arrays}, metadata)
 
 
-def save(folder: str | Path, policy: Trained, name: str = POLICY_FILE, *, half: bool = False) -> Path:
+def save(
+    folder: str | Path, policy: Trained, name: str = POLICY_FILE, *, half: bool = False
+) -> Path:
     """Writes a policy or a mixture into a folder; see `save_policy` and `save_mixture`."""
     if isinstance(policy, Mixture):
         return save_mixture(folder, policy, name, half=half)
@@ -169,10 +195,14 @@ def read(run: str | Path) -> Trained:
     if "members" not in metadata:
         return policy_in(path, metadata)
     try:
-        records = check("members", metadata.pop("members"), Annotated[list[dict[str, Any]], MaxLen(MEMBERS)])
+        records = check(
+            "members", metadata.pop("members"), Annotated[list[dict[str, Any]], MaxLen(MEMBERS)]
+        )
         weights = metadata.pop("weights")
         members = (policy_in(path, record, f"members/{i}/") for i, record in enumerate(records))
         return Mixture(tuple(members), weights, metadata)
     except (KeyError, InputError) as error:
         text = str(error)
-        raise InputError(text if str(path) in text else f"{path}: its members cannot be read ({text})") from None
+        raise InputError(
+            text if str(path) in text else f"{path}: its members cannot be read ({text})"
+        ) from None

@@ -1,4 +1,6 @@
-"""Trained policies in tasks with wider actions: each acts with its own skill, and some send no messages."""
+"""Trained policies in tasks with wider actions: each acts with its own skill, and some send no
+messages.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +23,23 @@ from mqe_jax.train.policy import Composed, Policy, check_policy
 
 @dataclasses.dataclass(frozen=True)
 class Translated(Composed):
-    """A trained policy whose actions mean `own`, as a policy of a task whose actions mean `here`."""
+    """A trained policy whose actions mean `own`, as a policy of a task whose actions mean
+    `here`.
+    """
 
     policy: Trained
     own: Commander = dataclasses.field(repr=False)
     here: Commander = dataclasses.field(repr=False)
     sensed: slice | None = None
-    """Place of the last action, as it means here, in the policy's observations; None if they lack it."""
+    """Place of the last action, as it means here, in the policy's observations; None if they lack
+    it."""
 
     _parts = property(lambda self: (self.policy,))
 
     def initial_memory(self, num_envs: int) -> Memory:
-        """Returns the initial recurrent state of the policy; if it sees its last action, with that."""
+        """Returns the initial recurrent state of the policy; if it sees its last action, with
+        that.
+        """
         memory = self.policy.initial_memory(num_envs)
         shape = (num_envs, self.agents, self.policy.needs.dims.action)
         return memory if self.sensed is None else (memory, jnp.zeros(shape))
@@ -42,9 +49,13 @@ class Translated(Composed):
         if self.sensed is None:
             action, memory = self.policy.act(obs, memory, key)
             return self.here.translate(action, self.own), memory
-        seen, (memory, last), group = Observations.at(obs), memory, self.policy.needs.group
+        seen = Observations.at(obs)
+        (memory, last) = memory
+        group = self.policy.needs.group
         here = seen.group(group) if isinstance(obs, Observations) else obs
-        own = jnp.concatenate([here[..., : self.sensed.start], last, here[..., self.sensed.stop :]], axis=-1)
+        own = jnp.concatenate(
+            [here[..., : self.sensed.start], last, here[..., self.sensed.stop :]], axis=-1
+        )
         seen = dataclasses.replace(seen, groups={**seen.groups, group: own})
         action, memory = self.policy.act(seen, memory, key)
         return self.here.translate(action, self.own), (memory, action)
@@ -52,7 +63,9 @@ class Translated(Composed):
 
 @dataclasses.dataclass(frozen=True)
 class Silent(Composed):
-    """A policy without sensors, as a policy of a task whose robots send messages of `numbers` numbers: zeros."""
+    """A policy without sensors, as a policy of a task whose robots send messages of `numbers`
+    numbers: zeros.
+    """
 
     policy: Policy
     numbers: int
@@ -66,11 +79,14 @@ class Silent(Composed):
     def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """Returns the actions; see `Policy`."""
         action, memory = self.policy.act(obs, memory, key)
-        return jnp.concatenate([action, jnp.zeros((*action.shape[:-1], self.numbers))], axis=-1), memory
+        return jnp.concatenate(
+            [action, jnp.zeros((*action.shape[:-1], self.numbers))], axis=-1
+        ), memory
 
 
 def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
-    """Returns a trained policy as it acts in a task: itself, or of several skills with its own one, or silent.
+    """Returns a trained policy as it acts in a task: itself, or of several skills with its own one,
+    or silent.
 
     Raises:
         InputError: if the policy does not fit the task.
@@ -82,17 +98,27 @@ def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
         return Silent(translate(policy, view, name), numbers)
     if needs.control == "command" == env.control and len(env.controller.skill.parts) > 1:
         gait = needs.gait and env.params.gait  # a skill may have no gaits
-        params = dataclasses.replace(env.params, skill=needs.skill, gait=gait, command_ranges=needs.command_ranges)
-        own, here = params.commander, env.params.commander
+        params = dataclasses.replace(
+            env.params, skill=needs.skill, gait=gait, command_ranges=needs.command_ranges
+        )
+        own = params.commander
+        here = env.params.commander
         if here.admits(own):
             if beyond := own.skill.untrained_commands(params.action_ranges()):
-                raise InputError(f"policy: {name} commands beyond what its skill is trained for: {', '.join(beyond)}")
+                raise InputError(
+                    f"policy: {name} commands beyond what its skill is trained for: "
+                    f"{', '.join(beyond)}"
+                )
             controller = dataclasses.replace(env.controller, commands=own.commands)
-            check_policy(policy, _changed(env, params=params, controller=controller), name)  # as it was trained
+            # as it was trained
+            check_policy(policy, _changed(env, params=params, controller=controller), name)
             layout = {"policy": env.observation_layout, **env.groups}[needs.group]
             sensed = layout.slice("action") if needs.senses and "action" in layout.names else None
             if sensed is not None and sensed.stop - sensed.start != env.controller.action_size:
-                raise InputError(f"policy: {name} remembers actions or sends messages; it meets its own skill only")
+                raise InputError(
+                    f"policy: {name} remembers actions or sends messages; it meets its own skill "
+                    "only"
+                )
             return Translated(policy, own, here, sensed)
     check_policy(policy, env, name)
     return policy
@@ -107,7 +133,8 @@ def _changed(env: QuadrupedEnv, **attributes: Any) -> QuadrupedEnv:
 
 
 def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns the skills and command ranges that let policies of different skills meet, each acting with its own.
+    """Returns the skills and command ranges that let policies of different skills meet, each acting
+    with its own.
 
     Empty if all have the same skill. Policies are given by their `Needs.by_name()`.
     """
@@ -119,4 +146,7 @@ def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     ranges = [needs["command_ranges"] for needs in every]
     common = [name for name in ranges[0] if all(name in each for each in ranges)]
     limits = {name: list(zip(*(each[name] for each in ranges), strict=True)) for name in common}
-    return {"skill": tuple(names), "command_ranges": {x: (min(low), max(high)) for x, (low, high) in limits.items()}}
+    return {
+        "skill": tuple(names),
+        "command_ranges": {x: (min(low), max(high)) for x, (low, high) in limits.items()},
+    }

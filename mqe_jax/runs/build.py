@@ -10,7 +10,16 @@ import jax
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, differences, fail, merge, override
+from mqe_jax.core.settings import (
+    Parameters,
+    PathText,
+    check,
+    check_arguments,
+    differences,
+    fail,
+    merge,
+    override,
+)
 from mqe_jax.core.types import Cast
 from mqe_jax.core.types import VectorEnv as AnyVectorEnv
 from mqe_jax.envs import ALIASES, SCRIPTED, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
@@ -37,7 +46,8 @@ from mqe_jax.train.start import initial_key, policy_to_start
 TaskLike = str | QuadrupedEnv | AnyVectorEnv
 """A task's id, its environment, or a batch of environments."""
 Config = str | Path | TrainConfig | Mapping[str, Any] | None
-"""Settings of a training: a shipped name, a file, settings, or changes of the task's default ones."""
+"""Settings of a training: a shipped name, a file, settings, or changes of the task's default
+ones."""
 Player = str | Path | Policy | Act | None
 """A policy, its function `act` without recurrent state, or what `load_policy` accepts."""
 
@@ -51,7 +61,8 @@ def prepare(
     impl: str = "auto",
     seeds: Sequence[int] | None = None,
 ) -> tuple[list[TrainConfig], Cast]:
-    """Returns the settings of each seed and the environments of a training; arguments and errors as `mqe_jax.learn`.
+    """Returns the settings of each seed and the environments of a training; arguments and errors as
+    `mqe_jax.learn`.
 
     `seeds` are trained in one program; by default the one of the settings.
     """
@@ -70,8 +81,14 @@ def prepare(
             settings = for_task(settings, inner)
         settings = override(settings, {"num_envs": task.num_envs, "evaluation.every": None})
     else:
-        fail("task", task, "a task's id, an environment such as that of mqe_jax.make, or a batch of environments")
-    configs = [settings] if seeds is None else [override(settings, {"seed": seed}) for seed in seeds]
+        fail(
+            "task",
+            task,
+            "a task's id, an environment such as that of mqe_jax.make, or a batch of environments",
+        )
+    configs = (
+        [settings] if seeds is None else [override(settings, {"seed": seed}) for seed in seeds]
+    )
     if isinstance(task, str | QuadrupedEnv):
         return configs, environments(impl, settings, len(configs), task)
     return configs, Cast(task)
@@ -87,7 +104,8 @@ def make_learner(
     seeds: int = 1,
     stages: type[Stages] = Stages,
 ) -> Learner:
-    """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure functions, not compiled.
+    """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure
+    functions, not compiled.
 
     Example:
         ```python
@@ -102,13 +120,16 @@ def make_learner(
         env: task parameters.
         impl: physics engine.
         seeds: number of states under an outer `jax.vmap`, for which buffers are sized.
-        stages: the algorithm; a subclass has other advantages, another loss or another update (examples/happo.py).
+        stages: the algorithm; a subclass has other advantages, another loss or another update
+            (examples/happo.py).
 
     Raises:
         InputError: as `mqe_jax.learn`.
     """
     (settings, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
-    return learner.make_learner(cast.env, settings, league=cast.league, teacher=cast.teacher, stages=stages)
+    return learner.make_learner(
+        cast.env, settings, league=cast.league, teacher=cast.teacher, stages=stages
+    )
 
 
 def make_env(
@@ -119,45 +140,68 @@ def make_env(
     copies: int = 1,
     final: Sequence[str] = (),
 ) -> tuple[Any, VectorEnv]:
-    """Returns a task and its vectorised environment with automatic reset; `copies` and `final` as in `VectorEnv`.
+    """Returns a task and its vectorised environment with automatic reset; `copies` and `final` as
+    in `VectorEnv`.
 
-    The task is an id or an environment, of which only class and engine are used (`parameters_of` has the rest).
+    The task is an id or an environment, of which only class and engine are used (`parameters_of`
+    has the rest).
     """
     check("set", overrides, Parameters)
     device = platform()
     if impl == "warp" and device != "gpu":
-        raise InputError(f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax")
+        raise InputError(
+            f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax"
+        )
     if isinstance(task, QuadrupedEnv):
-        control, params = overrides.get("control", "command"), {k: v for k, v in overrides.items() if k != "control"}
-        env = type(task)(override(task.Params(), params), impl=task.impl, control=control, num_envs=num_envs * copies)
+        control = overrides.get("control", "command")
+        params = {k: v for k, v in overrides.items() if k != "control"}
+        env = type(task)(
+            override(task.Params(), params),
+            impl=task.impl,
+            control=control,
+            num_envs=num_envs * copies,
+        )
     else:
         env = make(task, impl=impl, num_envs=num_envs * copies, **overrides)
     return env, VectorEnv(env, num_envs, copies, final=final)
 
 
 def parameters_of(task: str | QuadrupedEnv) -> dict[str, Any]:
-    """Returns the parameters, with the control mode, that differ from the task's defaults; empty for an id."""
+    """Returns the parameters, with the control mode, that differ from the task's defaults; empty
+    for an id.
+    """
     if not isinstance(task, QuadrupedEnv):
         return {}
     control = {} if task.control == "command" else {"control": task.control}
     return {**control, **differences(task.params, task.Params())}
 
 
-def environments(impl: str, config: TrainConfig, seeds: int, task: str | QuadrupedEnv | None = None) -> Cast:
+def environments(
+    impl: str, config: TrainConfig, seeds: int, task: str | QuadrupedEnv | None = None
+) -> Cast:
     """Returns the environments of seeds trained together, and who else plays in them.
 
     The task is that of the settings, or `task` as in `make_env`.
 
-    In a match the policy is team 0 against `opponents`. Without opponents, both teams of each of `num_envs` / 2 matches
-    are environments of the policy. It is then evaluated against the scripted policy, or an idle team if that does not
-    fit.
-    InputError for a task, an opponent or a demonstrator that is not allowed.
+    In a match the policy is team 0 against `opponents`. Without opponents, both teams of each of
+    `num_envs` / 2 matches are environments of the policy. It is then evaluated against the scripted
+    policy, or an idle team if that does not fit. InputError for a task, an opponent or a
+    demonstrator that is not allowed.
     """
-    task, episodes, opponents = task or config.task or "", config.evaluation.episodes, config.opponents
-    final = ["groups" if name == "obs" and config.group != "policy" else name for name in config.network.critic_reads]
+    task = task or config.task or ""
+    episodes = config.evaluation.episodes
+    opponents = config.opponents
+    final = [
+        "groups" if name == "obs" and config.group != "policy" else name
+        for name in config.network.critic_reads
+    ]
     both, started = make_env(task, impl, config.training_env, config.num_envs, seeds, final)
     _check_teams(both, config)
-    others = [load_as("opponent", name, both) for name in Roster(opponents).fixed] if len(both.teams) > 1 else []
+    others = (
+        [load_as("opponent", name, both) for name in Roster(opponents).fixed]
+        if len(both.teams) > 1
+        else []
+    )
     mates = [load_as("mate", name, both) for name in config.mates]
     shown = config.imitation.teacher
     teacher = None if shown is None else load_as("imitation.teacher", shown, both)
@@ -166,7 +210,11 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
 
     def batch(num_envs: int) -> Any:
         if demonstrator is None:
-            made = started if num_envs == config.num_envs else VectorEnv(both, num_envs, seeds, final=final)
+            made = (
+                started
+                if num_envs == config.num_envs
+                else VectorEnv(both, num_envs, seeds, final=final)
+            )
         else:
             policy = load_as("curriculum.demonstrator", demonstrator, both)
             everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
@@ -179,12 +227,17 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
         _, eval_env = make_env(task, impl, config.env, episodes, 2 * seeds)
         eval_env = eval_env.with_groups(groups)
     if config.train_env:
-        _check_alike(both, make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env, config)
+        _check_alike(
+            both,
+            make_env(task, impl, config.env, 1)[0] if eval_env is None else eval_env.env,
+            config,
+        )
     league = None
     if len(both.teams) < 2:
         env = batch(config.num_envs)
         if mates:
-            env, eval_env = Mates(env, mates), eval_env and Mates(eval_env, mates)
+            env = Mates(env, mates)
+            eval_env = eval_env and Mates(eval_env, mates)
     elif opponents:
         matches = batch(config.num_envs)
         league = League(BothSides(matches) if config.both_sides else matches, opponents, config)
@@ -194,7 +247,11 @@ def environments(impl: str, config: TrainConfig, seeds: int, task: str | Quadrup
     if len(both.teams) > 1 and eval_env is not None:
         fixed = Roster(opponents).fixed or reference_opponents(eval_env.env)[:1]
         if episodes % len(fixed):
-            fail("evaluation.episodes", episodes, f"a multiple of the number of opponents in evaluations, {len(fixed)}")
+            fail(
+                "evaluation.episodes",
+                episodes,
+                f"a multiple of the number of opponents in evaluations, {len(fixed)}",
+            )
         eval_env = versus(BothSides(eval_env) if config.both_sides else eval_env, fixed)
     return Cast(env, eval_env, league, teacher)
 
@@ -213,14 +270,26 @@ def _check_alike(training: QuadrupedEnv, env: QuadrupedEnv, config: TrainConfig)
     """Raises an InputError if a policy trained in a task could not act in its evaluation."""
     differing = needs_of(training, config).mismatches(needs_of(env, config))
     for name, (value, evaluated) in differing.items():
-        fail(f"train_env.{name}", value, f"that of env, {evaluated!r}, in which the policy is evaluated")
+        fail(
+            f"train_env.{name}",
+            value,
+            f"that of env, {evaluated!r}, in which the policy is evaluated",
+        )
 
 
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
     if len(env.teams) < 2 and config.opponents:
-        fail("opponents", list(config.opponents), f"empty: {env.name} is not a match; it has one team")
+        fail(
+            "opponents",
+            list(config.opponents),
+            f"empty: {env.name} is not a match; it has one team",
+        )
     if len(env.teams) > 1 and config.mates:
-        fail("mates", list(config.mates), f"empty: {env.name} is a match, whose opponents are `opponents`")
+        fail(
+            "mates",
+            list(config.mates),
+            f"empty: {env.name} is a match, whose opponents are `opponents`",
+        )
     if config.both_sides and not config.opponents:
         fail("both_sides", True, "false without opponents")
     if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
@@ -228,19 +297,25 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
 
 
 def reference_opponents(env: QuadrupedEnv) -> list[str]:
-    """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated against that one."""
+    """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated
+    against that one.
+    """
     walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
     return [*(["scripted"] if env.name in SCRIPTED and walking else []), "idle", "random"]
 
 
 def platform() -> str:
-    """Returns the platform of JAX; raises an InputError if JAX_PLATFORMS selects an unavailable one."""
+    """Returns the platform of JAX; raises an InputError if JAX_PLATFORMS selects an unavailable
+    one.
+    """
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:
         requested = os.environ.get("JAX_PLATFORMS", "")
         reason = str(error) or "no such device"
-        raise InputError(f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu") from None
+        raise InputError(
+            f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu"
+        ) from None
 
 
 class Players(NamedTuple):
@@ -272,19 +347,25 @@ def players(
 
     With `sensors`, robots that have none get the sensors of the set `onboard`.
 
-    A run brings its own task, parameters and policy. Without a policy and parameters, a task has its shipped policy, on
-    both sides of a match. Otherwise it has its scripted one, or `forward`, or `random` if actions are not commands. A
-    task by its id has the parameters that trained policies need, such as their skill.
+    A run brings its own task, parameters and policy. Without a policy and parameters, a task has
+    its shipped policy, on both sides of a match. Otherwise it has its scripted one, or `forward`,
+    or `random` if actions are not commands. A task by its id has the parameters that trained
+    policies need, such as their skill.
     """
-    made, name, params = task, "", dict(env or {})
+    made = task
+    name = ""
+    params = dict(env or {})
     if isinstance(made, QuadrupedEnv):
-        name, params = made.name, merge(parameters_of(made), params)
+        name = made.name
+        params = merge(parameters_of(made), params)
     else:
         given = str(check("task", made, PathText))
         made = name = ALIASES.get(given, given)
         if name not in (*TASKS, *zoo.names()) and (os.sep in name or Path(name).exists()):
             config = run_config(name)
-            made, params, policy = config.task or "", merge(config.env, params), policy or name
+            made = config.task or ""
+            params = merge(config.env, params)
+            policy = policy or name
     shipped = name in zoo.names() and not {*params} - {"senses"} and policy is None
     walking = "scripted" if name in SCRIPTED else "forward"
     default = walking if params.get("control", "command") == "command" else "random"
@@ -298,7 +379,8 @@ def players(
     match = len(task_env.teams) > 1
     other, against = (own, chosen) if shipped and match else (None, "idle")
     if opponent is not None:
-        other, against = load_as("opponent", opponent, task_env, deterministic=deterministic), opponent
+        other = load_as("opponent", opponent, task_env, deterministic=deterministic)
+        against = opponent
     about: dict[str, Any] = {"policy": str(chosen)}
     if (mean := getattr(getattr(own, "policy", own), "deterministic", None)) is not None:
         about["actions"] = "mean" if mean else "sampled"
@@ -310,7 +392,9 @@ def players(
 
 
 def run_config(target: str) -> TrainConfig:
-    """Returns the settings of the policy in a run folder or a policy file; InputError if it is missing."""
+    """Returns the settings of the policy in a run folder or a policy file; InputError if it is
+    missing.
+    """
     if not target.endswith(".safetensors") and not (Path(target) / POLICY_FILE).is_file():
         runs = sorted(str(path.parent) for path in Path(target).glob(f"*/{POLICY_FILE}"))
         hint = f"; did you mean {runs[0]}?" if runs else ""
@@ -319,28 +403,42 @@ def run_config(target: str) -> TrainConfig:
     return load_policy(target).config
 
 
-def settings_of(task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Returns the settings that `config` of `mqe_jax.learn` stands for, without the task and its parameters."""
+def settings_of(
+    task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any] | None = None
+) -> TrainConfig:
+    """Returns the settings that `config` of `mqe_jax.learn` stands for, without the task and its
+    parameters.
+    """
     if isinstance(config, TrainConfig):
         return config
     changes = dict(config) if isinstance(config, Mapping) else {"config": config}
-    source, algorithm = changes.pop("config", None), changes.pop("algorithm", None)
+    source = changes.pop("config", None)
+    algorithm = changes.pop("algorithm", None)
     if not isinstance(source, str | Path | None) or not isinstance(algorithm, str | None):
         fail("config", config, "a shipped name, a file, a TrainConfig, or a mapping of settings")
-    name, given = task.name if isinstance(task, QuadrupedEnv) else task, merge(parameters_of(task), env or {})
-    return override(base_config(name, None if source is None else str(source), algorithm, given), changes)
+    name = task.name if isinstance(task, QuadrupedEnv) else task
+    given = merge(parameters_of(task), env or {})
+    return override(
+        base_config(name, None if source is None else str(source), algorithm, given), changes
+    )
 
 
-def for_task(config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None) -> TrainConfig:
-    """Returns the settings with a task and its parameters; prints a line if they are for another task.
+def for_task(
+    config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None
+) -> TrainConfig:
+    """Returns the settings with a task and its parameters; prints a line if they are for another
+    task.
 
-    A task by its id gets the parameters that the teacher and the policy to start from need, unless they are passed.
+    A task by its id gets the parameters that the teacher and the policy to start from need, unless
+    they are passed.
     """
     name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
     if config.task not in (None, name):
         echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
     given = merge(config.env, merge(parameters_of(task), env or {}))
     if isinstance(task, str):
-        sources = (source for source in (config.imitation.teacher, config.start) if source is not None)
+        sources = (
+            source for source in (config.imitation.teacher, config.start) if source is not None
+        )
         given = merge(parameters_for(name, *sources), given)
     return override(config, {"task": name, "env": given})

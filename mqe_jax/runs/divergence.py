@@ -41,11 +41,15 @@ def guard(batch: Any, folder: str | Path | None) -> Iterator[Any]:
         yield guarded
     finally:
         if files := guarded.written:
-            echo(f"mqe: recorded {len(files)} divergences; replay the first with: mqe replay {files[0]}")
+            echo(
+                f"mqe: recorded {len(files)} divergences; replay the first with: mqe replay "
+                f"{files[0]}"
+            )
 
 
 class Guard(Outer):
-    """A batch of environments that writes the last steps before a divergence to `FOLDER/diverged_0000.npz`, ...
+    """A batch of environments that writes the last steps before a divergence to
+    `FOLDER/diverged_0000.npz`, ...
 
     Every step sends the fields on which it depends to the host, which keeps the last `STEPS`.
     """
@@ -56,7 +60,8 @@ class Guard(Outer):
         super().__init__(inner)
         check_folder(folder, "dump_diverged")
         self.written = []
-        self._folder, self._steps = folder, deque[tuple[Any, np.ndarray]](maxlen=STEPS)
+        self._folder = folder
+        self._steps = deque[tuple[Any, np.ndarray]](maxlen=STEPS)
         self._limit = LIMIT
 
     def reset(self, key: jax.Array) -> Any:
@@ -67,24 +72,37 @@ class Guard(Outer):
         """Advances all environments by one step; see the wrapped batch."""
         after = shown = self.inner.step(state, action)
         if isinstance(after, TeamState):
-            state, action, after = state.match, after.action, after.match
+            state = state.match
+            action = after.action
+            after = after.match
         while isinstance(after, WrappedState):
-            state, action, after = state.inner, after.action, after.inner
+            state = state.inner
+            action = after.action
+            after = after.inner
         diverged = shown.metrics["diverged"]
         kind = jax.ShapeDtypeStruct(diverged.shape, diverged.dtype)
         before = content(state), action, after.metrics["diverged"]
         # Returns the metric, on which the program depends: it neither drops nor reorders the calls.
-        diverged = jax.pure_callback(self._see, kind, diverged, *before, vmap_method="broadcast_all")
+        diverged = jax.pure_callback(
+            self._see, kind, diverged, *before, vmap_method="broadcast_all"
+        )
         return dataclasses.replace(shown, metrics={**shown.metrics, "diverged": diverged})
 
     def share(self, parts: int) -> Self:
         """Raises an InputError: recordings of several processes are not supported."""
-        raise InputError(f"dump_diverged: not allowed in {parts} processes; start the same training in one")
+        raise InputError(
+            f"dump_diverged: not allowed in {parts} processes; start the same training in one"
+        )
 
     def _see(self, shown: Any, before: Any, action: Any, diverged: Any) -> np.ndarray:
-        """Stores a step of all environments, of all seeds, and writes a recording of each that diverged in it."""
+        """Stores a step of all environments, of all seeds, and writes a recording of each that
+        diverged in it.
+        """
         lead = np.shape(diverged)
-        join = lambda x: np.array(x).reshape(-1, *np.shape(x)[len(lead) :])  # noqa: E731
+
+        def join(x):
+            return np.array(x).reshape(-1, *np.shape(x)[len(lead) :])
+
         self._steps.append((jax.tree.map(join, before), join(action)))
         for index in np.flatnonzero(np.ravel(diverged))[: self._limit - len(self.written)]:
             parts = [jax.tree.map(lambda x, i=index: x[i], step) for step in self._steps]
@@ -101,5 +119,7 @@ class Guard(Outer):
 
     def _next_file(self) -> Path:
         taken = {file.name for file in self._folder.glob("diverged_*.npz")}
-        name = next(name for i in range(len(taken) + 1) if (name := f"diverged_{i:04d}.npz") not in taken)
+        name = next(
+            name for i in range(len(taken) + 1) if (name := f"diverged_{i:04d}.npz") not in taken
+        )
         return self._folder / name

@@ -47,14 +47,18 @@ class Run:
     metrics: dict[str, np.ndarray]
     """The columns of metrics.csv, one entry per update (U,)."""
     evaluations: list[dict[str, Any]]
-    """Evaluations during training: `env_steps`, `episodes`, and results under `sampled` and `deterministic` actions."""
+    """Evaluations during training: `env_steps`, `episodes`, and results under `sampled` and
+    `deterministic` actions."""
     absolute: dict[str, Any] | None = None
-    """The absolute metric: an evaluation of the best policy over more episodes; None before the end of a training."""
+    """The absolute metric: an evaluation of the best policy over more episodes; None before the end
+    of a training."""
 
     def __post_init__(self) -> None:
         check("policy", self.policy, TrainedPolicy)
         columns = check("metrics", self.metrics, Mapping[str, np.ndarray]).values()
-        if len({x.shape for x in columns}) > 1 or any(x.ndim != 1 or x.dtype.kind not in "fiu" for x in columns):
+        if len({x.shape for x in columns}) > 1 or any(
+            x.ndim != 1 or x.dtype.kind not in "fiu" for x in columns
+        ):
             fail("metrics", self.metrics, "columns of numbers, of one length")
         for name, kind in {"evaluations": list[Evaluation], "absolute": Evaluation | None}.items():
             check(name, check(name, getattr(self, name), pydantic.JsonValue), kind)
@@ -85,7 +89,8 @@ class Run:
         return plot_curves([self.metrics], self.policy.task)
 
     def save(self, folder: str | Path) -> None:
-        """Writes a run folder without a checkpoint, for `load_run`, `load_policy` and the command line.
+        """Writes a run folder without a checkpoint, for `load_run`, `load_policy` and the command
+        line.
 
         It cannot be resumed; a training can start from its policy (setting `start`).
 
@@ -102,7 +107,9 @@ class Run:
             log.write(dict(zip(self.metrics, map(float, values), strict=True)))
         if self.evaluations:
             ended = {} if self.absolute is None else {"ended_at": self.env_steps}
-            write_evaluations(path, {"evaluations": self.evaluations, "absolute": self.absolute, **ended})
+            write_evaluations(
+                path, {"evaluations": self.evaluations, "absolute": self.absolute, **ended}
+            )
 
 
 @check_arguments(folder=PathText)
@@ -118,13 +125,16 @@ def load_run(folder: str | Path) -> Run:
     Raises:
         InputError: naming the file that is missing or damaged.
     """
-    path, policy = Path(folder), read_policy(folder)
+    path = Path(folder)
+    policy = read_policy(folder)
     metrics = read_metrics(path / CSV_FILE) if (path / CSV_FILE).is_file() else {}
     evaluations = read_evaluations(path)
     return Run(policy, metrics, evaluations["evaluations"], evaluations["absolute"])
 
 
-@check_arguments(seed=Seed | None, run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
+@check_arguments(
+    seed=Seed | None, run_dir=PathText | None, resume=bool, dump_diverged=PathText | None
+)
 def learn(
     task: TaskLike,
     config: Config = None,
@@ -139,8 +149,8 @@ def learn(
 ) -> Run:
     """Trains a policy on one device, as `mqe train` with the same settings does.
 
-    An interrupt (Ctrl-C, or a notebook's stop button) ends the training and returns the run so far. `mqe launch` trains
-    on several devices.
+    An interrupt (Ctrl-C, or a notebook's stop button) ends the training and returns the run so far.
+    `mqe launch` trains on several devices.
 
     Example:
         ```python
@@ -150,25 +160,34 @@ def learn(
 
     Args:
         task: id, environment, or a batch of environments, which is trained on as it is.
-        config: a shipped name, a file, settings, or a mapping of changes of the task's default settings. In a mapping,
-            `config` and `algorithm` name other settings to change. Default: those of `mqe train`.
+        config: a shipped name, a file, settings, or a mapping of changes of the task's default
+            settings. In a mapping, `config` and `algorithm` name other settings to change. Default:
+            those of `mqe train`.
         env: task parameters.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         seed: random seed. Default: that of the settings, 0 unless they name one.
         run_dir: run folder. Default: nothing is written.
-        resume: whether to continue the run in the folder from its newest checkpoint, if there is one.
-        dump_diverged: folder for recordings of environments whose physics diverges (see `mqe replay`).
-        stages: the algorithm; a subclass has other advantages, another loss or another update (examples/happo.py).
+        resume: whether to continue the run in the folder from its newest checkpoint, if there is
+            one.
+        dump_diverged: folder for recordings of environments whose physics diverges (see `mqe
+            replay`).
+        stages: the algorithm; a subclass has other advantages, another loss or another update
+            (examples/happo.py).
 
     Raises:
-        InputError: for a task, settings or parameters that are not allowed, or a run folder that cannot be used.
+        InputError: for a task, settings or parameters that are not allowed, or a run folder that
+            cannot be used.
         NonFiniteError: after the first update with a loss or weight that is not finite.
     """
     configs, cast = prepare(task, config, env, impl=impl, seeds=None if seed is None else [seed])
-    return _train(configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged, stages)[0]
+    return _train(
+        configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged, stages
+    )[0]
 
 
-@check_arguments(seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None)
+@check_arguments(
+    seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None
+)
 def learn_seeds(
     task: TaskLike,
     config: Config = None,
@@ -181,7 +200,8 @@ def learn_seeds(
     dump_diverged: str | Path | None = None,
     stages: type[Stages] = Stages,
 ) -> list[Run]:
-    """Trains several seeds in one program, each as `learn` would up to rounding; arguments and errors as there.
+    """Trains several seeds in one program, each as `learn` would up to rounding; arguments and
+    errors as there.
 
     Example:
         ```python
@@ -194,7 +214,11 @@ def learn_seeds(
         seeds: random seeds.
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
-    numbers = check("seeds", seeds, Annotated[tuple[Seed, ...], MinLen(1), MaxLen(int(limits.bounds(SeedCount)[1]))])
+    numbers = check(
+        "seeds",
+        seeds,
+        Annotated[tuple[Seed, ...], MinLen(1), MaxLen(int(limits.bounds(SeedCount)[1]))],
+    )
     configs, cast = prepare(task, config, env, impl=impl, seeds=numbers)
     folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
     return _train(configs, cast, folders, resume, dump_diverged, stages)
@@ -212,7 +236,11 @@ def _train(
     with (
         guard(cast.env, dump_diverged) as env,
         open_training(
-            configs=configs, run_dirs=folders, resume=resume, stages=stages, **cast._replace(env=env)._asdict()
+            configs=configs,
+            run_dirs=folders,
+            resume=resume,
+            stages=stages,
+            **cast._replace(env=env)._asdict(),
         ) as training,
     ):
         if resume and not training.resumed:
@@ -232,6 +260,10 @@ def _train(
 def _runs(training: Training) -> Iterator[Run]:
     """Yields the runs of the seeds of a training that writes nothing."""
     for i, (policy, rows) in enumerate(zip(training.policies(), training.rows, strict=True)):
-        metrics = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+        metrics = {
+            name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())
+        }
         log = training.evaluations[i] if training.evaluations else None
-        yield Run(policy, metrics, log.evaluations, log.absolute) if log else Run(policy, metrics, [])
+        yield (
+            Run(policy, metrics, log.evaluations, log.absolute) if log else Run(policy, metrics, [])
+        )

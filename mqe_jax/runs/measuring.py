@@ -1,4 +1,6 @@
-"""Parts of a sweep that measure policies: evaluations, tournaments and other calls that return a result."""
+"""Parts of a sweep that measure policies: evaluations, tournaments and other calls that return a
+result.
+"""
 
 import dataclasses
 import glob
@@ -26,8 +28,10 @@ MEASURES = {
     "double_oracle": "mqe_jax.runs.exploiting:double_oracle",
     "pool_of_mates": "mqe_jax.runs.pooling:pool_of_mates",
 }
-"""Functions by the name in `measure`. Those with an argument `folder` get the measurement's folder."""
-RESULT, RATES = "result.json", "rates.csv"
+"""Functions by the name in `measure`. Those with an argument `folder` get the measurement's
+folder."""
+RESULT = "result.json"
+RATES = "rates.csv"
 
 
 class Item(NamedTuple):
@@ -50,16 +54,25 @@ def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
         for variant, changes in part.variants.items():
             place = folder / "results" / task / variant
             asked = for_task({**usual, **changes}, task_id(task))
-            arguments = {"impl": impl, **{name: _with_files(name, value) for name, value in asked.items()}}
+            arguments = {
+                "impl": impl,
+                **{name: _with_files(name, value) for name, value in asked.items()},
+            }
             arguments |= {"folder": str(place / "runs")} if "folder" in known else {}
             for name in arguments.keys() - known.keys():
-                fail(f"arguments.{name}", arguments[name], f"an argument of {part.measure}: {', '.join(known)}")
+                fail(
+                    f"arguments.{name}",
+                    arguments[name],
+                    f"an argument of {part.measure}: {', '.join(known)}",
+                )
             items.append(Item(task, variant, arguments, place / RESULT))
     return items
 
 
 def _with_files(name: str, value: Any) -> Any:
-    """Returns an argument, of a list with the files that match in place of each pattern; InputError if none does."""
+    """Returns an argument, of a list with the files that match in place of each pattern; InputError
+    if none does.
+    """
     if not isinstance(value, list):
         return value
     found: list[Any] = []
@@ -72,9 +85,15 @@ def _with_files(name: str, value: Any) -> Any:
 
 
 def measure(
-    part: Measurement, folder: Path, impl: str = "auto", cells: Sequence[str] = (), *, dry_run: bool = False
+    part: Measurement,
+    folder: Path,
+    impl: str = "auto",
+    cells: Sequence[str] = (),
+    *,
+    dry_run: bool = False,
 ) -> dict[str, Any]:
-    """Makes the measurements of a part that have no results yet, and tabulates the rates; see `sweep`.
+    """Makes the measurements of a part that have no results yet, and tabulates the rates; see
+    `sweep`.
 
     With `cells`, it makes only those whose names, TASK/VARIANT, match a pattern.
     """
@@ -86,7 +105,9 @@ def measure(
             continue
         try:
             with lock(item.file.parent):
-                result = pkgutil.resolve_name(MEASURES[part.measure])(item.task, **_for_robot(item.arguments))
+                result = pkgutil.resolve_name(MEASURES[part.measure])(
+                    item.task, **_for_robot(item.arguments)
+                )
                 plain = result if isinstance(result, dict) else result.to_dict()
                 content = {"measure": part.measure, "arguments": item.arguments, "result": plain}
                 write_atomically(item.file, json.dumps(content, indent=1).encode())
@@ -98,14 +119,18 @@ def measure(
     if rows:
         write_atomically(folder / RATES, table(rows).encode())
     left = [
-        {"task": x.task, "variant": x.variant, "steps_left": 0, "seconds": None} for x in chosen if not x.file.is_file()
+        {"task": x.task, "variant": x.variant, "steps_left": 0, "seconds": None}
+        for x in chosen
+        if not x.file.is_file()
     ]
     total = {"steps_left": 0, "seconds": None}
     return {"left": {"jobs": left, **total}, "report": [str(folder / RATES)] if rows else []}
 
 
 def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Returns arguments whose policies act on the robot that `env` names, whichever they were trained on."""
+    """Returns arguments whose policies act on the robot that `env` names, whichever they were
+    trained on.
+    """
     robot = arguments.get("env", {}).get("robot")
     if robot is None:
         return arguments
@@ -116,7 +141,9 @@ def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
         except InputError:  # scripted and other policies fit every robot
             continue
         if isinstance(policy, TrainedPolicy):
-            changed[name] = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, robot=robot))
+            changed[name] = dataclasses.replace(
+                policy, needs=dataclasses.replace(policy.needs, robot=robot)
+            )
     return changed
 
 

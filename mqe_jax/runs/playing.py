@@ -12,7 +12,16 @@ from typing import Annotated, Any, Literal
 import jax
 from annotated_types import MinLen
 
-from mqe_jax.core.limits import Candidates, ClipLength, Environments, Episodes, FrameRate, ImageWidth, Seed, Speed
+from mqe_jax.core.limits import (
+    Candidates,
+    ClipLength,
+    Environments,
+    Episodes,
+    FrameRate,
+    ImageWidth,
+    Seed,
+    Speed,
+)
 from mqe_jax.core.settings import PathText, check, check_arguments, fail, merge
 from mqe_jax.core.types import AnySingle
 from mqe_jax.envs import QuadrupedEnv
@@ -31,7 +40,9 @@ from mqe_jax.train.evaluate import Result, evaluate_batch, pool
 Camera = Literal["follow", "near", "scene", "side"]
 
 
-@check_arguments(episodes=Episodes, sides=Literal["both", "first"], num_envs=Environments, seed=Seed)
+@check_arguments(
+    episodes=Episodes, sides=Literal["both", "first"], num_envs=Environments, seed=Seed
+)
 def evaluate(
     task: str | Path | QuadrupedEnv,
     policy: Player = None,
@@ -55,47 +66,69 @@ def evaluate(
         ```
 
     Args:
-        task: id, environment, or the run folder or policy file of a trained policy, which brings its task.
-        policy: a policy, or what `load_policy` accepts. Default: the run's policy, else the shipped, scripted or
-            `forward` one (`random` if actions are not commands). A task by its id gets the skill, gait, command ranges,
-            control mode and robot that a trained policy needs.
-        opponent: policy of the other team of a match, or a population (`mqe_jax.policies.zoo.population`), whose
-            members play `episodes` each. Default: the shipped policy if `policy` is the shipped one by default, else
-            `idle`.
+        task: id, environment, or the run folder or policy file of a trained policy, which brings
+            its task.
+        policy: a policy, or what `load_policy` accepts. Default: the run's policy, else the
+            shipped, scripted or `forward` one (`random` if actions are not commands). A task by its
+            id gets the skill, gait, command ranges, control mode and robot that a trained policy
+            needs.
+        opponent: policy of the other team of a match, or a population
+            (`mqe_jax.policies.zoo.population`), whose members play `episodes` each. Default: the
+            shipped policy if `policy` is the shipped one by default, else `idle`.
         env: task parameters.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         episodes: number of episodes.
-        sides: of a match, whether the policy is the task's team 0 in all episodes (`first`), or team 1 in half of them
-            (`both`).
+        sides: of a match, whether the policy is the task's team 0 in all episodes (`first`), or
+            team 1 in half of them (`both`).
         num_envs: environments in parallel, at most.
-        deterministic: whether trained policies act with their mean actions. A shipped one also does if its card says
-            so.
+        deterministic: whether trained policies act with their mean actions. A shipped one also does
+            if its card says so.
         seed: random seed.
-        dump_diverged: folder for recordings of environments whose physics diverges (see `mqe replay`).
+        dump_diverged: folder for recordings of environments whose physics diverges (see `mqe
+            replay`).
 
     Raises:
         InputError: for a task, parameters or a policy that is not allowed.
     """
     if isinstance(opponent, str) and population.is_named(opponent):
-        options = {"env": env, "impl": impl, "episodes": episodes, "sides": sides, "num_envs": num_envs}
+        options = {
+            "env": env,
+            "impl": impl,
+            "episodes": episodes,
+            "sides": sides,
+            "num_envs": num_envs,
+        }
         options |= {"deterministic": deterministic, "seed": seed, "dump_diverged": dump_diverged}
         match = build.players(task, policy, env=env, impl=impl).env.name
-        every = {name: evaluate(task, policy, name, **options) for name in population.members(opponent, match)}
+        every = {
+            name: evaluate(task, policy, name, **options)
+            for name in population.members(opponent, match)
+        }
         return pool(every, opponent)
     num_envs = min(num_envs, episodes)
-    playing = build.players(task, policy, opponent, env=env, impl=impl, num_envs=num_envs, deterministic=deterministic)
-    batch, about = playing.batch, dict(playing.about)
+    playing = build.players(
+        task, policy, opponent, env=env, impl=impl, num_envs=num_envs, deterministic=deterministic
+    )
+    batch = playing.batch
+    about = dict(playing.about)
     if len(playing.env.teams) > 1 and sides == "both":
         for name, count in {"episodes": episodes, "num_envs": num_envs}.items():
             if count % 2:
-                fail(name, count, "even: the policy plays half of the episodes on each side (sides: both)")
-        batch, about["sides"] = BothSides(batch), sides
+                fail(
+                    name,
+                    count,
+                    "even: the policy plays half of the episodes on each side (sides: both)",
+                )
+        batch = BothSides(batch)
+        about["sides"] = sides
     with guard(batch, dump_diverged) as guarded:
         result = evaluate_batch(guarded, playing.policy, episodes, jax.random.PRNGKey(seed))
     return dataclasses.replace(result, about={**about, "seed": seed}, labels=playing.env.labels)
 
 
-@check_arguments(policies=Annotated[Sequence[str], MinLen(1)], episodes=Candidates, deterministic=bool, seed=Seed)
+@check_arguments(
+    policies=Annotated[Sequence[str], MinLen(1)], episodes=Candidates, deterministic=bool, seed=Seed
+)
 def tournament(
     task: str | QuadrupedEnv,
     policies: Sequence[str],
@@ -106,7 +139,8 @@ def tournament(
     deterministic: bool = False,
     seed: int = 0,
 ) -> Standings | CrossPlay:
-    """Plays policies of a match against each other and rates them, or mixes teams of them, as `mqe tournament`.
+    """Plays policies of a match against each other and rates them, or mixes teams of them, as `mqe
+    tournament`.
 
     Example:
         ```python
@@ -116,9 +150,9 @@ def tournament(
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `load_policy` accepts, and populations. In a match, scripted, idle and random play too; ratings
-            are relative to scripted, else to idle. In a task of one team, agent 0 follows each policy with each one as
-            its mates; scripted and idle play too.
+        policies: what `load_policy` accepts, and populations. In a match, scripted, idle and random
+            play too; ratings are relative to scripted, else to idle. In a task of one team, agent 0
+            follows each policy with each one as its mates; scripted and idle play too.
         episodes: episodes of each pair on each side, or of each team.
 
     Returns:
@@ -132,8 +166,10 @@ def tournament(
     needed = parameters_for(task, *policies) if isinstance(task, str) else parameters_of(task)
     params = merge(needed, env or {})
     single, _ = build.make_env(task, impl, params, 1)
-    references, key = build.reference_opponents(single), jax.random.PRNGKey(seed)
-    match, own = len(single.teams) > 1, tuple(dict.fromkeys(policies))
+    references = build.reference_opponents(single)
+    key = jax.random.PRNGKey(seed)
+    match = len(single.teams) > 1
+    own = tuple(dict.fromkeys(policies))
     if not match:
         references = [name for name in references if name not in ("random", *own)]
     names = tuple(dict.fromkeys([*own, *references]))
@@ -141,13 +177,22 @@ def tournament(
     _, batch = build.make_env(task, impl, params, envs, copies)
     teams = {name: load_policy(name, batch.env, deterministic=deterministic) for name in names}
     if not match:
-        return CrossPlay(single.name, own, tuple(references), episodes, cross_play(batch, teams, episodes, key))
+        return CrossPlay(
+            single.name, own, tuple(references), episodes, cross_play(batch, teams, episodes, key)
+        )
     results = league.round_robin(batch, teams, key)
     return Standings(single.name, names, results, league.rate(results, names.index(references[0])))
 
 
 @check_arguments(
-    "width", "fps", "speed", "sensors", episodes=Candidates, seconds=ClipLength, seed=Seed, view=Camera | None
+    "width",
+    "fps",
+    "speed",
+    "sensors",
+    episodes=Candidates,
+    seconds=ClipLength,
+    seed=Seed,
+    view=Camera | None,
 )
 def render(
     task: str | Path | QuadrupedEnv,
@@ -178,12 +223,15 @@ def render(
         task: as `evaluate`, and so are policy, opponent, env, impl, deterministic and seed.
         episodes: number of episodes. The clip shows the best one, by success, then reward.
         seconds: length of the clip, s, at most.
-        view: camera: `follow` (tracks robots and objects), `near` (fixed, frames their trajectories), `scene` (fixed,
-            whole scene), `side` (tracks the first robot). Default: `follow`, for an image `scene`.
-        width: image width, pixels, at 16:9. Default: 960 for .mp4, 480 for .webp, .gif and notebooks, 1280 for .png.
+        view: camera: `follow` (tracks robots and objects), `near` (fixed, frames their
+            trajectories), `scene` (fixed, whole scene), `side` (tracks the first robot). Default:
+            `follow`, for an image `scene`.
+        width: image width, pixels, at 16:9. Default: 960 for .mp4, 480 for .webp, .gif and
+            notebooks, 1280 for .png.
         fps: frames per second. Default: 25 for .mp4, else 12.5.
         speed: playback speed; 0.5 is slow motion.
-        sensors: whether to draw what the sensors of `senses` measure, else those of the set `onboard`.
+        sensors: whether to draw what the sensors of `senses` measure, else those of the set
+            `onboard`.
 
     Raises:
         InputError: as `evaluate`.
@@ -195,7 +243,9 @@ def render(
     options: Any = {"env": env, "impl": impl, "num_envs": episodes, "deterministic": deterministic}
     playing = build.players(task, policy, opponent, **options, sensors=sensors)
     key = jax.random.PRNGKey(seed)
-    recorded = record_episodes(playing.env, playing.policy, key, episodes=episodes, seconds=seconds, sensors=sensors)
+    recorded = record_episodes(
+        playing.env, playing.policy, key, episodes=episodes, seconds=seconds, sensors=sensors
+    )
     size = None if width is None else (width, round(width * 9 / 32) * 2)
     look = {"view": view, "size": size, "fps": fps, "speed": speed}
     return Clip(playing.env, recorded, {**playing.about, "seed": seed}, look)
@@ -225,7 +275,9 @@ class Clip:
         from mqe_jax.viz.recording import Episode
 
         check("env", self.env, AnySingle)
-        if not check("episodes", self.episodes, list[Any]) or not all(isinstance(x, Episode) for x in self.episodes):
+        if not check("episodes", self.episodes, list[Any]) or not all(
+            isinstance(x, Episode) for x in self.episodes
+        ):
             fail("episodes", self.episodes, "a list of episodes")
         check("about", self.about, dict[str, Any])
         check("look", self.look, dict[Literal["view", "size", "fps", "speed"], Any])
@@ -240,11 +292,15 @@ class Clip:
 
     def __repr__(self) -> str:
         episode = self.episodes[self.best]
-        return f"<Clip of {self.env.name}: {(len(episode) - 1) * episode.dt:.1f} s, success {episode.success:g}>"
+        return (
+            f"<Clip of {self.env.name}: {(len(episode) - 1) * episode.dt:.1f} s, success "
+            f"{episode.success:g}>"
+        )
 
     @check_arguments(file=PathText)
     def save(self, file: str | Path, *, at: float | None = None) -> str:
-        """Writes a .mp4, .webp, .gif or .png file; returns the renderer (`egl`, `osmesa` or `matplotlib`).
+        """Writes a .mp4, .webp, .gif or .png file; returns the renderer (`egl`, `osmesa` or
+        `matplotlib`).
 
         Args:
             file: to write.
@@ -258,7 +314,9 @@ class Clip:
         return render_episode(self.env, self.episodes[self.best], Path(file), at=at, **self.look)
 
     def _repr_html_(self) -> str:
-        """Returns a video (H.264 with imageio-ffmpeg, of the extra `render`), else a GIF, within the page."""
+        """Returns a video (H.264 with imageio-ffmpeg, of the extra `render`), else a GIF, within
+        the page.
+        """
         kind = "mp4" if find_spec("imageio_ffmpeg") is not None else "gif"
         small = {**self.look, "size": self.look.get("size") or (480, 270)}
         with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,6 @@
-"""How a pool of mates in training helps a team with mates that it does not know (`pool_of_mates`)."""
+"""How a pool of mates in training helps a team with mates that it does not know
+(`pool_of_mates`).
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +17,11 @@ from mqe_jax.study.sweep import Sweep
 
 
 @check_arguments(
-    task=str, start=PathText, mates=Annotated[Sequence[str], MinLen(1)], others=Sequence[str], episodes=Candidates
+    task=str,
+    start=PathText,
+    mates=Annotated[Sequence[str], MinLen(1)],
+    others=Sequence[str],
+    episodes=Candidates,
 )
 def pool_of_mates(
     task: str,
@@ -29,7 +35,8 @@ def pool_of_mates(
     total_steps: int = 15_000_000,
     episodes: int = 64,
 ) -> dict[str, Any]:
-    """Continues the training of a team with a pool of mates, and mixes the old and the new team with other policies.
+    """Continues the training of a team with a pool of mates, and mixes the old and the new team
+    with other policies.
 
     Call it again to resume.
 
@@ -45,13 +52,17 @@ def pool_of_mates(
         episodes: of each mixed team.
 
     Returns:
-        `start`, `mates`, and the `tournament` of the new team, the old team and the others, in this order.
+        `start`, `mates`, and the `tournament` of the new team, the old team and the others, in this
+        order.
 
     Raises:
-        InputError: for a task, a policy, settings or a folder that is not allowed, or if the training failed.
+        InputError: for a task, a policy, settings or a folder that is not allowed, or if the
+            training failed.
     """
     own = {**settings, "start": start, "mates": [*mates], "total_steps": total_steps}
-    plan = build(Sweep, {"tasks": [task_id(task)], "algorithms": ["default"], "seeds": [0], "settings": own})
+    plan = build(
+        Sweep, {"tasks": [task_id(task)], "algorithms": ["default"], "seeds": [0], "settings": own}
+    )
     (run,) = train_runs(plan, Path(folder), "pool.yaml", impl)
     mixed = tournament(task, [str(run), start, *others], impl=impl, episodes=episodes)
     return {"start": start, "mates": [*mates], **mixed.to_dict()}

@@ -16,23 +16,39 @@ CONFIG_FOLDER = Path(__file__).parents[1] / "configs"
 
 @functools.cache
 def _parts(file: str) -> dict[str, Any]:
-    """Returns the parts of a shipped file of settings: those `common` to all, and changes of them by name."""
+    """Returns the parts of a shipped file of settings: those `common` to all, and changes of them
+    by name.
+    """
     return load_yaml(CONFIG_FOLDER / f"{file}.yaml")
 
 
 def preset(algorithm: str) -> dict[str, Any]:
-    """Returns the settings that define an algorithm, for `override`; InputError for an unknown name."""
+    """Returns the settings that define an algorithm, for `override`; InputError for an unknown
+    name.
+    """
     algorithms = {name: changes for name, changes in _parts("paper").items() if name != "common"}
     if algorithm not in algorithms:
-        fail("algorithm", algorithm, f"one of {', '.join(algorithms)}{nearest(algorithm, algorithms)}")
+        fail(
+            "algorithm",
+            algorithm,
+            f"one of {', '.join(algorithms)}{nearest(algorithm, algorithms)}",
+        )
     return algorithms[algorithm]
 
 
 def named_config(name: str, task: str) -> TrainConfig:
-    """Returns the settings of a file, or of a shipped name; `league` and `sizes` have changes of some tasks."""
+    """Returns the settings of a file, or of a shipped name; `league` and `sizes` have changes of
+    some tasks.
+    """
     shipped = ["demo", "league", "sizes"]
-    shipped += [f"{file}/{part}" for file in ("paper", "tuned") for part in sorted(_parts(file)) if part != "common"]
-    path, allowed = Path(check("config", name, PathText)), f"a YAML file, or one of {', '.join(shipped)}"
+    shipped += [
+        f"{file}/{part}"
+        for file in ("paper", "tuned")
+        for part in sorted(_parts(file))
+        if part != "common"
+    ]
+    path = Path(check("config", name, PathText))
+    allowed = f"a YAML file, or one of {', '.join(shipped)}"
     if name == "demo":
         path = CONFIG_FOLDER / "demo.yaml"
     elif name == "sizes":
@@ -43,23 +59,30 @@ def named_config(name: str, task: str) -> TrainConfig:
         common = override(TrainConfig(), _parts(file)["common"])
         return override(common, _parts(file).get(part or task, {}))
     elif path.suffix not in (".yaml", ".yml") and path.parent == Path("."):
-        raise InputError(f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}")
+        raise InputError(
+            f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}"
+        )
     if not path.is_file():
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
     return load_config(path)
 
 
 def base_config(
-    task: str, name: str | None, algorithm: str | None = None, env: Mapping[str, Any] = FrozenMapping()
+    task: str,
+    name: str | None,
+    algorithm: str | None = None,
+    env: Mapping[str, Any] = FrozenMapping(),
 ) -> TrainConfig:
-    """Returns the settings of a file or a shipped name, changed by an algorithm and by task parameters.
+    """Returns the settings of a file or a shipped name, changed by an algorithm and by task
+    parameters.
 
-    The default is paper/ALGORITHM for an algorithm, else tuned/TASK if it exists, else league for a match and
-    paper/mappo for other tasks. If the parameters have sensors and the settings name no group of observations,
-    `onboard.yaml` changes the settings. Parameters also replace those of `train_env`. InputError for a file or an
-    algorithm that is not allowed.
+    The default is paper/ALGORITHM for an algorithm, else tuned/TASK if it exists, else league for a
+    match and paper/mappo for other tasks. If the parameters have sensors and the settings name no
+    group of observations, `onboard.yaml` changes the settings. Parameters also replace those of
+    `train_env`. InputError for a file or an algorithm that is not allowed.
     """
-    task, changes = ALIASES.get(task, task), {} if algorithm is None else preset(algorithm)
+    task = ALIASES.get(task, task)
+    changes = {} if algorithm is None else preset(algorithm)
     if name is None and algorithm is not None:
         name = f"paper/{algorithm}"
     elif name is None:
@@ -83,7 +106,13 @@ def _without(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, 
 
 def default_name(task: str) -> str:
     """Returns the name of the settings with which a task is trained by default."""
-    return f"tuned/{task}" if task in _parts("tuned") else "league" if _is_match(task) else "paper/mappo"
+    return (
+        f"tuned/{task}"
+        if task in _parts("tuned")
+        else "league"
+        if _is_match(task)
+        else "paper/mappo"
+    )
 
 
 def _is_match(task: str) -> bool:

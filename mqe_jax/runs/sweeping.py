@@ -24,7 +24,9 @@ from mqe_jax.study.sweep import Job, Measurement, Sweep, load_part
 from mqe_jax.train.config import TrainConfig
 
 
-@check_arguments("part", "cells", "seeds", "time_limit", "impl", "dry_run", file=PathText, folder=PathText)
+@check_arguments(
+    "part", "cells", "seeds", "time_limit", "impl", "dry_run", file=PathText, folder=PathText
+)
 def sweep(
     file: str | Path,
     folder: str | Path,
@@ -36,7 +38,8 @@ def sweep(
     impl: str = "auto",
     dry_run: bool = False,
 ) -> dict[str, Any]:
-    """Trains all combinations of tasks, algorithms, variants and seeds, and reports, as `mqe sweep`.
+    """Trains all combinations of tasks, algorithms, variants and seeds, and reports, as `mqe
+    sweep`.
 
     A part with `measure` evaluates policies instead. Call it again to resume.
 
@@ -52,20 +55,26 @@ def sweep(
         file: YAML file with the fields of `mqe_jax.study.sweep.Sweep` or `Measurement`.
         folder: folder of the sweep; runs go into runs/, the report into report/.
         part: name of one sweep in a file that maps names to sweeps.
-        cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT], or to measure, TASK/VARIANT. Default: all.
+        cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT], or to measure,
+            TASK/VARIANT. Default: all.
         seeds: seeds to train. Default: all.
-        time_limit: time after which the training in progress is saved and the sweep ends, min. Default: none.
+        time_limit: time after which the training in progress is saved and the sweep ends, min.
+            Default: none.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         dry_run: whether nothing is trained.
 
     Returns:
-        `left`: the remaining trainings, `jobs`, and their `steps_left` and estimated `seconds`; `report`: files.
+        `left`: the remaining trainings, `jobs`, and their `steps_left` and estimated `seconds`;
+        `report`: files.
 
     Raises:
-        InputError: for a file, a cell, a seed or a folder that is not allowed, or at the end if trainings failed.
+        InputError: for a file, a cell, a seed or a folder that is not allowed, or at the end if
+            trainings failed.
         NonFiniteError: at the end, if the first training that failed became non-finite.
     """
-    settings, folder, began = load_part(Path(file), part), Path(folder), time.monotonic()
+    settings = load_part(Path(file), part)
+    folder = Path(folder)
+    began = time.monotonic()
     if isinstance(settings, Measurement):
         for name, value in {"seeds": seeds, "time_limit": time_limit}.items():
             if value:
@@ -76,7 +85,9 @@ def sweep(
 
     def config_of(task: str, algorithm: str) -> TrainConfig:
         name = settings.config and settings.config.replace("{task}", task)
-        return build.for_task(base_config(task, name, None if algorithm == "default" else algorithm), task)
+        return build.for_task(
+            base_config(task, name, None if algorithm == "default" else algorithm), task
+        )
 
     def stop() -> bool:
         return time_limit is not None and time.monotonic() - began > 60.0 * time_limit
@@ -88,7 +99,10 @@ def sweep(
         return {"left": _estimate(folder, jobs), "report": []}
     sweeps.prepare(settings, folder)
     make = functools.partial(build.environments, impl)
-    report_failure = lambda job, error: echo(f"mqe: {_names([job])} failed: {one_line(error)}")  # noqa: E731
+
+    def report_failure(job, error):
+        return echo(f"mqe: {_names([job])} failed: {one_line(error)}")
+
     others, failed = sweeps.run(jobs, make, report_failure, stop)
     if others:
         echo(f"mqe: skipped, in use by other processes: {_names(others)}")
@@ -106,14 +120,21 @@ def sweep(
 
 
 def train_runs(plan: Sweep, folder: Path, file: str, impl: str) -> list[Path]:
-    """Trains all runs of a sweep, which it also writes to a file; returns their folders, cell by cell.
+    """Trains all runs of a sweep, which it also writes to a file; returns their folders, cell by
+    cell.
 
     InputError if trainings failed or are left to other processes.
     """
     write_atomically(folder / file, yaml.safe_dump(to_mapping(plan), sort_keys=False).encode())
     if left := sweep(folder / file, folder, impl=impl)["left"]["jobs"]:
-        raise InputError(f"folder: {folder} has {len(left)} unfinished trainings; the same command resumes them")
-    return [folder / "runs" / cell.path / f"seed{seed}" for cell in sweeps.select(plan) for seed in plan.seeds]
+        raise InputError(
+            f"folder: {folder} has {len(left)} unfinished trainings; the same command resumes them"
+        )
+    return [
+        folder / "runs" / cell.path / f"seed{seed}"
+        for cell in sweeps.select(plan)
+        for seed in plan.seeds
+    ]
 
 
 def _names(jobs: Sequence[Job]) -> str:
@@ -135,4 +156,8 @@ def _estimate(folder: Path, jobs: Sequence[Job]) -> dict[str, Any]:
     ]
     total = sum(seconds)
     steps = sum(job.steps_left for job in jobs)
-    return {"jobs": rows, "steps_left": steps, "seconds": None if math.isnan(total) else round(total)}
+    return {
+        "jobs": rows,
+        "steps_left": steps,
+        "seconds": None if math.isnan(total) else round(total),
+    }

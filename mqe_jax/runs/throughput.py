@@ -1,4 +1,6 @@
-"""Throughput in environment steps per second: of whole steps with skill and resets, and of physics only."""
+"""Throughput in environment steps per second: of whole steps with skill and resets, and of physics
+only.
+"""
 
 import os
 import time
@@ -18,8 +20,11 @@ from mqe_jax.sensors.suite import ONBOARD
 WARM_UP = 4  # calls after the compiling one that are not counted: episodes spread, clocks settle
 
 
-def time_calls(run: Callable[[Any], Any], state: Any, repeats: int) -> tuple[float, list[float], Any]:
-    """Returns the seconds of the first call, which compiles, those of `repeats` calls after `WARM_UP` ones, the state.
+def time_calls(
+    run: Callable[[Any], Any], state: Any, repeats: int
+) -> tuple[float, list[float], Any]:
+    """Returns the seconds of the first call, which compiles, those of `repeats` calls after
+    `WARM_UP` ones, the state.
 
     `run(state) -> state`; each call continues from the previous state and is synchronised.
     """
@@ -39,8 +44,8 @@ def programs(
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
     """Returns what is timed, neither jitted: whole environment steps, and physics only.
 
-    The first maps a state and a random key to those `steps` later under random actions, and returns `seen` of each
-    state. The second maps a physics state to a later one under its constant control.
+    The first maps a state and a random key to those `steps` later under random actions, and returns
+    `seen` of each state. The second maps a physics state to a later one under its constant control.
     """
     shape = (vector.num_envs, env.num_agents, env.action_size)
 
@@ -70,12 +75,13 @@ def bench(
 ) -> dict[str, str | int | float]:
     """Measures throughput in environment steps per second, as `mqe bench`.
 
-    An environment step is one step of one environment. `env_steps_per_s` includes everything: control, skill, physics
-    steps, observations, sensors, rewards and automatic resets, under random actions sampled inside the same scan.
-    `bare_env_steps_per_s` is the same scene and number of physics steps under constant control, without skill, reward
-    and resets. Both are medians; `slowest` and `fastest` are the range of the first. `compile_s` is the first call
-    minus the median call. `overflow` counts the environment steps of one call in which the engine may have dropped
-    contacts or constraints.
+    An environment step is one step of one environment. `env_steps_per_s` includes everything:
+    control, skill, physics steps, observations, sensors, rewards and automatic resets, under random
+    actions sampled inside the same scan. `bare_env_steps_per_s` is the same scene and number of
+    physics steps under constant control, without skill, reward and resets. Both are medians;
+    `slowest` and `fastest` are the range of the first. `compile_s` is the first call minus the
+    median call. `overflow` counts the environment steps of one call in which the engine may have
+    dropped contacts or constraints.
 
     Example:
         ```python
@@ -102,7 +108,8 @@ def bench(
     walk = jax.jit(lambda carry: whole(carry[0]))
     first, full_s, (_, overflow) = time_calls(walk, ((state, key), jnp.zeros(steps)), repeats)
     _, bare_s, _ = time_calls(jax.jit(bare), jax.tree.map(jnp.copy, state.data), repeats)
-    full_rate, bare_rate = num_envs * steps / median(full_s), num_envs * steps / median(bare_s)
+    full_rate = num_envs * steps / median(full_s)
+    bare_rate = num_envs * steps / median(bare_s)
     return {
         "task": batch.name,
         "impl": made.physics.impl,

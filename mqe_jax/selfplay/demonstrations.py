@@ -1,4 +1,5 @@
-"""Training episodes that start in states of a demonstrator's episodes: a curriculum for rewards that are rarely met.
+"""Training episodes that start in states of a demonstrator's episodes: a curriculum for rewards
+that are rarely met.
 
 Source: resets to demonstrated states (Tao et al., arXiv 2405.03379).
 """
@@ -31,18 +32,27 @@ MOMENTS = 16
 class DemonstratedState(State[Any]):
     """States of N environments, and M states in which episodes can start."""
 
-    demonstrations: PyTree  # fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`
+    # fields of the M states, leading axis M; of the physics state, `STATE_FIELDS`
+    demonstrations: PyTree
 
 
 class Demonstrated(VectorEnv):
-    """A batch of environments whose episodes start in states of a demonstrator's with probability `assistance`.
+    """A batch of environments whose episodes start in states of a demonstrator's with probability
+    `assistance`.
 
-    Such an episode has the time that was left to the demonstrator. The states are the same in all runs of a task.
+    Such an episode has the time that was left to the demonstrator. The states are the same in all
+    runs of a task.
     """
 
     @check_arguments(demonstrator=AnyPolicy)
     def __init__(
-        self, env: QuadrupedEnv, num_envs: int, demonstrator: Policy, copies: int = 1, *, final: Sequence[str] = SEEN
+        self,
+        env: QuadrupedEnv,
+        num_envs: int,
+        demonstrator: Policy,
+        copies: int = 1,
+        *,
+        final: Sequence[str] = SEEN,
     ) -> None:
         """Creates the batch, as `VectorEnv`; `demonstrator` acts for all agents."""
         super().__init__(env, num_envs, copies, final=final)
@@ -50,20 +60,28 @@ class Demonstrated(VectorEnv):
             given = f"one of {demonstrator.agents} agents on {demonstrator.task}"
             fail("demonstrator", given, f"one of all {env.num_agents} agents on {env.name}")
         if self.max_episode_steps < MOMENTS:
-            fail("episode_length", env.params.episode_length, f"at least {MOMENTS} steps with a demonstrator")
+            fail(
+                "episode_length",
+                env.params.episode_length,
+                f"at least {MOMENTS} steps with a demonstrator",
+            )
         self.demonstrator = demonstrator
         self._guide = VectorEnv(self.env, NUM_ENVS, final=()).with_groups(groups_of(demonstrator))
 
     @single
     def reset(self, key: jax.Array) -> DemonstratedState:
-        """Returns N initial states of the task, with the demonstrator's states, which do not depend on the key."""
+        """Returns N initial states of the task, with the demonstrator's states, which do not depend
+        on the key.
+        """
         with devices.alone():
             demonstrations = self._record()
         return DemonstratedState(**vars(super().reset(key)), demonstrations=demonstrations)
 
     @single
     def step(self, state: State, action: jax.Array) -> DemonstratedState:
-        """Advances all environments by one step with actions (N, A, action_size); resets those that ended."""
+        """Advances all environments by one step with actions (N, A, action_size); resets those that
+        ended.
+        """
         self.check_step(state, action, DemonstratedState)
         assert isinstance(state, DemonstratedState)
         demonstrations = state.demonstrations
@@ -73,15 +91,22 @@ class Demonstrated(VectorEnv):
             fresh = self.env.begin(fresh_key, assistance)
             index = jax.random.randint(index_key, (), 0, len(demonstrations["step"]))
             chosen = jax.random.bernoulli(choice_key, assistance)
-            begun = jax.tree.map(lambda x, y: jnp.where(chosen, x[index], y), demonstrations, _fields(fresh))
-            return dataclasses.replace(fresh, **{**begun, "data": fresh.data.replace(**begun["data"])})
+            begun = jax.tree.map(
+                lambda x, y: jnp.where(chosen, x[index], y), demonstrations, _fields(fresh)
+            )
+            return dataclasses.replace(
+                fresh, **{**begun, "data": fresh.data.replace(**begun["data"])}
+            )
 
-        plain = State(**{field.name: getattr(state, field.name) for field in dataclasses.fields(State)})
+        plain = State(
+            **{field.name: getattr(state, field.name) for field in dataclasses.fields(State)}
+        )
         after = jax.vmap(functools.partial(self._step, start=start))(plain, action)
         return DemonstratedState(**vars(after), demonstrations=demonstrations)
 
     def _record(self) -> PyTree:
-        guide, policy = self._guide, self.demonstrator
+        guide = self._guide
+        policy = self.demonstrator
         first = policy.initial_memory(NUM_ENVS)
 
         def advance(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], None]:
@@ -103,5 +128,12 @@ class Demonstrated(VectorEnv):
 
 def _fields(state: State) -> dict[str, Any]:
     """Returns the fields of states that a start sets."""
-    names = [field.name for field in dataclasses.fields(State) if field.name not in ("data", "key", *SEEN, *KEPT)]
-    return {**{name: getattr(state, name) for name in names}, "data": {n: getattr(state.data, n) for n in STATE_FIELDS}}
+    names = [
+        field.name
+        for field in dataclasses.fields(State)
+        if field.name not in ("data", "key", *SEEN, *KEPT)
+    ]
+    return {
+        **{name: getattr(state, name) for name in names},
+        "data": {n: getattr(state.data, n) for n in STATE_FIELDS},
+    }

@@ -1,4 +1,6 @@
-"""A match as an environment of one team: against opponents (`versus`), or with both teams learning (`Mirror`)."""
+"""A match as an environment of one team: against opponents (`versus`), or with both teams learning
+(`Mirror`).
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -38,17 +40,21 @@ class OpponentState:
 
     arrays: PyTree  # arrays of the opponent; empty if it cannot change
     before: PyTree  # arrays of the opponent before the last change
-    waiting: jax.Array  # environments whose episode is still against the opponent before the change (B,) bool
+    # environments whose episode is still against the opponent before the change (B,) bool
+    waiting: jax.Array
     memory: Memory  # recurrent state, leading axis B
-    outcomes: jax.Array  # episodes that team 0 won, drew and lost against it (3,) int32, in the order of `RESULTS`
+    # episodes that team 0 won, drew and lost against it (3,) int32, in the order of `RESULTS`
+    outcomes: jax.Array
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TeamState(EnvironmentState):
-    """State of M environments of one team of T agents, in N matches of A agents; metrics are those of team 0.
+    """State of M environments of one team of T agents, in N matches of A agents; metrics are those
+    of team 0.
 
-    `step[::M // N]` and `assistance[::M // N]` hold one entry per match; `key` is for the opponents' actions.
+    `step[::M // N]` and `assistance[::M // N]` hold one entry per match; `key` is for the
+    opponents' actions.
     """
 
     match: EnvironmentState  # state of the matches, leading axis N
@@ -63,35 +69,54 @@ class OneTeam(Outer):
         if len(check("env", matches, AnyBatch).teams) != 2:
             raise InputError(f"env: {matches.name} is not a match; it has one team")
         super().__init__(matches)
-        self.num_envs, self.num_agents = num_envs, len(matches.teams[0])
+        self.num_envs = num_envs
+        self.num_agents = len(matches.teams[0])
         self.teams = (tuple(range(self.num_agents)),)
 
     def _step_matches(self, state: TeamState, action: jax.Array) -> EnvironmentState:
         """Advances the matches by a step with the actions of all agents (N, A, D)."""
         every = self.num_envs // self.inner.num_envs
-        match = dataclasses.replace(state.match, step=state.step[::every], assistance=state.assistance[::every])
+        match = dataclasses.replace(
+            state.match, step=state.step[::every], assistance=state.assistance[::every]
+        )
         return self.inner.step(match, action)
 
-    def _state(self, match: EnvironmentState, of_agents: Any, of_match: Any, **own: Any) -> TeamState:
-        """Returns the state of the environments: fields of agents (N, A, ...) and others (N, ...) mapped, or `own`."""
+    def _state(
+        self, match: EnvironmentState, of_agents: Any, of_match: Any, **own: Any
+    ) -> TeamState:
+        """Returns the state of the environments: fields of agents (N, A, ...) and others (N, ...)
+        mapped, or `own`.
+        """
         agents = ("obs", "final_obs", "reward", "active", "groups", "final_groups")
-        others = ("privileged_obs", "final_privileged_obs", "terminated", "truncated", "step", "assistance")
+        others = (
+            "privileged_obs",
+            "final_privileged_obs",
+            "terminated",
+            "truncated",
+            "step",
+            "assistance",
+        )
         others += ("metrics", "outcome")
         metrics = {name: x for name, x in match.metrics.items() if not name.startswith("team1/")}
-        team0 = dataclasses.replace(match, metrics=metrics, outcome=match.outcome.by_team(lambda x: x[:, :1]))
+        team0 = dataclasses.replace(
+            match, metrics=metrics, outcome=match.outcome.by_team(lambda x: x[:, :1])
+        )
         fields = {name: jax.tree.map(of_agents, getattr(match, name)) for name in agents}
         fields |= {name: jax.tree.map(of_match, getattr(team0, name)) for name in others}
         return TeamState(**{**fields, "match": match, **own})
 
 
 class Versus(OneTeam):
-    """N matches as N environments of team 0, in K equal blocks with one opponent each; see `versus`.
+    """N matches as N environments of team 0, in K equal blocks with one opponent each; see
+    `versus`.
 
     Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
     """
 
     @check_arguments(matches=AnyBatch, opponents=Sequence[AnyPolicy], draw_reward=Number)
-    def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0) -> None:
+    def __init__(
+        self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0
+    ) -> None:
         super().__init__(matches, matches.num_envs)
         self.draw_reward = draw_reward
         for policy in opponents:
@@ -100,16 +125,25 @@ class Versus(OneTeam):
         self._check_blocks(self.num_envs)
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {self.num_envs} against {list(self.opponents)}: {self.inner!r}>"
+        return (
+            f"<{type(self).__name__} of {self.num_envs} against {list(self.opponents)}: "
+            f"{self.inner!r}>"
+        )
 
     def share(self, parts: int) -> Self:
-        """Returns the environments of one of several processes; each process meets all opponents."""
+        """Returns the environments of one of several processes; each process meets all
+        opponents.
+        """
         self._check_blocks(self.num_envs // parts)
         return super().share(parts)
 
     def _check_blocks(self, num_envs: int) -> None:
         if not self.opponents or num_envs % len(self.opponents):
-            fail("opponents", len(self.opponents), f"a divisor of the environments of a process, {num_envs}")
+            fail(
+                "opponents",
+                len(self.opponents),
+                f"a divisor of the environments of a process, {num_envs}",
+            )
 
     @single
     @check_arguments(key=RandomKey)
@@ -120,17 +154,23 @@ class Versus(OneTeam):
         opponents = []
         for policy in self.opponents:
             arrays = _arrays(policy)
-            waiting, memory = jnp.zeros((self._size,), bool), policy.initial_memory(self._size)
-            opponents.append(OpponentState(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32)))
+            waiting = jnp.zeros((self._size,), bool)
+            memory = policy.initial_memory(self._size)
+            opponents.append(
+                OpponentState(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32))
+            )
         action = jnp.zeros((self.num_envs, self.inner.num_agents, self.action_size))
         return self._team_state(match, action, tuple(opponents), key)
 
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
-        """Advances all environments by one step with the actions of team 0 (N, T, D), else an InputError; resets."""
+        """Advances all environments by one step with the actions of team 0 (N, T, D), else an
+        InputError; resets.
+        """
         self.check_step(state, action, TeamState)
         key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
-        others, opponents = [], []
+        others = []
+        opponents = []
         for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
             block = jax.tree.map(lambda x: x[self._block(i)], observations(state.match))  # noqa: B023
             shape = (self._size, self.num_agents, self.action_size)
@@ -143,30 +183,45 @@ class Versus(OneTeam):
         match = self._step_matches(state, both)
         done = match.terminated | match.truncated
         ended = done[:, None] & (match.outcome.result[:, 0] > 0)
-        match = dataclasses.replace(match, reward=match.reward + self.draw_reward * ended[:, 1:2].astype(jnp.float32))
-        started = tuple(self._restart(i, opponent, done, ended) for i, opponent in enumerate(opponents))
+        match = dataclasses.replace(
+            match, reward=match.reward + self.draw_reward * ended[:, 1:2].astype(jnp.float32)
+        )
+        started = tuple(
+            self._restart(i, opponent, done, ended) for i, opponent in enumerate(opponents)
+        )
         return self._team_state(match, both, started, key)
 
     @check_arguments(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
-    def change(self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False) -> TeamState:
-        """Returns the state with another opponent in a block, a trained policy of the same architecture.
+    def change(
+        self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False
+    ) -> TeamState:
+        """Returns the state with another opponent in a block, a trained policy of the same
+        architecture.
 
-        Each environment keeps its opponent until its episode ends, unless `at_once`. Another change before that
-        replaces only the waiting opponent, also in environments in which it already plays.
+        Each environment keeps its opponent until its episode ends, unless `at_once`. Another change
+        before that replaces only the waiting opponent, also in environments in which it already
+        plays.
         """
         if not block < len(self.opponents):
             fail("block", block, f"below {len(self.opponents)}, the number of blocks")
         check_policy(policy, self.inner)
-        first, opponent = self.opponents[block], state.opponents[block]
+        first = self.opponents[block]
+        opponent = state.opponents[block]
         if not isinstance(first, TrainedPolicy):
-            raise InputError(f"block: the opponent of block {block} is fixed; only trained policies can be exchanged")
-        given, known = policy.architecture, first.architecture
+            raise InputError(
+                f"block: the opponent of block {block} is fixed; only trained policies can be "
+                "exchanged"
+            )
+        given = policy.architecture
+        known = first.architecture
         for name in dict.fromkeys((*given, *known)):
             if given.get(name) != known.get(name):
                 other = f"{name} {given.get(name)!r}, not {known.get(name)!r}"
                 raise InputError(f"policy: of another architecture than block {block}: {other}")
         changed = exchange(opponent, _arrays(policy), at_once=at_once)
-        return dataclasses.replace(state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :]))
+        return dataclasses.replace(
+            state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :])
+        )
 
     @property
     def _size(self) -> int:
@@ -175,19 +230,35 @@ class Versus(OneTeam):
     def _block(self, index: int) -> slice:
         return slice(index, None, len(self.opponents))
 
-    def _restart(self, index: int, opponent: OpponentState, done: jax.Array, ended: jax.Array) -> OpponentState:
-        """Counts the outcomes `ended` (N, 3); resets the recurrent state, and ends the waiting, of ended episodes."""
-        done, ended = done[self._block(index)], ended[self._block(index)]
+    def _restart(
+        self, index: int, opponent: OpponentState, done: jax.Array, ended: jax.Array
+    ) -> OpponentState:
+        """Counts the outcomes `ended` (N, 3); resets the recurrent state, and ends the waiting, of
+        ended episodes.
+        """
+        done = done[self._block(index)]
+        ended = ended[self._block(index)]
         first = self.opponents[index].initial_memory(self._size)
         memory = where_rows(done, first, opponent.memory)
-        outcomes = opponent.outcomes + jnp.sum(ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32)
-        return dataclasses.replace(opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes)
+        outcomes = opponent.outcomes + jnp.sum(
+            ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32
+        )
+        return dataclasses.replace(
+            opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes
+        )
 
     def _team_state(
-        self, match: EnvironmentState, action: jax.Array, opponents: tuple[OpponentState, ...], key: jax.Array
+        self,
+        match: EnvironmentState,
+        action: jax.Array,
+        opponents: tuple[OpponentState, ...],
+        key: jax.Array,
     ) -> TeamState:
         """Returns the state of team 0."""
-        cut = lambda x: x[:, : self.num_agents]  # noqa: E731
+
+        def cut(x):
+            return x[:, : self.num_agents]
+
         return self._state(match, cut, lambda x: x, action=action, opponents=opponents, key=key)
 
 
@@ -200,9 +271,10 @@ def versus(
 ) -> Versus:
     """Returns matches as environments of team 0, against opponents that control team 1.
 
-    Opponents are policies or what `load_policy` accepts; equally many environments meet each of them. Trained policies
-    act as they are loaded (sampled, unless deterministic) and can be exchanged (`Versus.change`). A draw adds
-    `draw_reward`. InputError for a task that is not a match, and for a policy of another task.
+    Opponents are policies or what `load_policy` accepts; equally many environments meet each of
+    them. Trained policies act as they are loaded (sampled, unless deterministic) and can be
+    exchanged (`Versus.change`). A draw adds `draw_reward`. InputError for a task that is not a
+    match, and for a policy of another task.
 
     Example:
         ```python
@@ -219,10 +291,11 @@ def versus(
 
 
 class Mirror(OneTeam):
-    """N matches as 2 N environments of one team, two in a row per match: one policy learns as both teams.
+    """N matches as 2 N environments of one team, two in a row per match: one policy learns as both
+    teams.
 
-    The privileged observation has one more number, the index of the team. Outcome and metrics are those of team 0;
-    `diverged` and `overflow` are counted for the first.
+    The privileged observation has one more number, the index of the team. Outcome and metrics are
+    those of team 0; `diverged` and `overflow` are counted for the first.
     """
 
     def __init__(self, matches: VectorEnv) -> None:
@@ -237,7 +310,9 @@ class Mirror(OneTeam):
 
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
-        """Advances all environments by one step with actions (2 N, T, D), else an InputError; resets."""
+        """Advances all environments by one step with actions (2 N, T, D), else an InputError;
+        resets.
+        """
         self.check_step(state, action, TeamState)
         both = action.reshape(self.inner.num_envs, 2 * self.num_agents, self.action_size)
         return self._team_state(self._step_matches(state, both), both)
@@ -254,18 +329,26 @@ class Mirror(OneTeam):
 
         names = "privileged_obs", "final_privileged_obs"
         own = {name: jax.tree.map(privileged, getattr(match, name)) for name in names}
-        state = self._state(match, teams, twice, action=action, opponents=(), key=jnp.zeros((2,), jnp.uint32), **own)
+        state = self._state(
+            match, teams, twice, action=action, opponents=(), key=jnp.zeros((2,), jnp.uint32), **own
+        )
         first = jnp.arange(self.num_envs) % 2 == 0
-        once = {name: jnp.where(first, state.metrics[name], 0.0) for name in ("diverged", "overflow")}
+        once = {
+            name: jnp.where(first, state.metrics[name], 0.0) for name in ("diverged", "overflow")
+        }
         return dataclasses.replace(state, metrics=state.metrics | once)
 
 
 def exchange(opponent: OpponentState, arrays: PyTree, *, at_once: bool = False) -> OpponentState:
     """Returns the opponent of a block with other arrays; see `Versus.change`."""
     if at_once:
-        return dataclasses.replace(opponent, arrays=arrays, before=arrays, waiting=jnp.zeros_like(opponent.waiting))
+        return dataclasses.replace(
+            opponent, arrays=arrays, before=arrays, waiting=jnp.zeros_like(opponent.waiting)
+        )
     pending = devices.any_of(jnp.any(opponent.waiting))
-    before = jax.tree.map(lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays)
+    before = jax.tree.map(
+        lambda old, new: jnp.where(pending, old, new), opponent.before, opponent.arrays
+    )
     waiting = jnp.where(pending, opponent.waiting, True)
     return dataclasses.replace(opponent, arrays=arrays, before=before, waiting=waiting)
 
@@ -275,7 +358,9 @@ def _arrays(policy: Policy) -> PyTree:
     return jax.tree.map(jnp.asarray, policy.arrays) if isinstance(policy, TrainedPolicy) else ()
 
 
-def _act(policy: Policy, opponent: OpponentState, obs: Observations, key: jax.Array) -> tuple[jax.Array, Any]:
+def _act(
+    policy: Policy, opponent: OpponentState, obs: Observations, key: jax.Array
+) -> tuple[jax.Array, Any]:
     """Returns the actions of a block's opponent (B, T, D) and its next recurrent state."""
     if not isinstance(policy, TrainedPolicy):
         return policy.act(obs.to(policy), opponent.memory, key)

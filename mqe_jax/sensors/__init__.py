@@ -52,11 +52,14 @@ class Sensor:
     name: str = ""
     """Name in the registry. A subclass has a `Literal` here, with its value as the default."""
     pipeline: Mapping[str, Pipeline] = FrozenMapping()
-    """What happens to the readings of its blocks, by their names; `all` stands for those that are not named."""
+    """What happens to the readings of its blocks, by their names; `all` stands for those that are
+    not named."""
 
     @property
     def action_size(self) -> int:
-        """Number of entries that it appends to an agent's action; at most one sensor of a task appends some."""
+        """Number of entries that it appends to an agent's action; at most one sensor of a task
+        appends some.
+        """
         return 0
 
     def pipeline_of(self, block: Block) -> Pipeline:
@@ -64,7 +67,9 @@ class Sensor:
         return self.pipeline.get(block.name, self.pipeline.get("all", Pipeline()))
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Adds what the sensor needs, such as sites or cameras, to the scene of the physics before it is compiled."""
+        """Adds what the sensor needs, such as sites or cameras, to the scene of the physics before
+        it is compiled.
+        """
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
         """Returns the blocks of its readings: names, widths, meaning with unit and frame."""
@@ -77,13 +82,16 @@ class Sensor:
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the readings of all agents by block (A, width), each in its own frame, and the next memory.
+        """Returns the readings of all agents by block (A, width), each in its own frame, and the
+        next memory.
 
         Args:
-            scene: what does not change, such as `num_agents`, `dt`, and `mirror` (A,), by which angles to the left are
-                multiplied.
-            snapshot: the step: poses of robots and entities, and each agent's pose in its own frame.
-            memory: what the last call returned, at first `init_memory(scene)`; always the same shapes.
+            scene: what does not change, such as `num_agents`, `dt`, and `mirror` (A,), by which
+                angles to the left are multiplied.
+            snapshot: the step: poses of robots and entities, and each agent's pose in its own
+                frame.
+            memory: what the last call returned, at first `init_memory(scene)`; always the same
+                shapes.
             key: a random key, one for all agents: draw arrays (A, ...).
         """
         raise NotImplementedError(f"sensor {type(self).__name__}: observe() is not defined")
@@ -91,7 +99,9 @@ class Sensor:
     def draw(
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
-        """Returns the marks that `--sensors` draws, for the latest readings by block (A, width), unscaled."""
+        """Returns the marks that `--sensors` draws, for the latest readings by block (A, width),
+        unscaled.
+        """
         return ()
 
 
@@ -102,7 +112,8 @@ S = TypeVar("S", bound=type[Sensor])
 
 
 def register(sensor: S) -> S:
-    """Registers a settings class under the default of its field `name`, and returns it; a class decorator.
+    """Registers a settings class under the default of its field `name`, and returns it; a class
+    decorator.
 
     Raises:
         InputError: for anything else, a class without a name, or a name of another class.

@@ -20,8 +20,11 @@ from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.scene import SensedScene, Snapshot
 
-_AHEAD = (0.5, 0.5, -0.5, -0.5)  # turns a camera, which looks along its -z with y up, to a body's x with z up
-_COLOR, _DRAWN = (0.0, 0.7, 0.4), 400  # of the points that are drawn, and how many, about
+# turns a camera, which looks along its -z with y up, to a body's x with z up
+_AHEAD = (0.5, 0.5, -0.5, -0.5)
+# of the points that are drawn, and how many, about
+_COLOR = (0.0, 0.7, 0.4)
+_DRAWN = 400
 
 Side = Annotated[int, Gt(0), Le(256)]  # pixels
 Angle = Annotated[float, Gt(0), Lt(180)]  # degrees
@@ -57,14 +60,25 @@ class Depth(Sensor):
                 body.add_camera(name=name, pos=self.mount, quat=_AHEAD, fovy=self.field_of_view)
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
-        return (image("depth", self.height, self.width, "distance along the camera's axis, part of the range"),)
+        return (
+            image(
+                "depth",
+                self.height,
+                self.width,
+                "distance along the camera's axis, part of the range",
+            ),
+        )
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        data, shape = snapshot.data, (scene.num_agents, self.height, self.width)
-        distance = _renderer(scene.compiled.model, *shape)(data.qpos, data.mocap_pos, data.mocap_quat).reshape(shape)
-        part = jnp.where(distance > 0, jnp.minimum(distance / self.range, 1.0), 1.0)  # 0 where there is nothing
+        data = snapshot.data
+        shape = (scene.num_agents, self.height, self.width)
+        distance = _renderer(scene.compiled.model, *shape)(
+            data.qpos, data.mocap_pos, data.mocap_quat
+        ).reshape(shape)
+        # 0 where there is nothing
+        part = jnp.where(distance > 0, jnp.minimum(distance / self.range, 1.0), 1.0)
         part = jnp.where(scene.mirror[:, None, None] < 0, part[..., ::-1], part)
         return {"depth": part.reshape(scene.num_agents, -1)}, memory
 
@@ -72,61 +86,93 @@ class Depth(Sensor):
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
         """Shows the points that the pixels see."""
-        agents, step = scene.num_agents, int(np.ceil(np.sqrt(self.height * self.width / _DRAWN)))
+        agents = scene.num_agents
+        step = int(np.ceil(np.sqrt(self.height * self.width / _DRAWN)))
         part = readings["depth"].reshape(agents, self.height, self.width)[:, ::step, ::step]
-        rows, columns = np.arange(self.height)[::step] + 0.5, np.arange(self.width)[::step] + 0.5
+        rows = np.arange(self.height)[::step] + 0.5
+        columns = np.arange(self.width)[::step] + 0.5
         scale = 2 * np.tan(np.deg2rad(self.field_of_view) / 2) / self.height
-        up, left = np.meshgrid(scale * (self.height / 2 - rows), scale * (self.width / 2 - columns), indexing="ij")
+        up, left = np.meshgrid(
+            scale * (self.height / 2 - rows), scale * (self.width / 2 - columns), indexing="ij"
+        )
         left = scene.mirror[:, None, None] * left
         rays = np.stack([np.ones_like(left), left, np.broadcast_to(up, left.shape)], axis=-1)
         points = np.array(self.mount) + self.range * part[..., None] * rays.astype(np.float32)
-        robots, points = snapshot.robots, points.reshape(agents, -1, 3)
+        robots = snapshot.robots
+        points = points.reshape(agents, -1, 3)
         turned = jax.vmap(jax.vmap(rotate, (None, 0)))(robots.quaternion[:agents], points)
         points = turned + robots.position_w[:agents, None]
-        none, opacity = jnp.zeros((agents, 0)), (part < 0.99).reshape(agents, -1) * np.float32(1)
-        lines, area = jnp.zeros((agents, 0, 2, 3)), jnp.zeros((agents, 0, 3))
+        none = jnp.zeros((agents, 0))
+        opacity = (part < 0.99).reshape(agents, -1) * np.float32(1)
+        lines = jnp.zeros((agents, 0, 2, 3))
+        area = jnp.zeros((agents, 0, 3))
         return (Marks("depth", _COLOR, False, lines, none, points, opacity, area),)
 
 
 @cache
-def _renderer(model: mujoco.MjModel, agents: int, height: int, width: int) -> Callable[..., jax.Array]:
-    """Returns a function of qpos, mocap_pos and mocap_quat of an environment to depths (A H W), m; 0 is nothing.
+def _renderer(
+    model: mujoco.MjModel, agents: int, height: int, width: int
+) -> Callable[..., jax.Array]:
+    """Returns a function of qpos, mocap_pos and mocap_quat of an environment to depths (A H W), m;
+    0 is nothing.
 
-    Warp renders a fixed number of environments at once, so batches are flattened and each size has its own buffers.
+    Warp renders a fixed number of environments at once, so batches are flattened and each size has
+    its own buffers.
     """
     mjx: Any = private.load_mjx()
     private.keep_streams()
     cameras = [model.camera(f"{prefix(number)}depth").id for number in range(agents)]
-    trunks, frames = model.cam_bodyid, np.zeros((model.ncam, 9))
+    trunks = model.cam_bodyid
+    frames = np.zeros((model.ncam, 9))
     for frame, quaternion in zip(frames, model.cam_quat, strict=True):
         mujoco.mju_quat2Mat(frame, quaternion)
-    turn, mount = np.float32(frames.reshape(-1, 3, 3)), np.float32(model.cam_pos)
+    turn = np.float32(frames.reshape(-1, 3, 3))
+    mount = np.float32(model.cam_pos)
     groups = sorted({*model.geom_group.tolist()})
     with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
         device = jax.local_devices()[0]
-        on_device, blank = mjx.put_model(model, device, impl="warp"), mjx.make_data(model, device, impl="warp")
+        on_device = mjx.put_model(model, device, impl="warp")
+        blank = mjx.make_data(model, device, impl="warp")
 
     @cache
     def context(count: int) -> Any:
-        looks = {"cam_res": (width, height), "render_rgb": False, "render_depth": True, "cam_active": cameras}
-        return mjx.create_render_context(model, count, **looks, use_shadows=False, enabled_geom_groups=groups)
+        looks = {
+            "cam_res": (width, height),
+            "render_rgb": False,
+            "render_depth": True,
+            "cam_active": cameras,
+        }
+        return mjx.create_render_context(
+            model, count, **looks, use_shadows=False, enabled_geom_groups=groups
+        )
 
-    def render(buffers: Any, qpos: jax.Array, mocap_pos: jax.Array, mocap_quat: jax.Array) -> jax.Array:
-        data = mjx.kinematics(on_device, blank.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat))
+    def render(
+        buffers: Any, qpos: jax.Array, mocap_pos: jax.Array, mocap_quat: jax.Array
+    ) -> jax.Array:
+        data = mjx.kinematics(
+            on_device, blank.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
+        )
         rotation = data.xmat[trunks]
         place = data.xpos[trunks] + jnp.einsum("cij,cj->ci", rotation, mount, precision="highest")
-        data = data.replace(cam_xpos=place, cam_xmat=jnp.einsum("cij,cjk->cik", rotation, turn, precision="highest"))
+        data = data.replace(
+            cam_xpos=place, cam_xmat=jnp.einsum("cij,cjk->cik", rotation, turn, precision="highest")
+        )
         _, depth, _ = mjx.render(on_device, mjx.refit_bvh(on_device, data, buffers), buffers)
         return depth
 
     @jax.custom_batching.custom_vmap
     def batch(*state: jax.Array) -> jax.Array:
         with jax.numpy_dtype_promotion("standard"):
-            return jax.vmap(render, in_axes=(None, 0, 0, 0))(context(len(state[0])).pytree(), *state)
+            return jax.vmap(render, in_axes=(None, 0, 0, 0))(
+                context(len(state[0])).pytree(), *state
+            )
 
     @batch.def_vmap
     def _(size: int, batched: Any, *state: jax.Array) -> tuple[jax.Array, bool]:
-        every = (x if has else jnp.broadcast_to(x, (size, *x.shape)) for x, has in zip(state, batched, strict=True))
+        every = (
+            x if has else jnp.broadcast_to(x, (size, *x.shape))
+            for x, has in zip(state, batched, strict=True)
+        )
         depth = batch(*(x.reshape(-1, *x.shape[2:]) for x in every))
         return depth.reshape(size, -1, *depth.shape[1:]), True
 

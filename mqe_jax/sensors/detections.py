@@ -1,4 +1,6 @@
-"""Detections: robots, objects, gates and goals that a camera and a detector on the robot would report."""
+"""Detections: robots, objects, gates and goals that a camera and a detector on the robot would
+report.
+"""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
@@ -20,15 +22,19 @@ _VIEW = (1.0, 0.85, 0.1)
 _SEEN = {"seen now": (0.4, 0.1, 0.95), "seen before": (0.1, 0.1, 0.1)}
 _ABOVE = 0.3  # height of their lines above the trunk, where sheep do not hide them, m
 _EDGES = 65  # points of the edge of what is in view
-_FADE, _PALEST = 2.0, 0.2  # time after which a line to somebody seen has half its opacity, s; its least opacity
+# time after which a line to somebody seen has half its opacity, s; its least opacity
+_FADE = 2.0
+_PALEST = 0.2
 
 
 @register
 @settings_class
 class Detections(Sensor):
-    """Robots and entities at their last sighting, in the robot's yaw frame of that moment, with its age.
+    """Robots and entities at their last sighting, in the robot's yaw frame of that moment, with its
+    age.
 
-    One is sighted if its centre is in the field of view and in range, and no wall, robot or object is between.
+    One is sighted if its centre is in the field of view and in range, and no wall, robot or object
+    is between.
     """
 
     name: Literal["detections"] = "detections"
@@ -49,23 +55,30 @@ class Detections(Sensor):
         for kind, rows in scene.targets.items():
             meaning = "x, y, m" + (", cosine and sine of yaw" if _turns(scene, rows) else "")
             what = "robot" if rows[0, 0] < scene.num_robots else kind
-            width, meaning = 5 if _turns(scene, rows) else 3, f"{meaning}, when last seen; age of that, s"
+            width = 5 if _turns(scene, rows) else 3
+            meaning = f"{meaning}, when last seen; age of that, s"
             blocks.append(entities(kind, what, rows.shape[1], width, meaning, masked=True))
         return tuple(blocks)
 
     def init_memory(self, scene: SensedScene) -> Any:
         """Returns the entries of each kind's block, and who has been seen in this episode."""
         return {
-            kind: (jnp.zeros((*rows.shape, 5 if _turns(scene, rows) else 3)), jnp.zeros(rows.shape, bool))
+            kind: (
+                jnp.zeros((*rows.shape, 5 if _turns(scene, rows) else 3)),
+                jnp.zeros(rows.shape, bool),
+            )
             for kind, rows in scene.targets.items()
         }
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        agents, poses = np.arange(scene.num_agents)[:, None], snapshot.places[: scene.num_agents, None]
-        mirror, sighted = scene.mirror[:, None].astype(np.float32), self.visible(scene, snapshot)
-        blocks, kept = {}, {}
+        agents = np.arange(scene.num_agents)[:, None]
+        poses = snapshot.places[: scene.num_agents, None]
+        mirror = scene.mirror[:, None].astype(np.float32)
+        sighted = self.visible(scene, snapshot)
+        blocks = {}
+        kept = {}
         for kind, rows, (off_x, off_y, off_yaw, missed) in self._chances(scene, key):
             entries, known = memory[kind]
             way = snapshot.places[rows] - poses
@@ -81,18 +94,28 @@ class Detections(Sensor):
             blocks[kind] = by_entity(*kept[kind])
         return blocks, kept
 
-    def _chances(self, scene: SensedScene, key: jax.Array) -> Iterator[tuple[str, np.ndarray, list[Any]]]:
-        """Yields kind and rows of targets with the noise of x, y, m, and of yaw, rad, and who is missed (A, count).
+    def _chances(
+        self, scene: SensedScene, key: jax.Array
+    ) -> Iterator[tuple[str, np.ndarray, list[Any]]]:
+        """Yields kind and rows of targets with the noise of x, y, m, and of yaw, rad, and who is
+        missed (A, count).
 
-        One draw for each of them, over all kinds: XLA would compute a common one again in each of its uses.
+        One draw for each of them, over all kinds: XLA would compute a common one again in each of
+        its uses.
         """
         sizes = [rows.shape[1] for rows in scene.targets.values()]
-        shape, keys = (scene.num_agents, sum(sizes)), jax.random.split(key, 4)
+        shape = (scene.num_agents, sum(sizes))
+        keys = jax.random.split(key, 4)
         deviations = self.position_noise, self.position_noise, np.deg2rad(self.yaw_noise)
         noise = [
-            x * jax.random.normal(k, shape) if x else jnp.zeros(shape) for x, k in zip(deviations, keys, strict=False)
+            x * jax.random.normal(k, shape) if x else jnp.zeros(shape)
+            for x, k in zip(deviations, keys, strict=False)
         ]
-        missed = jax.random.uniform(keys[3], shape) < self.misses if self.misses else jnp.zeros(shape, bool)
+        missed = (
+            jax.random.uniform(keys[3], shape) < self.misses
+            if self.misses
+            else jnp.zeros(shape, bool)
+        )
         parts = [jnp.split(each, np.cumsum(sizes)[:-1], axis=1) for each in (*noise, missed)]
         for (kind, rows), *part in zip(scene.targets.items(), *parts, strict=True):
             yield kind, rows, part
@@ -100,18 +123,27 @@ class Detections(Sensor):
     def draw(
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
-        """Shows what is in view, and lines to whom each agent has seen, the paler the longer ago."""
-        origin, yaw = snapshot.places[: scene.num_agents, None, :2], snapshot.places[: scene.num_agents, 2:]
+        """Shows what is in view, and lines to whom each agent has seen, the paler the longer
+        ago.
+        """
+        origin = snapshot.places[: scene.num_agents, None, :2]
+        yaw = snapshot.places[: scene.num_agents, 2:]
         half = np.deg2rad(self.field_of_view / 2)
-        direction = turn(jnp.array([1.0, 0.0]), yaw + np.linspace(-half, half, _EDGES, dtype=np.float32))
+        direction = turn(
+            jnp.array([1.0, 0.0]), yaw + np.linspace(-half, half, _EDGES, dtype=np.float32)
+        )
         edge = origin + reach(scene, snapshot, direction, self.range)[..., None] * direction
         rows = np.concatenate([*scene.targets.values()], axis=1)
         ends = snapshot.places[rows, :2]
         lines = jnp.stack([jnp.broadcast_to(origin, ends.shape), ends], axis=2)
         age = jnp.concatenate([memory[kind][0][..., -1] for kind in scene.targets], axis=1)
         known = jnp.concatenate([memory[kind][1] for kind in scene.targets], axis=1)
-        now, faded = age < scene.dt / 2, jnp.maximum(jnp.exp2(-age / _FADE), _PALEST)
-        found = {"seen now": (known & now) * 1.0, "seen before": jnp.where(known & ~now, faded, 0.0)}
+        now = age < scene.dt / 2
+        faded = jnp.maximum(jnp.exp2(-age / _FADE), _PALEST)
+        found = {
+            "seen now": (known & now) * 1.0,
+            "seen before": jnp.where(known & ~now, faded, 0.0),
+        }
         return (
             marks("in view", _VIEW, snapshot.height, area=jnp.concatenate([origin, edge], axis=1)),
             *(

@@ -31,20 +31,34 @@ class Lidar(Sensor):
     """Maximum distance, m."""
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
-        return (Block("lidar", self.rays, "distances from the trunk's centre, m, counterclockwise from ahead"),)
+        return (
+            Block(
+                "lidar",
+                self.rays,
+                "distances from the trunk's centre, m, counterclockwise from ahead",
+            ),
+        )
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        return {"lidar": reach(scene, snapshot, self._directions(scene, snapshot), self.range)}, memory
+        return {
+            "lidar": reach(scene, snapshot, self._directions(scene, snapshot), self.range)
+        }, memory
 
     def draw(
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
-        origin, distance = snapshot.places[: scene.num_agents, None, :2], readings["lidar"]
+        origin = snapshot.places[: scene.num_agents, None, :2]
+        distance = readings["lidar"]
         hits = origin + distance[..., None] * self._directions(scene, snapshot)
         lines = jnp.stack([jnp.broadcast_to(origin, hits.shape), hits], axis=2)
-        shown = {"lines": lines, "line_opacity": 1.0, "points": hits, "point_opacity": distance < 0.99 * self.range}
+        shown = {
+            "lines": lines,
+            "line_opacity": 1.0,
+            "points": hits,
+            "point_opacity": distance < 0.99 * self.range,
+        }
         return (marks("lidar", _COLOR, snapshot.height, **shown),)
 
     def _directions(self, scene: SensedScene, snapshot: Snapshot) -> jax.Array:

@@ -15,7 +15,9 @@ from mqe_jax.core.settings import Range, settings_class
 
 @settings_class
 class Pipeline:
-    """What happens to the readings of one block, in this order; masks are delayed and dropped only."""
+    """What happens to the readings of one block, in this order; masks are delayed and dropped
+    only.
+    """
 
     noise: NonNegative = 0.0
     """Standard deviation of normal noise, in the block's unit."""
@@ -28,13 +30,18 @@ class Pipeline:
     dropout: Fraction = 0.0
     """Share of readings of an agent that are lost: the last one takes their place."""
     history: Few = 1
-    """Number of readings of which the block consists, newest first; they are channels of an image."""
+    """Number of readings of which the block consists, newest first; they are channels of an
+    image."""
 
     def block(self, block: Block) -> Block:
         """Returns the block that comes out."""
-        entities = block.entities and dataclasses.replace(block.entities, count=self.history * block.entities.count)
+        entities = block.entities and dataclasses.replace(
+            block.entities, count=self.history * block.entities.count
+        )
         image = block.image and (self.history * block.image[0], *block.image[1:])
-        return dataclasses.replace(block, width=self.history * block.width, entities=entities, image=image)
+        return dataclasses.replace(
+            block, width=self.history * block.width, entities=entities, image=image
+        )
 
     def newest(self, block: Block, value: jax.Array) -> jax.Array:
         """Returns the newest reading (A, width) in what comes out, without the scale."""
@@ -42,7 +49,9 @@ class Pipeline:
         return jnp.where(block.continuous > 0, value / self.scale, value)
 
     def init_memory(self, block: Block, agents: int) -> Any:
-        """Returns the readings on their way (D, A, W), those last delivered (H, A, W), and whether there are any."""
+        """Returns the readings on their way (D, A, W), those last delivered (H, A, W), and whether
+        there are any.
+        """
         return (
             jnp.zeros((self.delay, agents, block.width)),
             jnp.zeros((self.history, agents, block.width)),
@@ -57,7 +66,8 @@ class Pipeline:
         noise: jax.Array | float = 0.0,
         lost: jax.Array | bool = False,
     ) -> tuple[jax.Array, Any]:
-        """Returns what comes out of a reading (A, W), and the next memory; an episode's first reading comes at once.
+        """Returns what comes out of a reading (A, W), and the next memory; an episode's first
+        reading comes at once.
 
         `noise` (A, W) is standard normal, and `lost` (A, 1) says whose reading does not arrive.
         """
@@ -68,4 +78,8 @@ class Pipeline:
         line = jnp.concatenate([value[None], jnp.where(started, underway, value)])
         now = jnp.where(lost & started, delivered[0], line[-1]) if self.dropout else line[-1]
         delivered = jnp.concatenate([now[None], jnp.where(started, delivered, now)])[: self.history]
-        return jnp.moveaxis(delivered, 0, 1).reshape(len(reading), -1), (line[:-1], delivered, jnp.ones((), bool))
+        return jnp.moveaxis(delivered, 0, 1).reshape(len(reading), -1), (
+            line[:-1],
+            delivered,
+            jnp.ones((), bool),
+        )

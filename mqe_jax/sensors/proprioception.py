@@ -18,18 +18,24 @@ from mqe_jax.sensors.scene import SensedScene, Snapshot
 
 _COLOR = (0.95, 0.1, 0.5)
 _ABOVE = 0.15  # height of the arrow above the trunk, m
-_ARROW = np.array([[[0, 0], [0.45, 0]], [[0.45, 0], [0.33, 0.08]], [[0.45, 0], [0.33, -0.08]]], np.float32)  # m
+# m
+_ARROW = np.array(
+    [[[0, 0], [0.45, 0]], [[0.45, 0], [0.33, 0.08]], [[0.45, 0], [0.33, -0.08]]], np.float32
+)
 
 
 @register
 @settings_class
 class Proprioception(Sensor):
-    """Gravity, angular velocity, joints, the last action, and an odometry estimate that starts at the true pose."""
+    """Gravity, angular velocity, joints, the last action, and an odometry estimate that starts at
+    the true pose.
+    """
 
     name: Literal["proprioception"] = "proprioception"
     """Name of the sensor."""
     drift: Distance = 0.05
-    """Standard deviation of the odometry's position after 1 m, m; it grows with the square root of the way."""
+    """Standard deviation of the odometry's position after 1 m, m; it grows with the square root of
+    the way."""
     yaw_drift: Degrees = 0.5
     """Standard deviation of its yaw after 1 s, degrees; it grows with the square root of time."""
 
@@ -40,11 +46,17 @@ class Proprioception(Sensor):
             Block("joint_position", NUM_JOINTS, "rad, minus default"),
             Block("joint_velocity", NUM_JOINTS, "rad/s"),
             Block("action", scene.action_size, "last action"),
-            Block("odometry", 4, "estimate of x, y, m, and cosine and sine of yaw, own frame of the task"),
+            Block(
+                "odometry",
+                4,
+                "estimate of x, y, m, and cosine and sine of yaw, own frame of the task",
+            ),
         )
 
     def init_memory(self, scene: SensedScene) -> Any:
-        """Returns the estimated and the last true pose of each agent, and whether there are any yet."""
+        """Returns the estimated and the last true pose of each agent, and whether there are any
+        yet.
+        """
         pose = jnp.zeros((scene.num_agents, 3))
         return pose, pose, jnp.zeros((), bool)
 
@@ -53,8 +65,12 @@ class Proprioception(Sensor):
     ) -> tuple[dict[str, jax.Array], Any]:
         robots = jax.tree.map(lambda x: x[: scene.num_agents], snapshot.robots)
         mirror = scene.mirror[:, None].astype(np.float32)
-        side = np.where(np.arange(3) == 1, mirror, 1.0)  # of y; rotations change the signs of the other two
-        joints = lambda x: jnp.where(mirror < 0, x[:, MIRRORED_JOINTS] * MIRRORED_SIGNS, x)  # noqa: E731
+        # of y; rotations change the signs of the other two
+        side = np.where(np.arange(3) == 1, mirror, 1.0)
+
+        def joints(x):
+            return jnp.where(mirror < 0, x[:, MIRRORED_JOINTS] * MIRRORED_SIGNS, x)
+
         estimate, last, started = memory
         chance = jax.random.normal(key, (scene.num_agents, 3))  # of position and yaw
         moved = turn(snapshot.pose[:, :2] - last[:, :2], -last[:, 2])
@@ -69,7 +85,9 @@ class Proprioception(Sensor):
         blocks = {
             "gravity": robots.projected_gravity * side,
             "angular_velocity": robots.angular_velocity_b * side * mirror,
-            "joint_position": joints(robots.joint_position - scene.compiled.scene.robot.default_joints),
+            "joint_position": joints(
+                robots.joint_position - scene.compiled.scene.robot.default_joints
+            ),
             "joint_velocity": joints(robots.joint_velocity),
             "action": snapshot.action,
             "odometry": jnp.concatenate([estimate[:, :2], jnp.cos(yaw), jnp.sin(yaw)], axis=-1),
@@ -80,7 +98,8 @@ class Proprioception(Sensor):
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
         """Shows the estimated pose as an arrow, with a line to the true one."""
-        places, mirror = snapshot.places[: scene.num_agents], jnp.asarray(scene.mirror, jnp.float32)[:, None]
+        places = snapshot.places[: scene.num_agents]
+        mirror = jnp.asarray(scene.mirror, jnp.float32)[:, None]
         x, y, cosine, sine = readings["odometry"].T
         off = turn(jnp.stack([x, y], axis=-1) - snapshot.pose[:, :2], -snapshot.pose[:, 2])
         off = jnp.concatenate([off[:, :1], mirror * off[:, 1:]], axis=-1)
@@ -89,4 +108,13 @@ class Proprioception(Sensor):
         arrow = at[:, None, None] + turn(_ARROW, yaw[..., None])
         link = jnp.stack([places[:, :2], at], axis=1)[:, None]
         lines = jnp.concatenate([arrow, link], axis=1)
-        return (marks("odometry", _COLOR, snapshot.height + _ABOVE, lines=lines, points=at[:, None], bold=True),)
+        return (
+            marks(
+                "odometry",
+                _COLOR,
+                snapshot.height + _ABOVE,
+                lines=lines,
+                points=at[:, None],
+                bold=True,
+            ),
+        )

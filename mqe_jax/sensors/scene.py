@@ -1,4 +1,6 @@
-"""What sensors sense: robots, walls and entities of a scene, as points and planar shapes in the environment frame."""
+"""What sensors sense: robots, walls and entities of a scene, as points and planar shapes in the
+environment frame.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ class Snapshot(NamedTuple):
     robots: RobotState
     """State of the robots."""
     pose: jax.Array
-    """Poses x, y, yaw of the agents, each in its own (possibly mirrored) frame (A, 3), m and rad."""
+    """Poses x, y, yaw of the agents, each in its own (possibly mirrored) frame (A, 3), m and
+    rad."""
     action: jax.Array
     """The agents' last actions, each in its own frame (A, D)."""
     places: jax.Array
@@ -91,12 +94,17 @@ class SensedScene:
     def mirror(self) -> np.ndarray:
         """-1 for agents whose left is the robot's right, 1 for the others (A,)."""
         return np.concatenate(
-            [np.full(len(t), -1.0 if n and self.reflected else 1.0) for n, t in enumerate(self.teams)]
+            [
+                np.full(len(t), -1.0 if n and self.reflected else 1.0)
+                for n, t in enumerate(self.teams)
+            ]
         )
 
     @functools.cached_property
     def mates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Each agent's teammates (A, count), padded by itself to the largest team's size, and which are real."""
+        """Each agent's teammates (A, count), padded by itself to the largest team's size, and which
+        are real.
+        """
         count = max(map(len, self.teams)) - 1
         rows = [
             [*(mate for mate in team if mate != agent), *[agent] * count][:count]
@@ -110,20 +118,30 @@ class SensedScene:
     def targets(self) -> dict[str, np.ndarray]:
         """What each agent may detect by kind, as rows of `Snapshot.places` (A, count)."""
         robots = np.arange(self.num_robots)
-        mates = [[other for other in team if other != agent] for team in self.teams for agent in team]
+        mates = [
+            [other for other in team if other != agent] for team in self.teams for agent in team
+        ]
         rivals = [np.setdiff1d(robots, team) for team in self.teams for _ in team]
         found = {"mates": np.array(mates, int), "opponents": np.array(rivals, int)}
         for kind in dict.fromkeys(entity.kind for entity in self.entities):
-            rows = np.flatnonzero([entity.kind == kind for entity in self.entities]) + self.num_robots
-            found[kind] = np.array([rows[::-1] if n else rows for n, team in enumerate(self.teams) for _ in team])
+            rows = (
+                np.flatnonzero([entity.kind == kind for entity in self.entities]) + self.num_robots
+            )
+            found[kind] = np.array(
+                [rows[::-1] if n else rows for n, team in enumerate(self.teams) for _ in team]
+            )
         return {kind: rows for kind, rows in found.items() if rows.shape[1]}
 
     @functools.cached_property
     def outlines(self) -> dict[int, Circle | Rectangle]:
         """Outlines of entities by their rows of `Snapshot.places`."""
-        objects, found = self.compiled.scene.objects, {}
+        objects = self.compiled.scene.objects
+        found = {}
         for row, entity in enumerate(self.entities, start=self.num_robots):
-            if isinstance(entity.place, str) and (outline := objects[entity.place].outline) is not None:
+            if (
+                isinstance(entity.place, str)
+                and (outline := objects[entity.place].outline) is not None
+            ):
                 found[row] = outline
         return found
 
@@ -132,25 +150,45 @@ class SensedScene:
         """The row of `Snapshot.places` of each circle and each segment (C + S,); -1 for walls."""
         circles = [row for row, outline in self.outlines.items() if isinstance(outline, Circle)]
         walls = len(self.compiled.layout.barriers) + 4 * len(self.compiled.layout.walls)
-        rectangles = [row for row, outline in self.outlines.items() if isinstance(outline, Rectangle)]
-        return np.array([*range(self.num_robots), *circles, *[-1] * walls, *np.repeat(rectangles, 4)], int)
+        rectangles = [
+            row for row, outline in self.outlines.items() if isinstance(outline, Rectangle)
+        ]
+        return np.array(
+            [*range(self.num_robots), *circles, *[-1] * walls, *np.repeat(rectangles, 4)], int
+        )
 
     def others(self, snapshot: Snapshot) -> jax.Array:
-        """Returns the radii of the circles for the rays of each agent (A, C), m: 0 of its own one."""
+        """Returns the radii of the circles for the rays of each agent (A, C), m: 0 of its own
+        one.
+        """
         rows = np.arange(self.num_agents)[:, None]
         return jnp.where(self.owners[: len(snapshot.circles)] == rows, 0.0, snapshot.circles[:, 2])
 
     def snapshot(
-        self, data: mjx.Data, robots: RobotState, anchors: jax.Array, pose: jax.Array, action: jax.Array
+        self,
+        data: mjx.Data,
+        robots: RobotState,
+        anchors: jax.Array,
+        pose: jax.Array,
+        action: jax.Array,
     ) -> Snapshot:
-        """Returns what there is to sense in a state; arguments as the fields of `State` and `Snapshot`."""
-        every = jnp.concatenate([_planar(robots.position_w, robots.quaternion), *self._entities(data, anchors)])
+        """Returns what there is to sense in a state; arguments as the fields of `State` and
+        `Snapshot`.
+        """
+        every = jnp.concatenate(
+            [_planar(robots.position_w, robots.quaternion), *self._entities(data, anchors)]
+        )
         radius = float(np.hypot(*self.compiled.scene.robot.leg_root))  # at which the hips are
         circles = dict.fromkeys(range(self.num_robots), radius)
-        circles |= {row: shape.radius for row, shape in self.outlines.items() if isinstance(shape, Circle)}
+        circles |= {
+            row: shape.radius for row, shape in self.outlines.items() if isinstance(shape, Circle)
+        }
         radii = np.array([*circles.values()], np.float32)[:, None]
-        rectangles = {row: shape for row, shape in self.outlines.items() if isinstance(shape, Rectangle)}
-        places, sizes = every[np.array([*rectangles], int)], np.reshape([*rectangles.values()], (-1, 2))
+        rectangles = {
+            row: shape for row, shape in self.outlines.items() if isinstance(shape, Rectangle)
+        }
+        places = every[np.array([*rectangles], int)]
+        sizes = np.reshape([*rectangles.values()], (-1, 2))
         return Snapshot(
             data=data,
             robots=robots,
@@ -163,7 +201,9 @@ class SensedScene:
 
     def _entities(self, data: mjx.Data, anchors: jax.Array) -> list[jax.Array]:
         """Returns the pose x, y, yaw of each entity (1, 3), m and rad."""
-        found: dict[str | int, jax.Array] = {n: jnp.append(anchors[n], 0.0) for n in range(len(anchors))}
+        found: dict[str | int, jax.Array] = {
+            n: jnp.append(anchors[n], 0.0) for n in range(len(anchors))
+        }
         names = [entity.place for entity in self.entities if isinstance(entity.place, str)]
         if names:
             bodies = [self.compiled.objects[name].body for name in names]
@@ -172,15 +212,21 @@ class SensedScene:
 
     def _walls(self, anchors: jax.Array) -> jax.Array:
         """Returns the ends of the walls' sides (S', 2, 2), m."""
-        barriers, walls = self.compiled.layout.barriers, self.compiled.layout.walls
-        along = np.reshape([(-barrier.normal[1], barrier.normal[0]) for barrier in barriers], (-1, 1, 2))
-        half = np.reshape([barrier.length / 2 for barrier in barriers], (-1, 1, 1)) * np.array([[-1.0], [1.0]])
+        barriers = self.compiled.layout.barriers
+        walls = self.compiled.layout.walls
+        along = np.reshape(
+            [(-barrier.normal[1], barrier.normal[0]) for barrier in barriers], (-1, 1, 2)
+        )
+        half = np.reshape([barrier.length / 2 for barrier in barriers], (-1, 1, 1)) * np.array(
+            [[-1.0], [1.0]]
+        )
         ends = np.reshape([barrier.point for barrier in barriers], (-1, 1, 2)) + along * half
         center = jnp.asarray(np.reshape([wall.center[:2] for wall in walls], (-1, 2)), jnp.float32)
         moving = np.flatnonzero([wall.anchor is not None for wall in walls])
         if len(moving):
             center = center.at[moving].add(anchors[self.compiled.mocap_anchor])
-        level = jnp.concatenate([center, jnp.zeros((len(walls), 1))], axis=-1)  # jnp.pad has no translation to a graph
+        # jnp.pad has no translation to a graph
+        level = jnp.concatenate([center, jnp.zeros((len(walls), 1))], axis=-1)
         boxes = sides(level, np.reshape([wall.size[:2] for wall in walls], (-1, 2)))
         return jnp.concatenate([jnp.asarray(ends, jnp.float32), boxes])
 
@@ -204,11 +250,16 @@ def reach(scene: SensedScene, snapshot: Snapshot, direction: jax.Array, limit: f
 
     def read(origin: jax.Array, direction: jax.Array, radius: jax.Array) -> jax.Array:
         circles = jnp.concatenate([snapshot.circles[:, :2], radius[:, None]], axis=-1)
-        found = to_circles(origin, direction, circles), to_segments(origin, direction, snapshot.segments)
+        found = (
+            to_circles(origin, direction, circles),
+            to_segments(origin, direction, snapshot.segments),
+        )
         circle, segment = (jnp.min(each, axis=0, initial=limit) for each in found)
         return jnp.minimum(circle, segment)
 
-    return jax.vmap(read)(snapshot.places[: scene.num_agents, :2], direction, scene.others(snapshot))
+    return jax.vmap(read)(
+        snapshot.places[: scene.num_agents, :2], direction, scene.others(snapshot)
+    )
 
 
 def _planar(position: jax.Array, quaternion: jax.Array) -> jax.Array:

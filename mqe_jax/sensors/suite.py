@@ -1,4 +1,6 @@
-"""The sensors of a task's robots together: settings by name, and the group of observations that they make."""
+"""The sensors of a task's robots together: settings by name, and the group of observations that
+they make.
+"""
 
 from __future__ import annotations
 
@@ -43,13 +45,15 @@ SETS: dict[str, tuple[Sensor, ...]] = {
         Lidar(pipeline={"all": Pipeline(noise=0.02)}),
     ),
 }
-"""Sets of sensors by name, for the parameter `senses`; `full` has none, only the task's own observations."""
+"""Sets of sensors by name, for the parameter `senses`; `full` has none, only the task's own
+observations."""
 
 _ALLOWED = f"{', '.join(SETS)}, or a list of sensors, such as [proprioception, lidar]"
 
 
 def sensors_of(value: Any) -> tuple[Sensor, ...]:
-    """Returns sensors from the name of a set, or from a sequence of sensors, of their names and of mappings.
+    """Returns sensors from the name of a set, or from a sequence of sensors, of their names and of
+    mappings.
 
     Raises:
         InputError: for an unknown name, two sensors of one name, or two that add to actions.
@@ -81,7 +85,9 @@ def _sensor(value: Any) -> Sensor:
         raise InputError(f"senses.{name}.{error}") from None
 
 
-Senses = Annotated[tuple[pydantic.SerializeAsAny[Sensor], ...], pydantic.BeforeValidator(sensors_of)]
+Senses = Annotated[
+    tuple[pydantic.SerializeAsAny[Sensor], ...], pydantic.BeforeValidator(sensors_of)
+]
 """Type of a field that holds sensors."""
 
 
@@ -138,23 +144,34 @@ class Suite:
         self, snapshot: Snapshot, state: SensorState, key: jax.Array
     ) -> tuple[dict[str, jax.Array], SensorState]:
         """Returns the readings by block (A, width) and the next state; once a step."""
-        readings, memory = {}, {}
+        readings = {}
+        memory = {}
         for number, sensor in enumerate(self.sensors):
             own_key = jax.random.fold_in(key, number)
-            blocks, memory[sensor.name] = self._read(sensor, snapshot, state.memory[sensor.name], own_key)
+            blocks, memory[sensor.name] = self._read(
+                sensor, snapshot, state.memory[sensor.name], own_key
+            )
             readings |= blocks
-        piped = {x.name: (sensor.pipeline_of(x), x) for sensor, x in self._measured if x.name in state.queues}
+        piped = {
+            x.name: (sensor.pipeline_of(x), x)
+            for sensor, x in self._measured
+            if x.name in state.queues
+        }
         noise, lost = self._chances(piped, jax.random.fold_in(key, len(self.sensors)))
         queues = {}
         for name, (pipeline, block) in piped.items():
             chances = noise.get(name, 0.0), lost.get(name, False)
-            readings[name], queues[name] = pipeline.apply(block, readings[name], state.queues[name], *chances)
+            readings[name], queues[name] = pipeline.apply(
+                block, readings[name], state.queues[name], *chances
+            )
         return readings, SensorState(state.action, memory, queues)
 
     def _read(
         self, sensor: Sensor, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        """Returns what a sensor observes; ValueError for blocks unlike its layout, or a memory unlike the last."""
+        """Returns what a sensor observes; ValueError for blocks unlike its layout, or a memory
+        unlike the last.
+        """
         method = f"{type(sensor).__name__}.observe"
         readings, after = sensor.observe(self.scene, snapshot, memory, key)
         widths = {block.name: block.width for owner, block in self._measured if owner is sensor}
@@ -166,18 +183,33 @@ class Suite:
     def _chances(
         self, piped: Mapping[str, tuple[Pipeline, Block]], key: jax.Array
     ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-        """Returns the noise and the losses of blocks with pipelines that have some; one draw each, which saves time."""
-        agents, (noise_key, loss_key) = self.scene.num_agents, jax.random.split(key)
+        """Returns the noise and the losses of blocks with pipelines that have some; one draw each,
+        which saves time.
+        """
+        agents = self.scene.num_agents
+        (noise_key, loss_key) = jax.random.split(key)
         noisy = {name: block.width for name, (pipeline, block) in piped.items() if pipeline.noise}
         drawn = jax.random.normal(noise_key, (agents, sum(noisy.values())))
         parts = jnp.split(drawn, np.cumsum([*noisy.values()])[:-1], axis=1) if noisy else []
-        rates = {name: pipeline.dropout for name, (pipeline, _) in piped.items() if pipeline.dropout}
+        rates = {
+            name: pipeline.dropout for name, (pipeline, _) in piped.items() if pipeline.dropout
+        }
         losses = jax.random.uniform(loss_key, (len(rates), agents, 1)) if rates else ()
         lost = {name: loss < rate for (name, rate), loss in zip(rates.items(), losses, strict=True)}
         return dict(zip(noisy, parts, strict=True)), lost
 
-    def draw(self, snapshot: Snapshot, state: SensorState, readings: Mapping[str, jax.Array]) -> tuple[Marks, ...]:
-        """Returns what shows the sensors' readings, by block as `observe` returns them, in the state after it."""
-        newest = {x.name: sensor.pipeline_of(x).newest(x, readings[x.name]) for sensor, x in self._measured}
-        drawn = (sensor.draw(self.scene, snapshot, newest, state.memory[sensor.name]) for sensor in self.sensors)
+    def draw(
+        self, snapshot: Snapshot, state: SensorState, readings: Mapping[str, jax.Array]
+    ) -> tuple[Marks, ...]:
+        """Returns what shows the sensors' readings, by block as `observe` returns them, in the
+        state after it.
+        """
+        newest = {
+            x.name: sensor.pipeline_of(x).newest(x, readings[x.name])
+            for sensor, x in self._measured
+        }
+        drawn = (
+            sensor.draw(self.scene, snapshot, newest, state.memory[sensor.name])
+            for sensor in self.sensors
+        )
         return tuple(itertools.chain.from_iterable(drawn))

@@ -1,6 +1,8 @@
-"""Skills: low-level policies of one robot, from commands and proprioception to joint targets; their registry.
+"""Skills: low-level policies of one robot, from commands and proprioception to joint targets; their
+registry.
 
-A skill is a class derived from `Skill` in its own file, registered by `register`. Agents and NPC robots use it alike.
+A skill is a class derived from `Skill` in its own file, registered by `register`. Agents and NPC
+robots use it alike.
 """
 
 from __future__ import annotations
@@ -61,11 +63,14 @@ class Skill(abc.ABC):
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
 
-    # -- defined by each skill ----------------------------------------------------------------------------------
+    # -- defined by each skill
+    # ----------------------------------------------------------------------------------
 
     @abc.abstractmethod
     def init_memory(self) -> Any:
-        """Returns the recurrent state after a reset: a dataclass or dictionary of arrays, or () without one."""
+        """Returns the recurrent state after a reset: a dataclass or dictionary of arrays, or ()
+        without one.
+        """
 
     @abc.abstractmethod
     def targets(
@@ -74,13 +79,20 @@ class Skill(abc.ABC):
         """Returns the joint targets (12,), rad, and the next recurrent state, for commands (C,)."""
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Reads the parameters from a file, or those shipped for the robot; InputError if they cannot be read."""
+        """Reads the parameters from a file, or those shipped for the robot; InputError if they
+        cannot be read.
+        """
         if path is not None:
-            raise InputError(f"skill_weights: {str(path)!r} is not allowed; the skill {self.name!r} has no weights")
+            raise InputError(
+                f"skill_weights: {str(path)!r} is not allowed; the skill {self.name!r} has no "
+                "weights"
+            )
         return ()
 
     def restrict(self, varied: Sequence[str], gait: str | None) -> Skill:
-        """Returns the skill for commands of which only the `varied` ones ever differ from the defaults of a gait."""
+        """Returns the skill for commands of which only the `varied` ones ever differ from the
+        defaults of a gait.
+        """
         return self
 
     def clock(self, memory: Any) -> jax.Array:
@@ -93,17 +105,24 @@ class Skill(abc.ABC):
         return (self,)
 
     def select(self, name: str) -> tuple[float, ...]:
-        """Returns the values of the commands of `selector` with which the skill of this name acts."""
+        """Returns the values of the commands of `selector` with which the skill of this name
+        acts.
+        """
         return ()
 
     def with_choice(self, name: str, commands: jax.Array) -> jax.Array:
-        """Returns the commands (N, C) that make the skill of this name act with its own commands (N, C')."""
+        """Returns the commands (N, C) that make the skill of this name act with its own commands
+        (N, C').
+        """
         return commands
 
-    # -- common to all skills -----------------------------------------------------------------------------------
+    # -- common to all skills
+    # -----------------------------------------------------------------------------------
 
     def index(self, names: Sequence[str]) -> np.ndarray:
-        """Returns the positions of commands in the vector of commands; InputError for an unknown name."""
+        """Returns the positions of commands in the vector of commands; InputError for an unknown
+        name.
+        """
         known = [command.name for command in self.commands]
         wrong = f"{self.name} command: unknown name"
         return np.array([known.index(known_name(wrong, name, known)) for name in names], int)
@@ -120,10 +139,15 @@ class Skill(abc.ABC):
         """
         if gait is not None and gait not in self.gaits:
             allowed = ", ".join(self.gaits) or f"none with the skill {self.name!r}"
-            raise InputError(f"gait: unknown name {gait!r}{nearest(gait, self.gaits)}; allowed: {allowed}")
+            raise InputError(
+                f"gait: unknown name {gait!r}{nearest(gait, self.gaits)}; allowed: {allowed}"
+            )
         given = (command.default for command in self.commands)
         default = np.array([x(self.robot) if callable(x) else x for x in given], np.float32)
-        for name, value in {**self.gaits.get(gait or next(iter(self.gaits), ""), {}), **values}.items():
+        for name, value in {
+            **self.gaits.get(gait or next(iter(self.gaits), ""), {}),
+            **values,
+        }.items():
             default[self.index([name])] = value
         return default
 
@@ -134,30 +158,42 @@ class Skill(abc.ABC):
 
         Args:
             names: commands that the action sets.
-            ranges: lowest and highest value by command, for some of them; the others change by +-limit.
+            ranges: lowest and highest value by command, for some of them; the others change by
+                +-limit.
             default: default commands (C,).
 
         Raises:
-            InputError: naming a command that the action does not set, or a range that excludes the default.
+            InputError: naming a command that the action does not set, or a range that excludes the
+                default.
         """
-        limit, default = self.column("limit", names), default[self.index(names)]
+        limit = self.column("limit", names)
+        default = default[self.index(names)]
         changes = np.stack([-limit, limit], axis=-1)
         for name, (low, high) in ranges.items():
             i = list(names).index(known_name("command_ranges: unknown command", name, names))
             if not low <= default[i] <= high or low == high:
                 allowed = f"lowest < highest, with the default {default[i]:g} between"
-                raise InputError(f"command_ranges.{name}: {(low, high)} is not allowed; it must be {allowed}")
+                raise InputError(
+                    f"command_ranges.{name}: {(low, high)} is not allowed; it must be {allowed}"
+                )
             changes[i] = np.array([low, high], np.float32) - default[i]
         return changes
 
     def trained_ranges(self, names: Sequence[str]) -> np.ndarray:
-        """Returns the lowest and the highest value of the named commands for which the skill is trained (n, 2)."""
-        default, commands = self.default_commands(), [self.commands[i] for i in self.index(names)]
+        """Returns the lowest and the highest value of the named commands for which the skill is
+        trained (n, 2).
+        """
+        default = self.default_commands()
+        commands = [self.commands[i] for i in self.index(names)]
         around = zip(commands, default[self.index(names)], strict=True)
-        return np.array([x.trained or (at - x.limit, at + x.limit) for x, at in around], float).reshape(-1, 2)
+        return np.array(
+            [x.trained or (at - x.limit, at + x.limit) for x, at in around], float
+        ).reshape(-1, 2)
 
     def untrained_commands(self, ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-        """Returns the commands whose range exceeds that for which the skill was trained, each with both ranges."""
+        """Returns the commands whose range exceeds that for which the skill was trained, each with
+        both ranges.
+        """
         trained = zip(ranges.items(), self.trained_ranges(list(ranges)), strict=True)
         return [
             f"{name} [{low:g}, {high:g}] outside [{least:g}, {most:g}]"
@@ -182,10 +218,13 @@ class Skill(abc.ABC):
             raise InputError(f"commands: {tuple(names)} must be one or more distinct commands")
 
     def check_period(self, timestep: float, num_substeps: int) -> None:
-        """Checks that `num_substeps` physics steps of `timestep` (s) are one period; raises an InputError."""
+        """Checks that `num_substeps` physics steps of `timestep` (s) are one period; raises an
+        InputError.
+        """
         if not math.isclose(timestep * num_substeps, self.period):
             raise InputError(
-                f"Scene.timestep: {timestep} s x {num_substeps} substeps is {timestep * num_substeps:g} s; "
+                f"Scene.timestep: {timestep} s x {num_substeps} substeps is "
+                f"{timestep * num_substeps:g} s; "
                 f"the period of the skill {self.name!r} is {self.period} s"
             )
 
@@ -203,7 +242,11 @@ def register(skill: type[S]) -> type[S]:
     Raises:
         InputError: for anything else, or if another class is registered under it.
     """
-    if not (isinstance(skill, type) and issubclass(skill, Skill) and isinstance(getattr(skill, "name", None), str)):
+    if not (
+        isinstance(skill, type)
+        and issubclass(skill, Skill)
+        and isinstance(getattr(skill, "name", None), str)
+    ):
         fail("skill", skill, "a class derived from Skill, with a name")
     if SKILLS.setdefault(skill.name, skill) is not skill:
         raise InputError(f"skill: the name {skill.name!r} is already registered")
@@ -212,7 +255,8 @@ def register(skill: type[S]) -> type[S]:
 
 @check_arguments(name=str | Sequence[str], robot=Robot)
 def make(name: str | Sequence[str], robot: Robot) -> Skill:
-    """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with the nearest one.
+    """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with
+    the nearest one.
 
     Example:
         ```python

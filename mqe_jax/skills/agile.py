@@ -1,19 +1,20 @@
 """The agile skill: fast velocity commands to joint targets, for one robot, by a small network.
 
-Its memory holds frames of the last steps, the action that corresponds to the last joint targets, and the phase of the
-gait cycle. A frame has 39 numbers:
+Its memory holds frames of the last steps, the action that corresponds to the last joint targets,
+and the phase of the gait cycle. A frame has 39 numbers:
 
 | block | size | content |
 |---|---|---|
 | projected gravity | 3 | unit gravity vector in the trunk frame |
 | joint position | 12 | minus the default angles, rad |
 | joint velocity | 12 | times 0.05, rad/s |
-| joint targets | 12 | of the step before: minus the default angles, divided by the robot's action scale |
+| joint targets | 12 | of the step before, minus the default angles, over the action scale |
 
-Input of the network: the frames of the steps `OFFSETS` before this one, oldest first (zeros before an episode's first
-step), the three commands times their scale, and the clock. The clock is sine and cosine of the phase of a trot, or
-zeros if the command is to stand. The trot's frequency grows with the commanded velocity. Layers 200-256-256-128-12 with
-ELU give the action, clipped to +-10. The joint target is default + scale x action.
+Input of the network: the frames of the steps `OFFSETS` before this one, oldest first (zeros before
+an episode's first step), the three commands times their scale, and the clock. The clock is sine and
+cosine of the phase of a trot, or zeros if the command is to stand. The trot's frequency grows with
+the commanded velocity. Layers 200-256-256-128-12 with ELU give the action, clipped to +-10. The
+joint target is default + scale x action.
 """
 
 from __future__ import annotations
@@ -34,7 +35,11 @@ OFFSETS = (8, 4, 2, 1, 0)  # steps before the current one
 LENGTH = max(OFFSETS) + 1
 FRAME_SIZE = 3 + 3 * NUM_JOINTS
 NOW_SIZE = 5  # commands and clock
-NETWORKS = Networks("agile", "agile skill", {"body": (len(OFFSETS) * FRAME_SIZE + NOW_SIZE, 256, 256, 128, NUM_JOINTS)})
+NETWORKS = Networks(
+    "agile",
+    "agile skill",
+    {"body": (len(OFFSETS) * FRAME_SIZE + NOW_SIZE, 256, 256, 128, NUM_JOINTS)},
+)
 STEP = 0.02  # s
 ACTION_CLIP = 10.0
 JOINT_VELOCITY_SCALE = 0.05
@@ -45,7 +50,9 @@ STAND = 0.02  # share of `FAST` below which the robot stands
 
 COMMANDS = (
     Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0, trained=(-1.5, 2.5)),
-    Command("vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0, trained=(-1.0, 1.0)),
+    Command(
+        "vy", "m/s to the left", gain=0.5, limit=0.5, scale=2.0, mirror=-1.0, trained=(-1.0, 1.0)
+    ),
     Command("yaw_rate", "rad/s", gain=0.5, limit=0.5, mirror=-1.0, trained=(-2.5, 2.5)),
 )
 _SCALE = np.array([command.scale for command in COMMANDS], np.float32)
@@ -78,7 +85,9 @@ def frequency(velocity: jax.Array) -> jax.Array:
 
 
 def foot_phases(gait: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above; 0.25 in standing."""
+    """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above; 0.25 in
+    standing.
+    """
     phases = jnp.mod(gait + jnp.array([0.5, 0.0, 0.0, 0.5]), 1.0)
     return jnp.where(stands(velocity), 0.25, phases)
 
@@ -120,7 +129,11 @@ class AgileSkill(Skill):
         return AgileMemory(jnp.zeros((LENGTH, FRAME_SIZE)), jnp.zeros(NUM_JOINTS), jnp.zeros(()))
 
     def targets(
-        self, params: Params, memory: AgileMemory, command: jax.Array, proprioception: Proprioception
+        self,
+        params: Params,
+        memory: AgileMemory,
+        command: jax.Array,
+        proprioception: Proprioception,
     ) -> tuple[jax.Array, AgileMemory]:
         newest = frame(self.robot, proprioception, memory.action)
         frames = jnp.concatenate([memory.frames[1:], newest[None]])

@@ -2,12 +2,13 @@
 
 | mode | per robot | meaning |
 |---|---|---|
-| `command` | one number per command that the action sets (3) | commands for the skill, by default velocities to walk |
+| `command` | one per command of the action (3) | the skill's commands, by default velocities |
 | `position` | 12 | joint target = default + scale x action, then PD at every physics step |
 | `torque` | 12 | joint torque = action x torque limit |
 
-Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the command, a negative one
-by the lowest, both times the skill's gain / limit. PD control runs inside the physics engine, at every physics step.
+Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the
+command, a negative one by the lowest, both times the skill's gain / limit. PD control runs inside
+the physics engine, at every physics step.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class ControlState:
     """Controller state of one environment (R robots)."""
 
     skill: Any
-    """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of agents and NPC robots, if
-    these have another skill."""
+    """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of agents and
+    NPC robots, if these have another skill."""
     delayed: jax.Array  # past actuator targets, newest first (lag + 1, R, 12)
 
 
@@ -55,39 +56,60 @@ class Commander:
     commands: tuple[str, ...]  # commands that the action sets, in order
     default_commands: np.ndarray  # default commands of the skill (C,)
     ranges: Mapping[str, tuple[float, float]]
-    """Lowest and highest value of some of `commands`; the others have the skill's default ranges."""
+    """Lowest and highest value of some of `commands`; the others have the skill's default
+    ranges."""
 
     def skill_commands(self, action: jax.Array) -> jax.Array:
-        """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in [-1, 1]."""
+        """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in
+        [-1, 1].
+        """
         change = self.change(action)
-        default, columns = self.default_commands, self.skill.index(self.commands)
-        commands = jax.vmap(lambda change: scatter(default, columns, default[columns] + change))(change)
+        default = self.default_commands
+        columns = self.skill.index(self.commands)
+        commands = jax.vmap(lambda change: scatter(default, columns, default[columns] + change))(
+            change
+        )
         return self.skill.limit_turn(commands)
 
     def action_of(self, change: jax.Array) -> jax.Array:
-        """Computes the actions (..., action_size) that change the commands (..., action_size) from the defaults."""
-        down, up = (np.where(slope > 0, 1.0 / np.maximum(slope, 1e-9), 0.0) for slope in self._slopes)
+        """Computes the actions (..., action_size) that change the commands (..., action_size) from
+        the defaults.
+        """
+        down, up = (
+            np.where(slope > 0, 1.0 / np.maximum(slope, 1e-9), 0.0) for slope in self._slopes
+        )
         return jnp.clip(jnp.where(change < 0, down, up) * change, -1.0, 1.0)
 
     def change(self, action: jax.Array) -> jax.Array:
-        """Computes the changes of the commands from the defaults that actions ask for (..., action_size)."""
+        """Computes the changes of the commands from the defaults that actions ask for (...,
+        action_size).
+        """
         down, up = self._slopes
         return jnp.clip(jnp.where(action < 0, down, up) * action, *self.changes.T)
 
     def admits(self, other: Commander) -> bool:
-        """Returns whether actions can have the skill of `other`, one of the skills here, act with all its commands."""
+        """Returns whether actions can have the skill of `other`, one of the skills here, act with
+        all its commands.
+        """
         names = other.commands
-        if names != self.commands[: len(names)] or other.skill.name not in [part.name for part in self.skill.parts]:
+        if names != self.commands[: len(names)] or other.skill.name not in [
+            part.name for part in self.skill.parts
+        ]:
             return False
-        (low, high), (least, most) = other.limits.T, self.limits[: len(names)].T
+        (low, high) = other.limits.T
+        (least, most) = self.limits[: len(names)].T
         return bool(np.all((low >= least - 1e-6) & (high <= most + 1e-6)))
 
     def translate(self, action: jax.Array, other: Commander) -> jax.Array:
-        """Computes the actions that give here the commands of actions (..., n) of `other`, which this one `admits`."""
+        """Computes the actions that give here the commands of actions (..., n) of `other`, which
+        this one `admits`.
+        """
         entries = self.skill.select(other.skill.name)
         if not entries and np.array_equal(self.changes, other.changes):
             return action
-        shift = (other.limits - other.changes - (self.limits - self.changes)[: len(other.commands)])[:, 0]
+        shift = (
+            other.limits - other.changes - (self.limits - self.changes)[: len(other.commands)]
+        )[:, 0]
         entries = jnp.broadcast_to(jnp.array(entries), (*action.shape[:-1], len(entries)))
         return self.action_of(jnp.concatenate([other.change(action) + shift, entries], axis=-1))
 
@@ -104,7 +126,8 @@ class Commander:
     @property
     def _slopes(self) -> np.ndarray:
         """Change of each command per unit of a negative and of a positive action (2, n)."""
-        gain, limit = (self.skill.column(field, self.commands) for field in ("gain", "limit"))
+        gain = self.skill.column("gain", self.commands)
+        limit = self.skill.column("limit", self.commands)
         return np.abs(self.changes.T) * (gain / limit)
 
 
@@ -117,7 +140,8 @@ class Controller(Commander):
     num_robots: int  # number of robots R
     num_agents: int  # number of agents A: the first A robots
     skill_params: Any  # parameters of the skill, or None if no robot uses it
-    npc: tuple[Skill, Any] | None = None  # skill of the NPC robots and its parameters if it is another one
+    # skill of the NPC robots and its parameters if it is another one
+    npc: tuple[Skill, Any] | None = None
     lag: int = 0  # maximum action lag, environment steps
     position_scale: float = 1.0  # factor on the range of the joint targets in the mode `position`
 
@@ -135,14 +159,18 @@ class Controller(Commander):
         return rest
 
     def check_action(self, action: jax.Array, size: int) -> jax.Array:
-        """Returns actions (A, size) as an array; InputError for others, or known ones that are not finite."""
+        """Returns actions (A, size) as an array; InputError for others, or known ones that are not
+        finite.
+        """
         try:
             action = jnp.asarray(action)
         except (TypeError, ValueError, OverflowError):
             fail("action", action, "an array of numbers")
         shape = (self.num_agents, size)
         if action.shape != shape:
-            raise InputError(f"action: shape {action.shape}; expected {shape} (agents, action size)")
+            raise InputError(
+                f"action: shape {action.shape}; expected {shape} (agents, action size)"
+            )
         if not jnp.issubdtype(action.dtype, jnp.floating):
             raise InputError(f"action: dtype {action.dtype}; expected a floating-point type")
         # Under jit the result is traced even if the action is a captured constant.
@@ -157,7 +185,9 @@ class Controller(Commander):
             jax.tree.map(lambda x, n=n: jnp.broadcast_to(x, (n, *x.shape)), skill.init_memory())
             for skill, _, n in self._groups
         ]
-        return ControlState(_one_or_all(memories), jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1)))
+        return ControlState(
+            _one_or_all(memories), jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1))
+        )
 
     def clock(self, state: ControlState) -> jax.Array:
         """Returns the clocks of the robots' skills (R, n); n is 0 if no robot uses the skill."""
@@ -168,7 +198,11 @@ class Controller(Commander):
         width = max((clock.shape[1] for clock in clocks), default=0)
         clocks = [jnp.pad(clock, ((0, 0), (0, width - clock.shape[1]))) for clock in clocks]
         rest = self.num_robots - sum(len(clock) for clock in clocks)
-        return jnp.concatenate([jnp.zeros((rest, width)), *clocks]) if rest or len(clocks) > 1 else clocks[0]
+        return (
+            jnp.concatenate([jnp.zeros((rest, width)), *clocks])
+            if rest or len(clocks) > 1
+            else clocks[0]
+        )
 
     @jax.named_scope("control")
     def targets(
@@ -190,7 +224,8 @@ class Controller(Commander):
         """
         agents = self.num_agents
         target = jnp.asarray(self.neutral)
-        commands, memories = jnp.tile(jnp.asarray(self.default_commands), (agents, 1)), []
+        commands = jnp.tile(jnp.asarray(self.default_commands), (agents, 1))
+        memories = []
         if self.mode == "command":
             commands = self.skill_commands(action)
         elif self.mode == "position":
@@ -199,11 +234,18 @@ class Controller(Commander):
             target = target.at[:agents].set(action * self.robot.torque_limit)
         asked = [commands] if npc_commands is None else [commands, npc_commands]
         asked = asked[-len(self._groups) :] if self.npc else [jnp.concatenate(asked)]
-        first, skilled = self.num_robots - sum(n for *_, n in self._groups), []
-        for (skill, params, n), memory, commands in zip(self._groups, self._memories(state), asked, strict=False):
+        first = self.num_robots - sum(n for *_, n in self._groups)
+        skilled = []
+        for (skill, params, n), memory, commands in zip(
+            self._groups, self._memories(state), asked, strict=False
+        ):
             sensed = jax.tree.map(lambda x, first=first, n=n: x[first : first + n], proprioception)
-            targets, memory = jax.vmap(functools.partial(skill.targets, params))(memory, commands, sensed)
-            skilled, memories, first = [*skilled, targets], [*memories, memory], first + n
+            targets, memory = jax.vmap(functools.partial(skill.targets, params))(
+                memory, commands, sensed
+            )
+            skilled = [*skilled, targets]
+            memories = [*memories, memory]
+            first = first + n
         if skilled:
             rest = [target[: self.num_robots - sum(map(len, skilled))]]
             uses = np.arange(self.num_robots)[:, None] >= (0 if self.mode == "command" else agents)
@@ -225,8 +267,14 @@ class Controller(Commander):
     def _groups(self) -> list[tuple[Skill, Any, int]]:
         """The robots that use a skill, the last ones, in groups: skill, parameters and number."""
         if self.npc is None:
-            return [] if self.skill_params is None else [(self.skill, self.skill_params, self.num_robots)]
-        agents = [(self.skill, self.skill_params, self.num_agents)] if self.mode == "command" else []
+            return (
+                []
+                if self.skill_params is None
+                else [(self.skill, self.skill_params, self.num_robots)]
+            )
+        agents = (
+            [(self.skill, self.skill_params, self.num_agents)] if self.mode == "command" else []
+        )
         return [*agents, (*self.npc, self.num_robots - self.num_agents)]
 
     def _memories(self, state: ControlState) -> Sequence[Any]:

@@ -1,6 +1,8 @@
-"""Networks of skills: named parts, each a chain of linear layers with an ELU between them, and their weight files.
+"""Networks of skills: named parts, each a chain of linear layers with an ELU between them, and
+their weight files.
 
-A layer is named `part.index` with even indices, as in torch's `Sequential`; its weight is (outputs, inputs).
+A layer is named `part.index` with even indices, as in torch's `Sequential`; its weight is (outputs,
+inputs).
 """
 
 from __future__ import annotations
@@ -26,8 +28,12 @@ ASSETS = pathlib.Path(__file__).parents[1] / "assets"
 Params = dict[str, dict[str, dict[str, jax.Array]]]
 
 
-def layers(params: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str, first: int = 0) -> jax.Array:
-    """Applies the layers from number `first` on to x (..., n), with an ELU before each but number 0."""
+def layers(
+    params: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str, first: int = 0
+) -> jax.Array:
+    """Applies the layers from number `first` on to x (..., n), with an ELU before each but number
+    0.
+    """
     for name in sorted(params, key=int)[first:]:
         x = x if name == "0" else jax.nn.elu(x)
         x = jnp.matmul(x, params[name]["weight"].T, precision=precision) + params[name]["bias"]
@@ -50,15 +56,21 @@ class Networks:
         return {f"{part}.{2 * i}": sizes for part, chain in chains for i, sizes in enumerate(chain)}
 
     def init(self, key: jax.Array) -> Params:
-        """Samples initial weights: uniform as in torch's linear layers, those of the action layer scaled by 0.1."""
+        """Samples initial weights: uniform as in torch's linear layers, those of the action layer
+        scaled by 0.1.
+        """
         params: Params = {part: {} for part in self.widths}
         for name, (n_in, n_out) in self.sizes.items():
             part, layer = name.split(".")
             key, w_key, b_key = jax.random.split(key, 3)
             bound = n_in**-0.5
             last = name == list(self.sizes)[-1]
-            weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound) * (0.1 if last else 1.0)
-            bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound) * (0.0 if last else 1.0)
+            weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound) * (
+                0.1 if last else 1.0
+            )
+            bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound) * (
+                0.0 if last else 1.0
+            )
             params[part][layer] = {"weight": weight, "bias": bias}
         return params
 
@@ -66,7 +78,8 @@ class Networks:
         """Returns flat weights as nested float32 arrays.
 
         Raises:
-            InputError: for missing or unexpected names, or other shapes; the message names `source`.
+            InputError: for missing or unexpected names, or other shapes; the message names
+                `source`.
         """
         params: Params = {part: {} for part in self.widths}
         for name, arrays in linear_layers(f"{self.title} {source}", flat, self.sizes).items():
@@ -75,7 +88,8 @@ class Networks:
         return params
 
     def load(self, robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
-        """Reads weights as float32 from a safetensors file; those shipped for the robot if `path` is None.
+        """Reads weights as float32 from a safetensors file; those shipped for the robot if `path`
+        is None.
 
         Raises:
             InputError: if the file is missing, damaged, or holds other names or shapes.
@@ -85,7 +99,8 @@ class Networks:
         train = f"train it with 'mqe skill train {self.skill} --robot {robot.name}'"
         if not file.is_file() and path is None:
             raise InputError(
-                f"{self.title}: no weights are shipped for {robot.name} (assets/{file.name}); {train} and give them as "
+                f"{self.title}: no weights are shipped for {robot.name} (assets/{file.name}); "
+                f"{train} and give them as "
                 "skill_weights=FILE, or use control 'position' or 'torque'"
             )
         if not file.is_file():
@@ -100,11 +115,15 @@ class Networks:
         *,
         half: bool = False,
     ) -> None:
-        """Writes weights and metadata to a safetensors file, atomically; with `half`, rounded to float16."""
+        """Writes weights and metadata to a safetensors file, atomically; with `half`, rounded to
+        float16.
+        """
         from safetensors.numpy import save
 
         flat = {
-            f"{part}.{layer}.{kind}": np.ascontiguousarray(array, np.float16 if half else np.float32)
+            f"{part}.{layer}.{kind}": np.ascontiguousarray(
+                array, np.float16 if half else np.float32
+            )
             for part, layers in params.items()
             for layer, arrays in layers.items()
             for kind, array in arrays.items()

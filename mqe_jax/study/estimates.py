@@ -22,24 +22,34 @@ LAST = 0.02
 
 
 def group(runs: Sequence[Run], reference: Reference) -> dict[Cell, list[Run]]:
-    """Returns the runs of each cell, cells in the reference's order: by variant, task and algorithm."""
+    """Returns the runs of each cell, cells in the reference's order: by variant, task and
+    algorithm.
+    """
     orders = list(reference.variants), list(reference.tasks), list(reference.algorithms)
 
     def key(cell: Cell) -> list[tuple[int, str]]:
         named = cell.variant, cell.task, cell.algorithm
         return [(o.index(x) if x in o else len(o), x) for x, o in zip(named, orders, strict=True)]
 
-    return {cell: [run for run in runs if run.cell == cell] for cell in sorted({run.cell for run in runs}, key=key)}
+    return {
+        cell: [run for run in runs if run.cell == cell]
+        for cell in sorted({run.cell for run in runs}, key=key)
+    }
 
 
 def names(cells: Cells, field: str) -> list[str]:
-    """Returns the tasks, algorithms or variants of cells, in their order; `field` is that of `Cell`."""
+    """Returns the tasks, algorithms or variants of cells, in their order; `field` is that of
+    `Cell`.
+    """
     return list(dict.fromkeys(getattr(cell, field) for cell in cells))
 
 
 def estimate(statistic: Callable[..., Array], *scores: Array) -> tuple[Array, Array, Array]:
     """Returns a statistic of scores (runs, tasks) each, and the bounds of its interval."""
-    return (statistic(*scores), *statistics.bootstrap_interval(scores, statistic, np.random.default_rng(0)))
+    return (
+        statistic(*scores),
+        *statistics.bootstrap_interval(scores, statistic, np.random.default_rng(0)),
+    )
 
 
 def _per_column(scores: Array) -> Array:
@@ -48,9 +58,11 @@ def _per_column(scores: Array) -> Array:
 
 
 def band(runs: Sequence[Run], column: str = REWARD) -> tuple[Array, Array, Array, Array]:
-    """Returns steps (K,), interquartile mean and interval bounds (K,) of a column over a cell's seeds.
+    """Returns steps (K,), interquartile mean and interval bounds (K,) of a column over a cell's
+    seeds.
 
-    Curves are interpolated to the first seed's steps, as far as all seeds have come; a missing reward term is zero.
+    Curves are interpolated to the first seed's steps, as far as all seeds have come; a missing
+    reward term is zero.
     """
     steps = runs[0].curve["env_steps"]
     steps = steps[steps <= min(run.curve["env_steps"][-1] for run in runs)]
@@ -60,12 +72,16 @@ def band(runs: Sequence[Run], column: str = REWARD) -> tuple[Array, Array, Array
         else run.curve[column]
         for run in runs
     ]
-    scores = np.stack([np.interp(steps, r.curve["env_steps"], y) for r, y in zip(runs, curves, strict=True)])
+    scores = np.stack(
+        [np.interp(steps, r.curve["env_steps"], y) for r, y in zip(runs, curves, strict=True)]
+    )
     return (steps, *estimate(_per_column, scores))
 
 
 def final_reward(run: Run) -> float:
-    """Returns the average step reward at the end of a training run: the mean over the last rows of its curve."""
+    """Returns the average step reward at the end of a training run: the mean over the last rows of
+    its curve.
+    """
     values = run.curve[REWARD]
     return float(values[-max(1, round(LAST * len(values))) :].mean())
 
@@ -77,7 +93,9 @@ def absolute(run: Run, name: str) -> float:
 
 
 def select_evaluated(cells: Cells) -> Cells:
-    """Returns the cells whose runs all have evaluations, with these, of the unmodified task, as curves."""
+    """Returns the cells whose runs all have evaluations, with these, of the unmodified task, as
+    curves.
+    """
     chosen: dict[Cell, list[Run]] = {}
     for cell, runs in cells.items():
         curves = [
@@ -88,8 +106,12 @@ def select_evaluated(cells: Cells) -> Cells:
             for run in runs
         ]
         if all(curve[REWARD] and None not in curve[REWARD] for curve in curves):
-            arrays = [{name: np.array(x, np.float64) for name, x in curve.items()} for curve in curves]
-            chosen[cell] = [dataclasses.replace(run, curve=x) for run, x in zip(runs, arrays, strict=True)]
+            arrays = [
+                {name: np.array(x, np.float64) for name, x in curve.items()} for curve in curves
+            ]
+            chosen[cell] = [
+                dataclasses.replace(run, curve=x) for run, x in zip(runs, arrays, strict=True)
+            ]
     return chosen
 
 
@@ -104,7 +126,9 @@ def curve_rows(cells: Cells) -> Rows:
 
 
 def final_rows(cells: Cells, reference: Reference) -> Rows:
-    """Returns the table of final values, a row for each cell; an estimate is NaN if a seed has no value."""
+    """Returns the table of final values, a row for each cell; an estimate is NaN if a seed has no
+    value.
+    """
     rows = []
     for cell, runs in cells.items():
         row: dict[str, Any] = {**dataclasses.asdict(cell), "seeds": len(runs)}
@@ -115,8 +139,15 @@ def final_rows(cells: Cells, reference: Reference) -> Rows:
             ("success", [absolute(run, "success_rate") for run in runs]),
         ):
             known = np.isfinite(values).all()
-            three = estimate(_per_column, np.array(values)[:, None]) if known else np.full((3, 1), math.nan)
-            row |= {key: float(x[0]) for key, x in zip((name, f"{name}_low", f"{name}_high"), three, strict=True)}
+            three = (
+                estimate(_per_column, np.array(values)[:, None])
+                if known
+                else np.full((3, 1), math.nan)
+            )
+            row |= {
+                key: float(x[0])
+                for key, x in zip((name, f"{name}_low", f"{name}_high"), three, strict=True)
+            }
         if reference.values:
             value = reference.value(cell.variant, cell.task, cell.algorithm)
             row["reference"] = math.nan if value is None else value
@@ -127,13 +158,18 @@ def final_rows(cells: Cells, reference: Reference) -> Rows:
 def score_matrices(cells: Cells, variant: str) -> dict[str, Array]:
     """Returns each algorithm's scores (runs, tasks) of a variant as fractions of each task's range.
 
-    Only tasks and seeds common to all algorithms are used; the score is the absolute metric if all runs have it,
-    otherwise the final training reward. Empty for fewer than two algorithms, or if fewer than half of the variant's
-    tasks are common.
+    Only tasks and seeds common to all algorithms are used; the score is the absolute metric if all
+    runs have it, otherwise the final training reward. Empty for fewer than two algorithms, or if
+    fewer than half of the variant's tasks are common.
     """
     chosen = {cell: runs for cell, runs in cells.items() if cell.variant == variant}
-    algorithms, every = names(chosen, "algorithm"), names(chosen, "task")
-    tasks = [task for task in every if all(Cell(task, algorithm, variant) in chosen for algorithm in algorithms)]
+    algorithms = names(chosen, "algorithm")
+    every = names(chosen, "task")
+    tasks = [
+        task
+        for task in every
+        if all(Cell(task, algorithm, variant) in chosen for algorithm in algorithms)
+    ]
     if len(algorithms) < 2 or not tasks or 2 * len(tasks) < len(every):
         return {}
     used = {(a, t): chosen[Cell(t, a, variant)] for a in algorithms for t in tasks}
@@ -146,7 +182,9 @@ def score_matrices(cells: Cells, variant: str) -> dict[str, Array]:
         return absolute(run, REWARD) if ended else final_reward(run)
 
     scores = {
-        a: np.array([[score(r) for r in used[a, t] if r.seed in seeds] for t in tasks], np.float64).T
+        a: np.array(
+            [[score(r) for r in used[a, t] if r.seed in seeds] for t in tasks], np.float64
+        ).T
         for a in algorithms
     }
     everything = np.concatenate(list(scores.values()))
@@ -161,10 +199,17 @@ def aggregate_tables(cells: Cells) -> dict[str, Rows]:
         scores = score_matrices(cells, variant)
         for name, values in scores.items():
             middle, low, high = map(float, estimate(statistics.interquartile_mean, values))
-            row = {"variant": variant, "algorithm": name, "runs": len(values), "tasks": values.shape[1]}
+            row = {
+                "variant": variant,
+                "algorithm": name,
+                "runs": len(values),
+                "tasks": values.shape[1],
+            }
             total.append({**row, "iqm": middle, "low": low, "high": high})
         for x, y in itertools.permutations(scores, 2):
-            chance, low, high = map(float, estimate(statistics.probability_of_improvement, scores[x], scores[y]))
+            chance, low, high = map(
+                float, estimate(statistics.probability_of_improvement, scores[x], scores[y])
+            )
             row = {"variant": variant, "first": x, "second": y}
             pairs.append({**row, "probability": chance, "low": low, "high": high})
     return {"aggregate": total, "improvement": pairs} if total else {}

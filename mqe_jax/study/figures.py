@@ -8,11 +8,20 @@ from typing import Any
 import numpy as np
 
 from mqe_jax.core.literal import to_label
-from mqe_jax.study.estimates import Array, Cells, band, estimate, names, score_matrices, select_evaluated
+from mqe_jax.study.estimates import (
+    Array,
+    Cells,
+    band,
+    estimate,
+    names,
+    score_matrices,
+    select_evaluated,
+)
 from mqe_jax.study.runs import Cell, Reference, Run
 from mqe_jax.study.statistics import performance_profile
 
-_INK, _PALE = "#23252b", "#8a8f99"
+_INK = "#23252b"
+_PALE = "#8a8f99"
 _COLORS = {"jrpo": "#4f86e0", "mappo": "#b5316f", "mat": "#3fae49"}
 _OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
 _DASHES = (0, (4, 3))
@@ -34,7 +43,9 @@ def _png(figure: Any) -> bytes:
 def _panels(parent: Any, tasks: Sequence[str]) -> Iterator[tuple[Any, str]]:
     """Yields the axes of each task, two per row; the rest is hidden."""
     across = min(2, len(tasks))
-    for axes, task in itertools.zip_longest(parent.subplots(-(-len(tasks) // 2), across, squeeze=False).ravel(), tasks):
+    for axes, task in itertools.zip_longest(
+        parent.subplots(-(-len(tasks) // 2), across, squeeze=False).ravel(), tasks
+    ):
         if task is None:
             axes.set_axis_off()
         else:
@@ -47,9 +58,15 @@ def _color(algorithm: str, algorithms: Sequence[str]) -> str:
 
 
 def draw_curves(cells: Cells, reference: Reference) -> bytes:
-    """Returns the training curves, a block of tasks for each variant; dashed lines are the reference's values."""
-    variants, algorithms, tasks = (names(cells, field) for field in ("variant", "algorithm", "task"))
-    figure = _figure(max(5.0, 3.7 * min(2, len(tasks)) * len(variants)), 2.5 * -(-len(tasks) // 2) + 0.9)
+    """Returns the training curves, a block of tasks for each variant; dashed lines are the
+    reference's values.
+    """
+    variants = names(cells, "variant")
+    algorithms = names(cells, "algorithm")
+    tasks = names(cells, "task")
+    figure = _figure(
+        max(5.0, 3.7 * min(2, len(tasks)) * len(variants)), 2.5 * -(-len(tasks) // 2) + 0.9
+    )
     blocks = figure.subfigures(1, len(variants), squeeze=False)[0]
     for block, variant in zip(blocks, variants, strict=True):
         for axes, task in _panels(block, tasks):
@@ -58,7 +75,9 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
                 if runs is not None:
                     _draw_band(axes, runs, _color(algorithm, algorithms), algorithm.upper())
             if not axes.lines:
-                axes.text(0.5, 0.6, "not trained", color=_PALE, ha="center", transform=axes.transAxes)
+                axes.text(
+                    0.5, 0.6, "not trained", color=_PALE, ha="center", transform=axes.transAxes
+                )
                 axes.set_xticks([])
             values = reference.values.get(variant, {}).get(task, {})
             _draw_values(axes, {name: x for name, x in values.items() if name in algorithms})
@@ -75,11 +94,13 @@ def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
 
 
 def draw_evaluations(cells: Cells, reference: Reference) -> bytes:
-    """Returns the evaluations during training, of the unmodified task with sampled actions: a panel for each task.
+    """Returns the evaluations during training, of the unmodified task with sampled actions: a panel
+    for each task.
 
     Every panel has its own legend.
     """
-    tasks, chosen = names(cells, "task"), select_evaluated(cells)
+    tasks = names(cells, "task")
+    chosen = select_evaluated(cells)
     figure = _figure(max(5.0, 3.7 * min(2, len(tasks))), 2.7 * -(-len(tasks) // 2) + 0.6)
     for axes, task in _panels(figure, tasks):
         drawn = [cell for cell in chosen if cell.task == task]
@@ -98,7 +119,9 @@ def _draw_band(axes: Any, runs: Sequence[Run], color: str, label: str) -> None:
     _draw_interval(axes, steps / 1e6, values, color, label)
 
 
-def _draw_interval(axes: Any, x: Array, values: Sequence[Array], color: str, label: str = "") -> None:
+def _draw_interval(
+    axes: Any, x: Array, values: Sequence[Array], color: str, label: str = ""
+) -> None:
     """Draws a line and its interval: `values` are middle, low and high, each of x's shape."""
     axes.fill_between(x, values[1], values[2], color=color, alpha=0.15, lw=0)
     axes.plot(x, values[0], color=color, lw=1.5, label=to_label(label))
@@ -118,10 +141,18 @@ def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
     """Adds a legend below the figure: colours by label, and the label of dashed lines."""
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=color, label=to_label(label)) for label, color in colors.items()]
+    handles = [
+        Line2D([], [], color=color, label=to_label(label)) for label, color in colors.items()
+    ]
     if dashed is not None:
         handles.append(Line2D([], [], color=_INK, ls=_DASHES, lw=1.0, label=to_label(dashed)))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False, fontsize=8)
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=min(4, len(handles)),
+        frameon=False,
+        fontsize=8,
+    )
 
 
 def draw_profiles(cells: Cells, reference: Reference) -> bytes:
@@ -131,7 +162,9 @@ def draw_profiles(cells: Cells, reference: Reference) -> bytes:
     thresholds = np.linspace(0.0, 1.0, 101)
 
     figure = _figure(max(5.0, 4.2 * len(variants)), 3.4)
-    for axes, variant in zip(figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True):
+    for axes, variant in zip(
+        figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True
+    ):
         for name, scores in score_matrices(cells, variant).items():
             values = estimate(lambda x: performance_profile(x, thresholds), scores)
             _draw_interval(axes, thresholds, values, _color(name, algorithms))

@@ -7,14 +7,25 @@ from typing import Any
 
 from mqe_jax.core.files import check_folder, write_atomically
 from mqe_jax.core.literal import to_markdown
-from mqe_jax.study.estimates import LAST, Rows, aggregate_tables, curve_rows, final_rows, group, select_evaluated
+from mqe_jax.study.estimates import (
+    LAST,
+    Rows,
+    aggregate_tables,
+    curve_rows,
+    final_rows,
+    group,
+    select_evaluated,
+)
 from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
 from mqe_jax.study.runs import Reference, Run, read_runs, table
 from mqe_jax.train.logs import number
 
 
 def report(folder: Path, reference: Reference | None = None) -> list[Path]:
-    """Writes FOLDER/report from the finished runs of a sweep; returns the files. InputError without a finished run."""
+    """Writes FOLDER/report from the finished runs of a sweep; returns the files.
+
+    InputError without a finished run.
+    """
     runs = read_runs(folder)
     check_folder(folder / "report", "folder")
     return write_report(runs, folder / "report", reference or Reference())
@@ -33,7 +44,9 @@ def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> lis
     text = ["# Results", "", _EXPLANATION, *label, ""]
     text += [markdown(finals), "", "![Training curves](curves.png)", ""]
     if with_evaluations := select_evaluated(cells):
-        files["evaluations.png"] = draw_evaluations({cell: cells[cell] for cell in with_evaluations}, reference)
+        files["evaluations.png"] = draw_evaluations(
+            {cell: cells[cell] for cell in with_evaluations}, reference
+        )
         text += ["![Evaluations during training](evaluations.png)", ""]
     aggregates = aggregate_tables(cells)
     for name, rows in aggregates.items():
@@ -48,10 +61,10 @@ def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> lis
     return [target / name for name in files]
 
 
-_EXPLANATION = f"""Each value is the interquartile mean over seeds with its 95% stratified bootstrap interval.
-`training`: average step reward over the last {LAST:.0%} of training steps; it includes shaping rewards of the settings.
-`absolute`: average step reward of the unmodified task with the best checkpoint over the final evaluation's episodes,
-actions sampled; `success` likewise."""
+_EXPLANATION = f"""Each value is the interquartile mean over seeds with its 95% stratified bootstrap
+interval. `training`: average step reward over the last {LAST:.0%} of training steps; it includes
+shaping rewards of the settings. `absolute`: average step reward of the unmodified task with the
+best checkpoint over the final evaluation's episodes, actions sampled; `success` likewise."""
 _HEADINGS = {
     "aggregate": "Over all tasks, as fractions of each task's range of scores",
     "improvement": "Probability of improvement of the first algorithm over the second",
@@ -60,8 +73,16 @@ _HEADINGS = {
 
 def markdown(rows: Rows) -> str:
     """Returns rows as a Markdown table; an interval joins its value."""
-    names = [name for name in rows[0] if name not in ("low", "high") and not name.endswith(("_low", "_high"))]
-    lines = [names, ["---"] * len(names), *([_format_cell(row, name) for name in names] for row in rows)]
+    names = [
+        name
+        for name in rows[0]
+        if name not in ("low", "high") and not name.endswith(("_low", "_high"))
+    ]
+    lines = [
+        names,
+        ["---"] * len(names),
+        *([_format_cell(row, name) for name in names] for row in rows),
+    ]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
@@ -72,8 +93,13 @@ def _format_cell(row: Mapping[str, Any], name: str) -> str:
         return to_markdown(value)
     if not math.isfinite(value):
         return ""
-    low, high = ("low", "high") if name in ("iqm", "probability") else (f"{name}_low", f"{name}_high")
-    three = [f"{x:.1%}" if name == "success" else _short(x) for x in (value, row.get(low, 0.0), row.get(high, 0.0))]
+    low, high = (
+        ("low", "high") if name in ("iqm", "probability") else (f"{name}_low", f"{name}_high")
+    )
+    three = [
+        f"{x:.1%}" if name == "success" else _short(x)
+        for x in (value, row.get(low, 0.0), row.get(high, 0.0))
+    ]
     return f"{three[0]} [{three[1]}, {three[2]}]" if low in row else three[0]
 
 

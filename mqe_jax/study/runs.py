@@ -1,4 +1,6 @@
-"""Finished runs of a sweep, from FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV; reference values."""
+"""Finished runs of a sweep, from FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV;
+reference values.
+"""
 
 import csv
 import io
@@ -30,7 +32,9 @@ Curve = dict[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Cell:
-    """One task, algorithm and variant of a sweep; runs of different seeds belong to the same cell."""
+    """One task, algorithm and variant of a sweep; runs of different seeds belong to the same
+    cell.
+    """
 
     task: str
     algorithm: str
@@ -57,8 +61,8 @@ class Run:
     seed: int
     curve: Curve  # columns of metrics.csv, (updates,) each
     evaluations: list[dict[str, Any]]
-    """Evaluations during training: {env_steps, sampled, deterministic}; `sampled` and `deterministic` map names such as
-    average_step_reward and success_rate to numbers or None."""
+    """Evaluations during training: {env_steps, sampled, deterministic}; `sampled` and
+    `deterministic` map names such as average_step_reward and success_rate to numbers or None."""
     absolute: dict[str, Any] | None
     """The absolute metric, an evaluation of the best checkpoint; None without evaluations."""
 
@@ -78,25 +82,35 @@ def is_finished(run_dir: Path) -> bool:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Reads the finished runs of a sweep's folder, ordered by path and seed; InputError without any."""
+    """Reads the finished runs of a sweep's folder, ordered by path and seed; InputError without
+    any.
+    """
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
         if path.parent.name.removeprefix("seed").isdecimal() and is_finished(path.parent):
             seed = int(path.parent.name.removeprefix("seed"))
             evaluations = read_evaluations(path.parent)
-            curve, config = read_curve(path.parent / CSV_FILE), load_run_config(path.parent)
+            curve = read_curve(path.parent / CSV_FILE)
+            config = load_run_config(path.parent)
             if curve["env_steps"][-1] != (total := config.num_updates * config.steps_per_update):
                 ends = number(float(curve["env_steps"][-1]))
-                raise InputError(f"{path.parent / CSV_FILE}: ends after {ends} steps; the finished run has {total}")
+                raise InputError(
+                    f"{path.parent / CSV_FILE}: ends after {ends} steps; the finished run has "
+                    f"{total}"
+                )
             cell = Cell.at(path.parent.parent)
             runs.append(Run(cell, seed, curve, evaluations["evaluations"], evaluations["absolute"]))
     if not runs:
-        raise InputError(f"{folder}: has no finished run runs/TASK/ALGORITHM/seed*; it must be a sweep's folder")
+        raise InputError(
+            f"{folder}: has no finished run runs/TASK/ALGORITHM/seed*; it must be a sweep's folder"
+        )
     return sorted(runs, key=lambda run: (run.cell.path.as_posix(), run.seed))
 
 
 def read_curve(path: str | Path) -> Curve:
-    """Reads the columns of a metrics.csv; InputError naming the file, if it is missing, malformed or has no row."""
+    """Reads the columns of a metrics.csv; InputError naming the file, if it is missing, malformed
+    or has no row.
+    """
     curve = read_metrics(path)
     if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):
         raise InputError(f"{path}: has no rows with columns env_steps and {REWARD}")
@@ -105,19 +119,27 @@ def read_curve(path: str | Path) -> Curve:
     return curve
 
 
-def table(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = (), digits: int = DIGITS) -> str:
-    """Returns rows as CSV text, of the columns `names` or those of the first row; numbers as `number` writes them."""
+def table(
+    rows: Sequence[Mapping[str, Any]], names: Sequence[str] = (), digits: int = DIGITS
+) -> str:
+    """Returns rows as CSV text, of the columns `names` or those of the first row; numbers as
+    `number` writes them.
+    """
     text = io.StringIO()
     writer = csv.DictWriter(text, list(names or rows[0]), lineterminator="\n")
     writer.writeheader()
     for row in rows:
-        writer.writerow({name: line(x) if isinstance(x, str) else number(x, digits) for name, x in row.items()})
+        writer.writerow(
+            {name: line(x) if isinstance(x, str) else number(x, digits) for name, x in row.items()}
+        )
     return text.getvalue()
 
 
 @settings_class
 class Reference:
-    """Values that a report compares with, such as a paper's, and the titles and order of its cells."""
+    """Values that a report compares with, such as a paper's, and the titles and order of its
+    cells.
+    """
 
     label: str = "reference"
     """What the values are, in the legend of figures."""
@@ -136,7 +158,9 @@ class Reference:
 
 
 def load_reference(path: Path) -> Reference:
-    """Reads a YAML file with the fields of `Reference`; InputError naming the file, for invalid content."""
+    """Reads a YAML file with the fields of `Reference`; InputError naming the file, for invalid
+    content.
+    """
     try:
         return build(Reference, load_yaml(path))
     except InputError as error:

@@ -21,7 +21,15 @@ from annotated_types import MaxLen, MinLen
 from mqe_jax.core.errors import InputError, InUseError, NonFiniteError, nearest
 from mqe_jax.core.files import check_folder, lock, write_atomically
 from mqe_jax.core.limits import Seed, SeedCount
-from mqe_jax.core.settings import FrozenMapping, build, fail, load_yaml, override, settings_class, to_mapping
+from mqe_jax.core.settings import (
+    FrozenMapping,
+    build,
+    fail,
+    load_yaml,
+    override,
+    settings_class,
+    to_mapping,
+)
 from mqe_jax.core.types import Cast
 from mqe_jax.study.runs import PLAIN, Cell, is_finished, read_curve
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
@@ -32,28 +40,34 @@ from mqe_jax.train.runner import train_seeds
 SWEEP_FILE = "sweep.yaml"
 
 MakeEnvironments = Callable[[TrainConfig, int], Cast]
-"""Factory of the training and evaluation environments for a given number of seeds trained together."""
+"""Factory of the training and evaluation environments for a given number of seeds trained
+together."""
 
 
 @settings_class
 class Sweep:
-    """Settings of a sweep, which trains every combination of tasks, algorithms, variants and seeds."""
+    """Settings of a sweep, which trains every combination of tasks, algorithms, variants and
+    seeds.
+    """
 
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     algorithms: Annotated[tuple[str, ...], MinLen(1)] = ("mappo",)
-    """Names of the algorithms, as `--algorithm` of `mqe train`; `default` has the settings of `mqe train` without."""
+    """Names of the algorithms, as `--algorithm` of `mqe train`; `default` has the settings of `mqe
+    train` without."""
     seeds: Annotated[tuple[Seed, ...], MinLen(1), MaxLen(1000)] = (0, 1, 2, 3, 4)
     """Random seeds."""
     seeds_together: SeedCount | None = None
     """Seeds trained in one program; none trains all of them at once."""
     config: str | None = None
-    """Settings file or shipped name, in which {task} stands for the task's id; none uses that of `mqe train`."""
+    """Settings file or shipped name, in which {task} stands for the task's id; none uses that of
+    `mqe train`."""
     settings: Mapping[str, Any] = FrozenMapping()
-    """Settings that override the file's in every run; {task} in `start`, `opponents` and `mates` stands for the task's
-    id."""
+    """Settings that override the file's in every run; {task} in `start`, `opponents` and `mates`
+    stands for the task's id."""
     variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
-    """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a cell's `variant`."""
+    """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a
+    cell's `variant`."""
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "seeds"):
@@ -61,20 +75,31 @@ class Sweep:
             if len(set(values)) < len(values):
                 fail(name, values, "a list without repetitions")
         for name, values in self.variants.items():
-            if not isinstance(values, Mapping) or not name.replace("-", "").replace("_", "").isalnum():
-                fail(f"variants.{name}", values, "a mapping of settings, under a name of letters and digits")
+            if (
+                not isinstance(values, Mapping)
+                or not name.replace("-", "").replace("_", "").isalnum()
+            ):
+                fail(
+                    f"variants.{name}",
+                    values,
+                    "a mapping of settings, under a name of letters and digits",
+                )
 
 
 @settings_class
 class Measurement:
-    """Settings of a part that measures policies: a call for every combination of tasks and variants."""
+    """Settings of a part that measures policies: a call for every combination of tasks and
+    variants.
+    """
 
     measure: str
-    """What is called: evaluate, tournament, exploitability or double_oracle, as in `mqe_jax`, or pool_of_mates."""
+    """What is called: evaluate, tournament, exploitability or double_oracle, as in `mqe_jax`, or
+    pool_of_mates."""
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     arguments: Mapping[str, Any] = FrozenMapping()
-    """Arguments of the call, in which {task} stands for the task's id, in a list also * for any part of a file name."""
+    """Arguments of the call, in which {task} stands for the task's id, in a list also * for any
+    part of a file name."""
     by_task: Mapping[str, Any] = FrozenMapping()
     """Arguments of a task, by its id, that override these, such as go1gate: {episodes: 64}."""
     variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
@@ -105,10 +130,14 @@ class Job:
 
 
 def load_sweep(path: Path, part: str | None = None) -> Sweep:
-    """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to parts; InputError names the file."""
+    """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to parts; InputError
+    names the file.
+    """
     loaded = load_part(path, part)
     if isinstance(loaded, Measurement):
-        raise InputError(f"{path}: measure: {loaded.measure!r} is not allowed; it must be a sweep of trainings")
+        raise InputError(
+            f"{path}: measure: {loaded.measure!r} is not allowed; it must be a sweep of trainings"
+        )
     return loaded
 
 
@@ -117,9 +146,13 @@ def load_part(path: Path, part: str | None = None) -> Sweep | Measurement:
     values = load_yaml(path)
     if part is not None:
         if not isinstance(values.get(part), dict):
-            raise InputError(f"{path}: has no part {part!r}{nearest(part, values)}; it has: {', '.join(values)}")
+            raise InputError(
+                f"{path}: has no part {part!r}{nearest(part, values)}; it has: {', '.join(values)}"
+            )
         values = values[part]
-    elif "tasks" not in values and any(isinstance(value, dict) and "tasks" in value for value in values.values()):
+    elif "tasks" not in values and any(
+        isinstance(value, dict) and "tasks" in value for value in values.values()
+    ):
         raise InputError(f"part: none is named; {path} has: {', '.join(values)}")
     try:
         return build(Measurement if "measure" in values else Sweep, values)
@@ -128,20 +161,27 @@ def load_part(path: Path, part: str | None = None) -> Sweep | Measurement:
 
 
 def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
-    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all without patterns."""
+    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all
+    without patterns.
+    """
     product = itertools.product(sweep.tasks, sweep.algorithms, sweep.variants)
     cells = {cell.path.as_posix(): cell for cell in itertools.starmap(Cell, product)}
     return [cells[name] for name in match_names(cells, patterns, "*/mat")]
 
 
 def match_names(names: Iterable[str], patterns: Sequence[str], example: str) -> list[str]:
-    """Returns the names of cells that match a pattern, all without patterns; InputError for one that matches none."""
-    known, wanted = [*names], set[str]()
+    """Returns the names of cells that match a pattern, all without patterns; InputError for one
+    that matches none.
+    """
+    known = [*names]
+    wanted = set[str]()
     for pattern in patterns or ("*",):
         found = [name for name in known if fnmatch.fnmatchcase(name, pattern)]
         if not found:
             allowed = f"allowed: {', '.join(known)}, or patterns such as {example}"
-            raise InputError(f"cells: {pattern!r} matches no cell{nearest(pattern, known)}; {allowed}")
+            raise InputError(
+                f"cells: {pattern!r} matches no cell{nearest(pattern, known)}; {allowed}"
+            )
         wanted.update(found)
     return [name for name in known if name in wanted]
 
@@ -154,11 +194,13 @@ def plan(
     seeds: Sequence[int] = (),
     check: Callable[[TrainConfig, int], object] = lambda config, seeds: None,
 ) -> list[Job]:
-    """Returns the remaining jobs, in the order of training, of the cells that `select` returns for `cells`.
+    """Returns the remaining jobs, in the order of training, of the cells that `select` returns for
+    `cells`.
 
-    `seeds` are some of the sweep's, all if empty. `config_of(task, algorithm)` gives the settings that those of the
-    sweep override. `check(config, seeds)` raises an InputError for settings with which so many seeds could not start;
-    no cell is trained before. Seeds whose newest checkpoints differ are trained in separate jobs.
+    `seeds` are some of the sweep's, all if empty. `config_of(task, algorithm)` gives the settings
+    that those of the sweep override. `check(config, seeds)` raises an InputError for settings with
+    which so many seeds could not start; no cell is trained before. Seeds whose newest checkpoints
+    differ are trained in separate jobs.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
@@ -178,10 +220,15 @@ def plan(
                 check_folders([_run(folder, cell, seed)], resume=True)
         except InputError as error:
             raise InputError(f"{cell.path.as_posix()}: {error}") from None
-        newest = {seed: "".join(file.name for file in list_checkpoints(_run(folder, cell, seed))[-1:]) for seed in left}
+        newest = {
+            seed: "".join(file.name for file in list_checkpoints(_run(folder, cell, seed))[-1:])
+            for seed in left
+        }
         for name in sorted({*newest.values()}, reverse=True):  # those without a checkpoint last
             group = [seed for seed in left if newest[seed] == name]
-            jobs += [_job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)]
+            jobs += [
+                _job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)
+            ]
     return jobs
 
 
@@ -195,10 +242,16 @@ def for_task(values: Any, task: str) -> Any:
 
 
 def _override(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
-    """Returns settings with those of the mapping `name` in a sweep file; its errors have this prefix."""
+    """Returns settings with those of the mapping `name` in a sweep file; its errors have this
+    prefix.
+    """
     for key in ("task", "seed"):
         if key in changes:
-            fail(f"{name}.{key}", changes[key], f"left out: the sweep's {key}s are in its list `{key}s`")
+            fail(
+                f"{name}.{key}",
+                changes[key],
+                f"left out: the sweep's {key}s are in its list `{key}s`",
+            )
     try:
         return override(config, changes)
     except InputError as error:
@@ -217,10 +270,13 @@ def _run(folder: Path, cell: Cell, seed: int) -> Path:
 
 
 def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
-    """Returns the estimated duration of each job, s, from runs of the same task and algorithm, else of all; or NaN."""
+    """Returns the estimated duration of each job, s, from runs of the same task and algorithm, else
+    of all; or NaN.
+    """
     speeds: dict[tuple[str, ...], list[float]] = {}
     for path in sorted(folder.glob("runs/*/*/seed*/metrics.csv")):
-        with contextlib.suppress(InputError, KeyError):  # stopped before the first update, or without fps
+        # stopped before the first update, or without fps
+        with contextlib.suppress(InputError, KeyError):
             fps = read_curve(path)["fps"]
             speed = float(fps[len(fps) // 2])
             for key in ((), path.parts[-4:-2]):
@@ -235,7 +291,8 @@ def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
 def prepare(sweep: Sweep, folder: Path, *, write: bool = True) -> None:
     """Writes sweep.yaml into a folder, or without `write` only checks that this is possible.
 
-    Tasks, algorithms, variants and seeds may be added later; InputError for a sweep with different settings.
+    Tasks, algorithms, variants and seeds may be added later; InputError for a sweep with different
+    settings.
     """
     for place in (folder, folder / "report"):
         check_folder(place, "folder")
@@ -243,12 +300,18 @@ def prepare(sweep: Sweep, folder: Path, *, write: bool = True) -> None:
     if path.is_file():
         before = load_sweep(path)
         for name in ("config", "settings"):
-            old, new = getattr(before, name), getattr(sweep, name)
+            old = getattr(before, name)
+            new = getattr(sweep, name)
             if old != new:
-                raise InputError(f"{name}: {new!r} differs from {path}, which has {old!r}; name another folder")
+                raise InputError(
+                    f"{name}: {new!r} differs from {path}, which has {old!r}; name another folder"
+                )
         for name, values in before.variants.items():
             if sweep.variants.get(name, values) != values:
-                raise InputError(f"variants.{name}: differs from {path}, which has {values!r}; name another folder")
+                raise InputError(
+                    f"variants.{name}: differs from {path}, which has {values!r}; name another "
+                    "folder"
+                )
     if write:
         write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
 
@@ -268,8 +331,9 @@ def run(
 ) -> Unfinished:
     """Trains the jobs sequentially, until `stop()`; each resumes from its checkpoints.
 
-    A job that fails (bad input, files, numbers that are not finite, memory) does not stop the others: `on_failure` is
-    called at once. Several processes may run the same sweep: the one that locks a job's run folders first trains it.
+    A job that fails (bad input, files, numbers that are not finite, memory) does not stop the
+    others: `on_failure` is called at once. Several processes may run the same sweep: the one that
+    locks a job's run folders first trains it.
     """
     unfinished = Unfinished([], [])
     for job in jobs:

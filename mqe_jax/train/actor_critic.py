@@ -1,4 +1,6 @@
-"""The network `actor_critic`: feed-forward or recurrent actors, centralised or decentralised critic."""
+"""The network `actor_critic`: feed-forward or recurrent actors, centralised or decentralised
+critic.
+"""
 
 import functools
 import math
@@ -16,21 +18,35 @@ from mqe_jax.train.encoder import Encoder, of_team, plain
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import ActorCritic, ChunkResult, EnvDims, Network
 
-_ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu, "elu": jax.nn.elu, "tanh": jnp.tanh}
+_ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "relu": jax.nn.relu,
+    "elu": jax.nn.elu,
+    "tanh": jnp.tanh,
+}
 
 
-def _trunk_init(key: jax.Array, encoder: Encoder, n_out: int, final_scale: float, settings: ActorCritic) -> Params:
+def _trunk_init(
+    key: jax.Array, encoder: Encoder, n_out: int, final_scale: float, settings: ActorCritic
+) -> Params:
     hidden_key, gru_key, head_key = jax.random.split(key, 3)
     width = settings.hidden_sizes[-1]
     params: Params = {
-        "hidden": nn.mlp_init(hidden_key, (encoder.size, *settings.hidden_sizes), final_scale=math.sqrt(2.0)),
-        "head": nn.dense_init(head_key, settings.gru_size if settings.recurrent else width, n_out, final_scale),
+        "hidden": nn.mlp_init(
+            hidden_key, (encoder.size, *settings.hidden_sizes), final_scale=math.sqrt(2.0)
+        ),
+        "head": nn.dense_init(
+            head_key, settings.gru_size if settings.recurrent else width, n_out, final_scale
+        ),
     }
     if settings.recurrent:
         params["gru"] = nn.gru_init(gru_key, width, settings.gru_size)
     if settings.openrl_layers:
         params["linear"] = nn.dense_init(jax.random.fold_in(hidden_key, 1), width, width)
-        widths = (*settings.hidden_sizes, width, *((settings.gru_size,) if settings.recurrent else ()))
+        widths = (
+            *settings.hidden_sizes,
+            width,
+            *((settings.gru_size,) if settings.recurrent else ()),
+        )
         params["norm"] = {str(i): nn.layer_norm_init(size) for i, size in enumerate(widths)}
     if encoded := encoder.init(jax.random.fold_in(key, 1)):
         params["encoder"] = encoded
@@ -44,13 +60,22 @@ def _hidden(params: Params, x: jax.Array, settings: ActorCritic) -> jax.Array:
         return nn.mlp(params["hidden"], x, activation, activate_last=True)
     for i in range(len(settings.hidden_sizes)):
         x = nn.layer_norm(params["norm"][str(i)], activation(nn.dense(params["hidden"][str(i)], x)))
-    return nn.layer_norm(params["norm"][str(len(settings.hidden_sizes))], nn.dense(params["linear"], x))
+    return nn.layer_norm(
+        params["norm"][str(len(settings.hidden_sizes))], nn.dense(params["linear"], x)
+    )
 
 
 def _trunk(
-    params: Params, memory: Memory, is_first: jax.Array, x: jax.Array, encoder: Encoder, settings: ActorCritic
+    params: Params,
+    memory: Memory,
+    is_first: jax.Array,
+    x: jax.Array,
+    encoder: Encoder,
+    settings: ActorCritic,
 ) -> tuple[jax.Array, Memory]:
-    """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ..., n_out), memory."""
+    """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ...,
+    n_out), memory.
+    """
     x = _hidden(params, encoder.apply(params.get("encoder", {}), x), settings)
     if settings.recurrent:
 
@@ -68,14 +93,27 @@ def _trunk(
 def network(settings: ActorCritic, dims: EnvDims, encoder: Encoder | None = None) -> Network:
     """Returns the network; `encoder` is that of an agent's observation, by default none."""
     encoder = encoder or plain(dims.observation)
-    agents, share = dims.agents, settings.share_policy
+    agents = dims.agents
+    share = settings.share_policy
     own = settings.critic_input == "own"
     if own and dims.values != agents:
-        fail("network.critic_input", "own", "'privileged' or 'observations' when ppo.value is 'joint'")
+        fail(
+            "network.critic_input",
+            "own",
+            "'privileged' or 'observations' when ppo.value is 'joint'",
+        )
     if settings.critic_input == "privileged" and not dims.privileged:
-        fail("network.critic_input", "privileged", "'observations' or 'own': there is no privileged observation")
+        fail(
+            "network.critic_input",
+            "privileged",
+            "'observations' or 'own': there is no privileged observation",
+        )
     critic_rows = agents if own else 1
-    encoders = {"privileged": plain(dims.privileged), "observations": of_team(encoder, agents), "own": encoder}
+    encoders = {
+        "privileged": plain(dims.privileged),
+        "observations": of_team(encoder, agents),
+        "own": encoder,
+    }
     critic_encoder = encoders[settings.critic_input]
     critic_out = 1 if own else dims.values
     critic_shared = share or not own
@@ -97,7 +135,9 @@ def network(settings: ActorCritic, dims: EnvDims, encoder: Encoder | None = None
         return {
             "actor": actor_init(actor_key) if share else jax.vmap(actor_init)(actor_key),
             "log_std": jnp.full(log_std_shape, settings.log_std_init, jnp.float32),
-            "critic": critic_init(critic_key) if critic_shared else jax.vmap(critic_init)(critic_key),
+            "critic": critic_init(critic_key)
+            if critic_shared
+            else jax.vmap(critic_init)(critic_key),
         }
 
     def policy_params(params: Params) -> Params:
@@ -112,7 +152,12 @@ def network(settings: ActorCritic, dims: EnvDims, encoder: Encoder | None = None
         )
 
     def run(
-        params: Params, encoder: Encoder, shared: bool, memory: Memory, is_first: jax.Array, x: jax.Array
+        params: Params,
+        encoder: Encoder,
+        shared: bool,
+        memory: Memory,
+        is_first: jax.Array,
+        x: jax.Array,
     ) -> tuple[jax.Array, Memory]:
         trunk: Any = functools.partial(_trunk, encoder=encoder, settings=settings)
         if not shared:  # a set of parameters for each agent
@@ -133,14 +178,20 @@ def network(settings: ActorCritic, dims: EnvDims, encoder: Encoder | None = None
     ) -> tuple[jax.Array, jax.Array, Memory]:
         is_first = jnp.zeros((1, *obs.shape[:-2]), bool)
         mean, log_std, memory = distribution(params, memory, is_first, obs[None])
-        mean, log_std = mean[0], log_std[0]
+        mean = mean[0]
+        log_std = log_std[0]
         action = mean
         if key is not None:
             action = mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
         return action, log_prob(action, mean, log_std), memory
 
     def value(
-        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array, active: Mask = None
+        params: Params,
+        memory: Memory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        active: Mask = None,
     ) -> tuple[jax.Array, Memory]:
         if settings.critic_input == "privileged":
             x = privileged[..., None, :]

@@ -28,7 +28,11 @@ _FINITE = (-float(np.finfo(np.float32).max), float(np.finfo(np.float32).max))
 _RANGES: tuple[tuple[str, float, float], ...] = (
     (r"normalizer/(obs/|privileged/)?(variance|samples|square|weight)$", 0.0, _FINITE[1]),
     (r"^optimizer/(square/|updates$)|^learning_rate$", 0.0, _FINITE[1]),
-    (r"^(updates|rollout/episode_steps|extra/(played|snapshot|recent|member|pool/(games|score)))$", 0.0, _FINITE[1]),
+    (
+        r"^(updates|rollout/episode_steps|extra/(played|snapshot|recent|member|pool/(games|score)))$",
+        0.0,
+        _FINITE[1],
+    ),
     (r"^extra/pool/born$", -1.0, _FINITE[1]),
     (r"^assistance$", 0.0, 1.0),
     (r"(^|/)params/(?!critic)", -limits.WEIGHT, limits.WEIGHT),
@@ -52,7 +56,9 @@ class Checkpoint(NamedTuple):
 def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:
     """Returns the leaves by path name, in the tree's order, and the tree's structure."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}, structure
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves
+    }, structure
 
 
 def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
@@ -66,7 +72,9 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
 
 @check_arguments(path=PathText, metadata=Mapping[str, Any], kind=Kind)
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
-    """Writes a pytree of arrays with JSON metadata as a file of a kind; equal content gives equal bytes."""
+    """Writes a pytree of arrays with JSON metadata as a file of a kind; equal content gives equal
+    bytes.
+    """
     try:
         text = json.dumps(dict(metadata), sort_keys=True)
     except (TypeError, ValueError):
@@ -74,8 +82,15 @@ def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind:
     try:
         named, _ = _flatten(jax.device_get(raw_keys(tree)))
         # ascontiguousarray turns scalars into (1,); load_tree checks the original shape
-        arrays = {name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()}
-        header = {"kind": kind, "version": str(VERSION), "checksum": _checksum(arrays, text), "metadata": text}
+        arrays = {
+            name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()
+        }
+        header = {
+            "kind": kind,
+            "version": str(VERSION),
+            "checksum": _checksum(arrays, text),
+            "metadata": text,
+        }
         content = save(arrays, {FORMAT: json.dumps(header)})
     except (SafetensorError, TypeError, ValueError):
         fail("tree", tree, "a pytree of arrays")
@@ -83,7 +98,9 @@ def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind:
 
 
 def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Returns arrays by name and metadata; raises an InputError that names the file and what is wrong."""
+    """Returns arrays by name and metadata; raises an InputError that names the file and what is
+    wrong.
+    """
     if not path.exists():
         raise InputError(f"{path}: no such file; a {kind} written by this package is needed")
     check_file(path, _LARGEST[kind])
@@ -91,12 +108,17 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
         with parsing(path, f"a {kind}, or truncated"), safe_open(path, framework="numpy") as file:
             found = file.metadata() or {}
             if FORMAT not in found:
-                raise InputError(f"not a file of this package, or of a version before 0.2.0; a {kind} is needed")
+                raise InputError(
+                    f"not a file of this package, or of a version before 0.2.0; a {kind} is needed"
+                )
             header = parse_json(found[FORMAT], "header")
             if header["kind"] != kind:
                 raise InputError(f"holds a {brief(str(header['kind']))}; a {kind} is needed")
             if header["version"] != str(VERSION):
-                raise InputError(f"has format version {brief(str(header['version']))}; version {VERSION} is needed")
+                raise InputError(
+                    f"has format version {brief(str(header['version']))}; version {VERSION} is "
+                    "needed"
+                )
             arrays = {name: file.get_tensor(name) for name in file.keys()}
             metadata = parse_json(header["metadata"], "metadata")
             if not isinstance(metadata, dict):
@@ -116,27 +138,38 @@ def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
 
 
 @check_arguments(path=PathText, kind=Kind, half=bool, part=str)
-def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False, part: str = "") -> Checkpoint:
+def load_tree(
+    path: str | Path, template: Any, *, kind: str, half: bool = False, part: str = ""
+) -> Checkpoint:
     """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
 
-    With `half`, float16 leaves are converted to float32. With `part`, only the leaves below this path name are read,
-    such as "extra/pool/". InputError, naming the file, if it is missing, damaged or of another version, and for leaves
-    that are missing, unknown, impossible or of another shape or dtype.
+    With `half`, float16 leaves are converted to float32. With `part`, only the leaves below this
+    path name are read, such as "extra/pool/". InputError, naming the file, if it is missing,
+    damaged or of another version, and for leaves that are missing, unknown, impossible or of
+    another shape or dtype.
     """
     path = Path(path)
     arrays, metadata = _read(path, kind)
-    arrays = {name.removeprefix(part): array for name, array in arrays.items() if name.startswith(part)}
+    arrays = {
+        name.removeprefix(part): array for name, array in arrays.items() if name.startswith(part)
+    }
     expected, structure = _flatten(template)
     for name in expected:
         if name not in arrays:
-            raise InputError(f"{path}: {name} is missing; the file has other settings or is of another version")
+            raise InputError(
+                f"{path}: {name} is missing; the file has other settings or is of another version"
+            )
     for name in arrays:
         if name not in expected:
-            raise InputError(f"{path}: unexpected entry {name}, not defined by the current settings")
+            raise InputError(
+                f"{path}: unexpected entry {name}, not defined by the current settings"
+            )
     for name, leaf in _flatten(jax.eval_shape(raw_keys, template))[0].items():
         found = arrays[name]
         if tuple(found.shape) != tuple(leaf.shape):
-            raise InputError(f"{path}: {name} has shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed")
+            raise InputError(
+                f"{path}: {name} has shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed"
+            )
         if half and found.dtype == np.float16 and leaf.dtype == np.float32:
             arrays[name] = found.astype(np.float32)
         elif found.dtype != leaf.dtype:
@@ -152,10 +185,18 @@ def load_tree(path: str | Path, template: Any, *, kind: str, half: bool = False,
 
 def _check_range(path: Path, name: str, array: np.ndarray) -> None:
     """Raises an InputError for numbers that no training writes."""
-    low, high = next(((low, high) for pattern, low, high in _RANGES if re.search(pattern, name)), _FINITE)
-    if array.dtype.kind in "fiu" and not _ANY.search(name) and not np.all(within := (array >= low) & (array <= high)):
+    low, high = next(
+        ((low, high) for pattern, low, high in _RANGES if re.search(pattern, name)), _FINITE
+    )
+    if (
+        array.dtype.kind in "fiu"
+        and not _ANY.search(name)
+        and not np.all(within := (array >= low) & (array <= high))
+    ):
         wrong = array[~within].flat[0]
-        raise InputError(f"{path}: {name} holds {wrong}; a number from {low:g} to {high:g} is needed")
+        raise InputError(
+            f"{path}: {name} holds {wrong}; a number from {low:g} to {high:g} is needed"
+        )
 
 
 def checkpoint_folder(run_dir: str | Path) -> Path:
@@ -169,7 +210,9 @@ def list_checkpoints(run_dir: str | Path) -> list[Path]:
 
 
 def files_by_step(folder: Path) -> list[Path]:
-    """Returns the files of a folder that are named by environment steps, as checkpoints are, oldest first."""
+    """Returns the files of a folder that are named by environment steps, as checkpoints are, oldest
+    first.
+    """
     return sorted(p for p in folder.glob("step_*.safetensors") if _NAME.fullmatch(p.name))
 
 
@@ -187,10 +230,16 @@ def latest(run_dir: str | Path) -> Path | None:
 
 def nonfinite(tree: Any) -> list[str]:
     """Returns the path names of the leaves that hold NaN or infinite numbers."""
-    return [name for name, leaf in _flatten(jax.device_get(raw_keys(tree)))[0].items() if not np.all(np.isfinite(leaf))]
+    return [
+        name
+        for name, leaf in _flatten(jax.device_get(raw_keys(tree)))[0].items()
+        if not np.all(np.isfinite(leaf))
+    ]
 
 
-def save_checkpoint(run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int) -> Path:
+def save_checkpoint(
+    run_dir: str | Path, tree: Any, step: int, metadata: Mapping[str, Any], keep: int
+) -> Path:
     """Writes a checkpoint of environment step `step`, then removes all but the newest `keep`."""
     folder = checkpoint_folder(run_dir)
     make_folder(folder)

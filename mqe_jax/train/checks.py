@@ -17,11 +17,20 @@ from mqe_jax.train.networks import Network
 def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
     if len(teams_of(env)) > 1:
-        raise InputError(f"env: {env.name} has {len(teams_of(env))} teams; use versus(env, opponents) or Mirror(env)")
+        raise InputError(
+            f"env: {env.name} has {len(teams_of(env))} teams; use versus(env, opponents) or "
+            "Mirror(env)"
+        )
     if env.num_envs * processes != config.num_envs:
-        fail("num_envs", config.num_envs, f"equal to the environment's num_envs, {env.num_envs * processes}")
+        fail(
+            "num_envs",
+            config.num_envs,
+            f"equal to the environment's num_envs, {env.num_envs * processes}",
+        )
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    count, agents, privileged = env.num_envs, env.num_agents, env.privileged_observation_size
+    count = env.num_envs
+    agents = env.num_agents
+    privileged = env.privileged_observation_size
     expected = {
         "obs": (count, agents, env.observation_size),
         "final_obs": (count, agents, env.observation_size),
@@ -31,10 +40,21 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
         "terminated": (count,),
         "truncated": (count,),
     }
-    reads, other = config.network.critic_reads, config.group != "policy"
-    if other and "obs" in reads and config.group not in (getattr(state, "final_groups", None) or {}):
-        raise InputError(f"env: final_groups of {env.name} lacks {config.group!r}, which the critic reads")
-    left_out = {f"final_{name}" for name in ("obs", "privileged_obs") if name not in reads or (name == "obs" and other)}
+    reads = config.network.critic_reads
+    other = config.group != "policy"
+    if (
+        other
+        and "obs" in reads
+        and config.group not in (getattr(state, "final_groups", None) or {})
+    ):
+        raise InputError(
+            f"env: final_groups of {env.name} lacks {config.group!r}, which the critic reads"
+        )
+    left_out = {
+        f"final_{name}"
+        for name in ("obs", "privileged_obs")
+        if name not in reads or (name == "obs" and other)
+    }
     for name, shape in expected.items():
         value = getattr(state, name)
         if value is None and name in left_out:
@@ -43,30 +63,57 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
             found = "is missing" if value is None else f"has shape {value.shape}"
             raise InputError(f"env: {name} of {env.name} {found}; expected {shape}")
     numbers = env.num_agents * (env.observation_size + env.action_size + 4) + privileged
-    check_memory("rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update / processes)
+    check_memory(
+        "rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update / processes
+    )
     assistance = config.curriculum.assistance
     if assistance and not hasattr(state, "assistance"):
         fail("curriculum.assistance", assistance, f"0: the state of {env.name} has no such field")
-    if config.stagger_episodes and not (hasattr(env, "max_episode_steps") and hasattr(state, "step")):
-        fail("stagger_episodes", True, f"false: {env.name} has no max_episode_steps, or its state has no field step")
+    if config.stagger_episodes and not (
+        hasattr(env, "max_episode_steps") and hasattr(state, "step")
+    ):
+        fail(
+            "stagger_episodes",
+            True,
+            f"false: {env.name} has no max_episode_steps, or its state has no field step",
+        )
 
 
 def check_teacher(config: TrainConfig, teacher: Any) -> None:
     """Checks that there is a teacher if and only if the settings name one."""
     if (config.imitation.teacher is None) != (teacher is None):
-        fail("imitation.teacher", config.imitation.teacher, "a policy, which is the learner's argument `teacher`")
+        fail(
+            "imitation.teacher",
+            config.imitation.teacher,
+            "a policy, which is the learner's argument `teacher`",
+        )
 
 
 def check_divisible(config: TrainConfig, network: Network, processes: int = 1) -> None:
     """Checks that rollouts split into chunks, and these into minibatches."""
     if config.rollout_steps % network.chunk_length:
-        fail("rollout_steps", config.rollout_steps, f"a multiple of the network's chunk_length, {network.chunk_length}")
+        fail(
+            "rollout_steps",
+            config.rollout_steps,
+            f"a multiple of the network's chunk_length, {network.chunk_length}",
+        )
     chunks = config.steps_per_update // network.chunk_length
     if chunks % config.ppo.minibatches:
-        fail("ppo.minibatches", config.ppo.minibatches, f"a divisor of the rollout's number of chunks ({chunks})")
+        fail(
+            "ppo.minibatches",
+            config.ppo.minibatches,
+            f"a divisor of the rollout's number of chunks ({chunks})",
+        )
     groups = config.ppo.groups
     if config.num_envs % groups or chunks // groups % config.ppo.minibatches:
-        wanted = f"a divisor of num_envs ({config.num_envs}) that leaves each a multiple of ppo.minibatches chunks"
+        wanted = (
+            f"a divisor of num_envs ({config.num_envs}) that leaves each a multiple of "
+            "ppo.minibatches chunks"
+        )
         fail("ppo.groups", groups, f"{wanted} ({config.ppo.minibatches}), of {chunks} in all")
     if config.ppo.minibatches > 1 and groups % processes:
-        fail("ppo.groups", groups, f"a multiple of the number of processes, {processes}, if there are minibatches")
+        fail(
+            "ppo.groups",
+            groups,
+            f"a multiple of the number of processes, {processes}, if there are minibatches",
+        )

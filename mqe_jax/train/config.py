@@ -21,7 +21,16 @@ from mqe_jax.core.limits import (
     Seed,
     Steps,
 )
-from mqe_jax.core.settings import FileName, FrozenMapping, Parameters, fail, load_yaml, merge, override, settings_class
+from mqe_jax.core.settings import (
+    FileName,
+    FrozenMapping,
+    Parameters,
+    fail,
+    load_yaml,
+    merge,
+    override,
+    settings_class,
+)
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
@@ -37,22 +46,25 @@ class PPO:
     minibatches: PositiveInt = 1
     """Minibatches per epoch."""
     groups: PositiveInt = 1
-    """Groups of environments with equal shares of every minibatch, a multiple of the number of processes. Runs with
-    equal `groups` are equal on any number of processes."""
+    """Groups of environments with equal shares of every minibatch, a multiple of the number of
+    processes. Runs with equal `groups` are equal on any number of processes."""
     ratio: Literal["agent", "dimension", "joint"] = "agent"
-    """Probability ratio that is clipped: per agent, per action dimension (OpenRL's MAPPO), or joint (JRPO)."""
+    """Probability ratio that is clipped: per agent, per action dimension (OpenRL's MAPPO), or joint
+    (JRPO)."""
     value: Literal["agent", "joint"] = "agent"
     """One value per agent, or one of the team, of its mean reward."""
     clip: Positive = 0.2
     """Half width of the clipping interval of the ratio."""
     dual_clip: Annotated[float, Gt(1)] | None = None
-    """Dual-clip coefficient c: for A < 0 the loss is at most c |A| (the paper's variant: 3.0); none disables it."""
+    """Dual-clip coefficient c: for A < 0 the loss is at most c |A| (the paper's variant: 3.0); none
+    disables it."""
     gamma: Fraction = 0.99
     """Discount per step."""
     gae_lambda: Fraction = 0.95
     """Trace decay of generalised advantage estimation."""
     value_clip: Positive | None = 0.2
-    """Half width of the clipping interval around the old value in the value loss; none disables clipping."""
+    """Half width of the clipping interval around the old value in the value loss; none disables
+    clipping."""
     huber_delta: Positive | None = 10.0
     """Huber threshold of the value loss, in normalised values; none uses the squared error."""
     value_coef: NonNegative = 0.5
@@ -62,7 +74,8 @@ class PPO:
     entropy_coef_final: NonNegative | None = None
     """Weight of the entropy bonus at the end, annealed linearly; none keeps it constant."""
     critic_warmup: Fraction = 0.0
-    """Initial fraction of training in which only the critic is trained, for a policy that starts from weights."""
+    """Initial fraction of training in which only the critic is trained, for a policy that starts
+    from weights."""
 
 
 @settings_class
@@ -76,8 +89,8 @@ class OptimizerSettings:
     anneal: Annotated[float, Gt(0), Le(1)] = 1.0
     """Final fraction of the run over which the linear schedule falls."""
     target_kl: Positive | None = None
-    """KL divergence per minibatch to which the learning rate adapts; it does not rise while the schedule falls. None:
-    only the schedule."""
+    """KL divergence per minibatch to which the learning rate adapts; it does not rise while the
+    schedule falls. None: only the schedule."""
     eps: Positive = 1e-5
     """Adam's epsilon."""
     max_grad_norm: Positive | None = 10.0
@@ -86,32 +99,38 @@ class OptimizerSettings:
 
 @settings_class
 class Curriculum:
-    """Curriculum: task modifications annealed to zero during training; not applied in evaluation."""
+    """Curriculum: task modifications annealed to zero during training; not applied in
+    evaluation.
+    """
 
     assistance: Fraction = 0.0
     """Initial assistance of the environment (its state's `assistance`), annealed linearly to 0."""
     assistance_until: Positive = 0.5
     """Fraction of training after which the assistance is 0."""
     demonstrator: str | None = None
-    """Policy whose episodes provide initial states: scripted, a run folder or a policy file. An episode starts in one
-    with probability `assistance`. None: all episodes start as the task does."""
+    """Policy whose episodes provide initial states: scripted, a run folder or a policy file. An
+    episode starts in one with probability `assistance`. None: all episodes start as the task
+    does."""
     failure_bootstrap: Fraction = 0.0
-    """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in training a failure costs
-    only its penalty, not the future return, which encourages exploration."""
+    """Fraction of the bootstrap value kept at termination, annealed linearly to 0. Early in
+    training a failure costs only its penalty, not the future return, which encourages
+    exploration."""
     failure_bootstrap_until: Positive = 0.5
     """Fraction of training over which `failure_bootstrap` is annealed to 0."""
 
 
 @settings_class
 class Imitation:
-    """A teacher that the policy imitates in the states that it reaches itself (Schmitt et al., arXiv 1803.03835).
+    """A teacher that the policy imitates in the states that it reaches itself (Schmitt et al.,
+    arXiv 1803.03835).
 
     The loss is the negative log-probability of the teacher's action.
     """
 
     teacher: str | None = None
-    """Policy to imitate: scripted, the task (its shipped policy), a run folder or a policy file. It sees its own group
-    of observations, and the task gets the parameters that it needs. None disables imitation."""
+    """Policy to imitate: scripted, the task (its shipped policy), a run folder or a policy file. It
+    sees its own group of observations, and the task gets the parameters that it needs. None
+    disables imitation."""
     weight: NonNegative = 1.0
     """Initial weight of the loss, annealed linearly to 0."""
     until: Positive = 0.5
@@ -141,7 +160,8 @@ class LeagueSettings:
     snapshot_steps: Steps = 3_000_000
     """Environment steps after which the policy becomes a member."""
     snapshot_win_rate: Fraction = 0.7
-    """Mean win rate against the members at which the policy joins them after only a quarter of these steps."""
+    """Mean win rate against the members at which the policy joins them after only a quarter of
+    these steps."""
     episodes: Episodes = 200
     """Episodes that a block of environments plays against a member before another one is drawn."""
 
@@ -155,22 +175,25 @@ class Checkpointing:
     kept: PositiveInt = 2
     """Number of checkpoints to keep, the newest ones."""
     environments: bool = True
-    """Include the environments' states, so that a resumed run continues exactly. Without them a checkpoint holds only
-    weights, optimiser state, statistics and keys (under 1 MB), and environments are reset when a run resumes."""
+    """Include the environments' states, so that a resumed run continues exactly. Without them a
+    checkpoint holds only weights, optimiser state, statistics and keys (under 1 MB), and
+    environments are reset when a run resumes."""
 
 
 @settings_class
 class EvaluationSettings:
-    """Evaluation during training, on separate environments of the unmodified task (Gorsane et al., arXiv 2209.10485).
+    """Evaluation during training, on separate environments of the unmodified task (Gorsane et al.,
+    arXiv 2209.10485).
 
-    Half of the environments use sampled actions, the others mean actions. The policy of the best evaluation is kept,
-    and the run ends with its absolute metric, over ten times as many episodes.
+    Half of the environments use sampled actions, the others mean actions. The policy of the best
+    evaluation is kept, and the run ends with its absolute metric, over ten times as many episodes.
     """
 
     every: PositiveInt | None = None
     """Updates between two evaluations; none disables evaluation."""
     episodes: Environments = 32
-    """Episodes per evaluation under sampled actions, and as many under mean actions; one per environment."""
+    """Episodes per evaluation under sampled actions, and as many under mean actions; one per
+    environment."""
 
 
 @settings_class
@@ -189,30 +212,34 @@ class TrainConfig:
     env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
     """Overrides of the task's parameters, passed to the environment unchanged."""
     train_env: Annotated[Parameters, tyro.conf.Suppress] = FrozenMapping()
-    """Further overrides during training, not in evaluation. A parameter of `--set` or `env` replaces one of the
-    file."""
+    """Further overrides during training, not in evaluation. A parameter of `--set` or `env`
+    replaces one of the file."""
     opponents: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _OPPONENT] = ()
-    """Opponent in a match, in training and its evaluations. A run folder, a policy file or the task itself (its shipped
-    policy). Or scripted, another scripted policy of the task, random, idle, forward. In training also newest (the
-    policy itself), older (a member of the league's pool, preferably one that is hard to beat) or uniform (any member).
-    Opponents share the environments equally. Without any, both teams of each match learn."""
+    """Opponent in a match, in training and its evaluations. A run folder, a policy file or the task
+    itself (its shipped policy). Or scripted, another scripted policy of the task, random, idle,
+    forward. In training also newest (the policy itself), older (a member of the league's pool,
+    preferably one that is hard to beat) or uniform (any member). Opponents share the environments
+    equally. Without any, both teams of each match learn."""
     mates: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _MATE] = ()
-    """Pool of mates in a task of one team, in training and its evaluations: what `opponents` accept, except newest,
-    older and uniform. Each has an equal share of the environments, in which it acts for one robot and the policy learns
-    as the others. In one more share the policy acts for the whole team."""
+    """Pool of mates in a task of one team, in training and its evaluations: what `opponents`
+    accept, except newest, older and uniform. Each has an equal share of the environments, in which
+    it acts for one robot and the policy learns as the others. In one more share the policy acts for
+    the whole team."""
     both_sides: bool = False
-    """Whether the policy plays its opponents as the task's team 1 in half of the environments, in evaluations too."""
+    """Whether the policy plays its opponents as the task's team 1 in half of the environments, in
+    evaluations too."""
     draw_reward: float = 0.0
     """Added to the reward of a draw against opponents, during training only."""
     time_limit_ends: bool = False
-    """Whether the time limit ends the episode for the learner too: no value follows, and the privileged observation
-    includes the time left. During training only."""
+    """Whether the time limit ends the episode for the learner too: no value follows, and the
+    privileged observation includes the time left. During training only."""
     league: LeagueSettings = LeagueSettings()
     start: FileName | None = None
-    """Policy to start from: a run folder, a policy file, or a task for its shipped policy. The run takes over its
-    parameters and observation statistics. None: from scratch."""
+    """Policy to start from: a run folder, a policy file, or a task for its shipped policy. The run
+    takes over its parameters and observation statistics. None: from scratch."""
     group: str = "policy"
-    """Group of observations that the policy sees (`env.groups`), and its critic if that reads observations."""
+    """Group of observations that the policy sees (`env.groups`), and its critic if that reads
+    observations."""
     seed: Seed = 0
     """Random seed."""
     num_envs: Environments = 500
@@ -222,9 +249,11 @@ class TrainConfig:
     rollout_steps: Horizon = 200
     """Steps of each environment between two updates."""
     stagger_episodes: bool = False
-    """Start the first episodes at random times, so that environments do not all reset at the same step."""
+    """Start the first episodes at random times, so that environments do not all reset at the same
+    step."""
     action_scale: Positive = 1.0
-    """Factor on sampled actions before the environment clips them; log-probabilities are of the unscaled sample."""
+    """Factor on sampled actions before the environment clips them; log-probabilities are of the
+    unscaled sample."""
     ppo: PPO = PPO()
     optimizer: OptimizerSettings = OptimizerSettings()
     network: Annotated[NetworkSettings, pydantic.BeforeValidator(network_settings)] = ActorCritic()
@@ -233,20 +262,28 @@ class TrainConfig:
     normalization: Normalization = Normalization()
     checkpoint: Checkpointing = Checkpointing()
     loggers: tuple[Literal["tensorboard", "wandb"], ...] = ("tensorboard",)
-    """Loggers besides metrics.csv: tensorboard (if tensorboardX is installed), wandb (offline unless
-    WANDB_MODE=online is set)."""
+    """Loggers besides metrics.csv: tensorboard (if tensorboardX is installed), wandb (offline
+    unless WANDB_MODE=online is set)."""
     evaluation: EvaluationSettings = EvaluationSettings()
 
     def __post_init__(self) -> None:
         if self.curriculum.demonstrator is not None and not self.curriculum.assistance:
-            fail("curriculum.assistance", self.curriculum.assistance, "above 0 if curriculum.demonstrator is set")
+            fail(
+                "curriculum.assistance",
+                self.curriculum.assistance,
+                "above 0 if curriculum.demonstrator is set",
+            )
         if self.ppo.ratio == "joint" and self.ppo.value != "joint":
             fail("ppo.value", self.ppo.value, "'joint' when ppo.ratio is 'joint'")
         shares = len(self.opponents) or 1
         if self.num_envs % shares:
             fail("num_envs", self.num_envs, f"a multiple of the number of opponents, {shares}")
         if self.ppo.critic_warmup and self.network.name == "mat":
-            fail("ppo.critic_warmup", self.ppo.critic_warmup, "0 with the network mat, whose encoder serves both")
+            fail(
+                "ppo.critic_warmup",
+                self.ppo.critic_warmup,
+                "0 with the network mat, whose encoder serves both",
+            )
 
     @property
     def training_env(self) -> dict[str, Any]:

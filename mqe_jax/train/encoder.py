@@ -1,7 +1,7 @@
 """Encoders, the first layers of a network: of an observation as it is, or of its blocks.
 
-Sources: Deep Sets, Zaheer et al., arXiv 1703.06114 (entities); the maximum besides the mean, as in PointNet, Qi et al.,
-arXiv 1612.00593.
+Sources: Deep Sets, Zaheer et al., arXiv 1703.06114 (entities); the maximum besides the mean, as in
+PointNet, Qi et al., arXiv 1612.00593.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,9 @@ def plain(size: int) -> Encoder:
 
 
 def of_team(encoder: Encoder, agents: int) -> Encoder:
-    """Returns the encoder of the observations of all agents, one after another, each by the same encoder."""
+    """Returns the encoder of the observations of all agents, one after another, each by the same
+    encoder.
+    """
 
     def apply(params: Params, x: jax.Array) -> jax.Array:
         each = encoder.apply(params, x.reshape(*x.shape[:-1], agents, -1))
@@ -51,21 +53,33 @@ def by_block(settings: Blocks, dims: EnvDims) -> Encoder:
     """
     blocks = dims.blocks
     if sum(block.width for block in blocks) != dims.observation:
-        fail("network.name", settings.name, "another network: the environment does not describe its observations")
+        fail(
+            "network.name",
+            settings.name,
+            "another network: the environment does not describe its observations",
+        )
     kinds = {_kind(block.entities): block.entities.width for block in blocks if block.entities}
     images = {block.name: block.image for block in blocks if block.image}
 
     def init(key: jax.Array) -> Params:
-        keys = iter(jax.random.split(key, len(kinds) + len(images) * (1 + len(settings.image_channels)) + 1))
+        keys = iter(
+            jax.random.split(key, len(kinds) + len(images) * (1 + len(settings.image_channels)) + 1)
+        )
         params: Params = {}
         for kind, width in kinds.items():
-            params[kind] = nn.mlp_init(next(keys), (width, *settings.entity_sizes), final_scale=2.0**0.5)
+            params[kind] = nn.mlp_init(
+                next(keys), (width, *settings.entity_sizes), final_scale=2.0**0.5
+            )
         for name, (channels, height, width) in images.items():
             layers: Params = {}
             for i, size in enumerate(settings.image_channels):
                 layers[str(i)] = nn.dense_init(next(keys), 9 * channels, size)
-                channels, height, width = size, -(-height // 2), -(-width // 2)
-            layers["out"] = nn.dense_init(next(keys), channels * height * width, settings.image_size)
+                channels = size
+                height = -(-height // 2)
+                width = -(-width // 2)
+            layers["out"] = nn.dense_init(
+                next(keys), channels * height * width, settings.image_size
+            )
             params[name] = layers
         return params
 
@@ -77,22 +91,31 @@ def by_block(settings: Blocks, dims: EnvDims) -> Encoder:
     def apply(params: Params, x: jax.Array) -> jax.Array:
         ends = [sum(block.width for block in blocks[: i + 1]) for i in range(len(blocks))]
         parts = [x[..., end - block.width : end] for block, end in zip(blocks, ends, strict=True)]
-        return jnp.concatenate([encode(params, *each) for each in zip(blocks, parts, strict=True)], axis=-1)
+        return jnp.concatenate(
+            [encode(params, *each) for each in zip(blocks, parts, strict=True)], axis=-1
+        )
 
     sizes = (
-        2 * settings.entity_sizes[-1] if block.entities else settings.image_size if block.image else block.width
+        2 * settings.entity_sizes[-1]
+        if block.entities
+        else settings.image_size
+        if block.image
+        else block.width
         for block in blocks
     )
     return Encoder(init, apply, sum(sizes))
 
 
 def _kind(entities: Entities) -> str:
-    """Returns the name of the parameters of a kind; kinds of one name that differ in width share none."""
+    """Returns the name of the parameters of a kind; kinds of one name that differ in width share
+    none.
+    """
     return f"{entities.kind}_{entities.width}"
 
 
 def pool(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
-    """Returns maxima and means of the features of the entities that are there: (..., block) -> (..., 2 W); 0 if none.
+    """Returns maxima and means of the features of the entities that are there: (..., block) ->
+    (..., 2 W); 0 if none.
 
     Masked entities have no effect. The order of entities has none beyond rounding.
     """
@@ -101,11 +124,15 @@ def pool(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
     features = nn.mlp(params, rows[..., : entities.width], jax.nn.relu, activate_last=True)
     features = jnp.where(there, features, 0.0)  # which no maximum is below
     count = jnp.maximum(jnp.sum(there.astype(x.dtype), axis=-2), 1.0)
-    return jnp.concatenate([jnp.max(features, axis=-2), jnp.sum(features, axis=-2) / count], axis=-1)
+    return jnp.concatenate(
+        [jnp.max(features, axis=-2), jnp.sum(features, axis=-2) / count], axis=-1
+    )
 
 
 def convolve(params: Params, x: jax.Array, image: tuple[int, int, int]) -> jax.Array:
-    """Returns features of an image (..., channels x height x width): convolutions of 3 x 3 pixels at stride 2."""
+    """Returns features of an image (..., channels x height x width): convolutions of 3 x 3 pixels
+    at stride 2.
+    """
     x = jnp.moveaxis(x.reshape(*x.shape[:-1], *image), -3, -1)
     for i in range(len(params) - 1):
         x = jax.nn.relu(nn.dense(params[str(i)], _patches(x)))
@@ -113,7 +140,8 @@ def convolve(params: Params, x: jax.Array, image: tuple[int, int, int]) -> jax.A
 
 
 def _patches(x: jax.Array) -> jax.Array:
-    """Returns the 3 x 3 neighbourhoods of every second pixel: (..., H, W, C) -> (..., H / 2, W / 2, 9 C), rounded up.
+    """Returns the 3 x 3 neighbourhoods of every second pixel: (..., H, W, C) -> (..., H / 2, W / 2,
+    9 C), rounded up.
 
     Beyond the edges are zeros.
     """
@@ -121,6 +149,7 @@ def _patches(x: jax.Array) -> jax.Array:
     for axis in (-3, -2):  # jnp.pad has no translation to a graph
         edge = jnp.zeros_like(jax.lax.slice_in_dim(x, 0, 1, axis=axis))
         x = jnp.concatenate([edge, x, edge], axis=axis)
-    rows, columns = 2 * -(-height // 2) - 1, 2 * -(-width // 2) - 1
+    rows = 2 * -(-height // 2) - 1
+    columns = 2 * -(-width // 2) - 1
     near = [x[..., i : i + rows : 2, j : j + columns : 2, :] for i in range(3) for j in range(3)]
     return jnp.concatenate(near, axis=-1)

@@ -1,4 +1,6 @@
-"""Unbiased evaluation: a fixed quota of episodes from each environment, so that short ones are not over-represented."""
+"""Unbiased evaluation: a fixed quota of episodes from each environment, so that short ones are not
+over-represented.
+"""
 
 import functools
 import math
@@ -34,13 +36,15 @@ from mqe_jax.train.policy import Policy, check_policy
 from mqe_jax.train.rollout import active_of, mean_of_team
 
 Act = Callable[[Any, Memory, jax.Array], tuple[jax.Array, Memory]]
-"""`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the recurrent state."""
+"""`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the
+recurrent state."""
 
 _NORMAL = 1.959964  # two-sided 95% quantile
 
 
 class Rate(NamedTuple):
-    """A rate of episodes with its 95% Wilson interval (Wilson 1927, doi 10.1080/01621459.1927.10502953).
+    """A rate of episodes with its 95% Wilson interval (Wilson 1927, doi
+    10.1080/01621459.1927.10502953).
 
     Example:
         ```python
@@ -65,7 +69,9 @@ class Rate(NamedTuple):
     @classmethod
     @check_arguments(value=Fraction, episodes=PositiveInt)
     def of(cls, value: float, episodes: int) -> "Rate":
-        """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is conservative."""
+        """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is
+        conservative.
+        """
         spread = _NORMAL**2 / episodes
         middle = (value + spread / 2) / (1 + spread)
         half = math.sqrt(spread * max(value * (1 - value), 0.0) + spread**2 / 4) / (1 + spread)
@@ -131,29 +137,61 @@ class Result:
         """All rates with their intervals, by name as in `to_dict`."""
         own = {"success_rate": self.success_rate, **self.match}
         own |= {f"ending/{name}": share for name, share in self.endings.items()}
-        bounded = {name: min(max(value, 0.0), 1.0) for name, value in own.items() if not math.isnan(value)}  # rounding
+        # rounding
+        bounded = {
+            name: min(max(value, 0.0), 1.0) for name, value in own.items() if not math.isnan(value)
+        }
         found = {name: Rate.of(value, self.episodes) for name, value in bounded.items()}
         every = {name: result.rates for name, result in self.by_opponent.items()}
-        members = {f"{rate}/{name}": each[rate] for rate in ("win_rate", "loss_rate") for name, each in every.items()}
-        return found | members | ({"worst_win_rate": min(each["win_rate"] for each in every.values())} if every else {})
+        members = {
+            f"{rate}/{name}": each[rate]
+            for rate in ("win_rate", "loss_rate")
+            for name, each in every.items()
+        }
+        return (
+            found
+            | members
+            | (
+                {"worst_win_rate": min(each["win_rate"] for each in every.values())}
+                if every
+                else {}
+            )
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; the entries of all mappings but `terms` become top-level keys.
+        """Returns plain values for JSON; the entries of all mappings but `terms` become top-level
+        keys.
 
         `intervals` has the ends of the 95% interval of each rate.
         """
         mappings = ("task", "about", "endings", "outcomes", "match", "by_opponent", "labels")
         values = {k: v for k, v in vars(self).items() if k not in mappings}
         named = {"ending": self.endings, "success": self.outcomes}
-        flat = {f"{kind}/{name}": value for kind, values in named.items() for name, value in values.items()}
+        flat = {
+            f"{kind}/{name}": value
+            for kind, values in named.items()
+            for name, value in values.items()
+        }
         rates = self.rates
-        flat |= {name: rate.value for name, rate in rates.items() if "/" in name or name == "worst_win_rate"}
+        flat |= {
+            name: rate.value
+            for name, rate in rates.items()
+            if "/" in name or name == "worst_win_rate"
+        }
         intervals = {name: [rate.low, rate.high] for name, rate in rates.items()}
-        return {"task": self.task, **self.about, **values, **self.match, **flat, "intervals": intervals}
+        return {
+            "task": self.task,
+            **self.about,
+            **values,
+            **self.match,
+            **flat,
+            "intervals": intervals,
+        }
 
     def rows(self) -> dict[str, str]:
         """Returns all results as text by name; rates have their intervals."""
-        found, rates = {}, self.rates
+        found = {}
+        rates = self.rates
         for name, value in self.to_dict().items():
             if name == "terms":
                 found |= {f"reward/{term}": f"{mean:.4g}" for term, mean in value.items()}
@@ -168,7 +206,9 @@ class Result:
         return "\n".join(f"{name:<28} {text}" for name, text in self.rows().items())
 
     def __repr__(self) -> str:
-        about = {name: str(self.about[name]) for name in ("policy", "opponent") if name in self.about}
+        about = {
+            name: str(self.about[name]) for name in ("policy", "opponent") if name in self.about
+        }
         if {"policy", "actions"} <= self.about.keys():
             about["policy"] += f", {self.about['actions']} actions"
         sides = ", on both sides" if self.about.get("sides") == "both" else ""
@@ -178,23 +218,42 @@ class Result:
         if self.match:
             rates.pop("success_rate", None)  # that of `win`
         first = {name: rates[name] for name in ("success_rate", *self.match) if name in rates}
-        shares = {text: self.outcomes[name] for name, text in self.labels.items() if name in self.outcomes}
-        named = {text: Rate.of(min(share, 1.0), self.episodes) for text, share in shares.items()}  # rounding
+        shares = {
+            text: self.outcomes[name] for name, text in self.labels.items() if name in self.outcomes
+        }
+        # rounding
+        named = {text: Rate.of(min(share, 1.0), self.episodes) for text, share in shares.items()}
         rates = {_plain_words(name): rate for name, rate in {**first, **named, **rates}.items()}
-        outcomes = {_plain_words(name): mean for name, mean in self.outcomes.items() if name not in self.labels}
-        means = {"steps per episode": self.episode_length, "return": self.episode_return, **outcomes}
+        outcomes = {
+            _plain_words(name): mean
+            for name, mean in self.outcomes.items()
+            if name not in self.labels
+        }
+        means = {
+            "steps per episode": self.episode_length,
+            "return": self.episode_return,
+            **outcomes,
+        }
         faults = {"diverged episodes": self.diverged, "overflowing steps": self.overflow}
         means |= {name: count for name, count in faults.items() if count}
         wide = max(20, *map(len, rates))
         lines = [f"{name:<{wide}} {line(text)}" for name, text in who.items()]
         lines += ["", f"{'':{wide}} {'%':>6}   95% interval"]
         for name, (value, low, high) in rates.items():
-            lines.append(f"{line(name):<{wide}} {100 * value:>6.1f}   {100 * low:.1f} to {100 * high:.1f}")
-        return "\n".join([*lines, "", *(f"{line(name):<{wide}} {value:>6.4g}" for name, value in means.items())])
+            lines.append(
+                f"{line(name):<{wide}} {100 * value:>6.1f}   {100 * low:.1f} to {100 * high:.1f}"
+            )
+        return "\n".join(
+            [*lines, "", *(f"{line(name):<{wide}} {value:>6.4g}" for name, value in means.items())]
+        )
 
     def _repr_html_(self) -> str:
         cells = ((to_html(name), to_html(text)) for name, text in self.rows().items())
-        return "<table>" + "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in cells) + "</table>"
+        return (
+            "<table>"
+            + "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in cells)
+            + "</table>"
+        )
 
 
 def _plain_words(name: str) -> str:
@@ -206,7 +265,8 @@ def _plain_words(name: str) -> str:
 def pool(results: Mapping[str, Result], opponent: str) -> Result:
     """Returns the mean of results against the members of a population, by name."""
     every = list(results.values())
-    summed, fixed = ("episodes", "overflow", "diverged"), ("task", "about", "by_opponent", "labels")
+    summed = ("episodes", "overflow", "diverged")
+    fixed = ("task", "about", "by_opponent", "labels")
     names = [name for name in vars(every[0]) if name not in (*summed, *fixed)]
     means = {name: _mean([getattr(each, name) for each in every]) for name in names}
     sums = {name: sum(getattr(each, name) for each in every) for name in summed}
@@ -232,14 +292,20 @@ class _Progress(NamedTuple):
     diverged: jax.Array  # counted episodes that ended because the physics diverged (N,)
 
 
-def make_act(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()) -> tuple[Act, Memory]:
-    """Returns the function of a policy of all agents, or a function itself, and its initial recurrent state."""
+def make_act(
+    policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ()
+) -> tuple[Act, Memory]:
+    """Returns the function of a policy of all agents, or a function itself, and its initial
+    recurrent state.
+    """
     either: Any = policy
     if not hasattr(either, "act"):
         if any(np.shape(leaf)[:1] != (num_envs,) for leaf in jax.tree.leaves(memory)):
             fail("memory", memory, f"arrays with a leading axis of {num_envs}, the environments")
         function = functools.partial(_call_with_obs, either)
-        return functools.partial(_act, function, (num_envs, env.num_agents, env.action_size)), memory
+        return functools.partial(
+            _act, function, (num_envs, env.num_agents, env.action_size)
+        ), memory
     if (trained := getattr(either, "task", "")) and trained != env.name:
         fail("policy", f"one of {trained}", f"one of {env.name}; pass its `act` instead")
     if (agents := getattr(either, "agents", env.num_agents)) != env.num_agents:
@@ -249,16 +315,22 @@ def make_act(policy: Policy | Act, env: Any, num_envs: int, memory: Memory = ())
         check_policy(either, env)
     if jax.tree.leaves(memory):
         fail("memory", "an array", "() for a policy, which brings its own")
-    function = either.act if hasattr(either, "groups") else functools.partial(_call_with_obs, either.act)
+    function = (
+        either.act if hasattr(either, "groups") else functools.partial(_call_with_obs, either.act)
+    )
     act = functools.partial(_act, function, (num_envs, env.num_agents, env.action_size))
     return act, either.initial_memory(num_envs)
 
 
-def _act(act: Act, shape: tuple[int, ...], obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+def _act(
+    act: Act, shape: tuple[int, ...], obs: Any, memory: Memory, key: jax.Array
+) -> tuple[jax.Array, Memory]:
     return check_act("policy", act(obs, memory, key), shape, memory)
 
 
-def _call_with_obs(function: Act, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+def _call_with_obs(
+    function: Act, obs: Any, memory: Memory, key: jax.Array
+) -> tuple[jax.Array, Memory]:
     return function(Observations.at(obs).obs, memory, key)
 
 
@@ -275,21 +347,25 @@ def evaluate_batch(
 ) -> Result:
     """Runs `episodes` episodes from fresh resets and returns their means.
 
-    Each environment contributes its first `episodes // N` episodes, some of them one more. Later ones are ignored:
-    short episodes are not over-represented. `policy` may be a function like a policy's `act`, and `memory` its initial
-    recurrent state, leading axis N. A compiled call makes `block` steps. InputError for a policy of another task, and
-    for episodes that do not end within `max_steps`.
+    Each environment contributes its first `episodes // N` episodes, some of them one more. Later
+    ones are ignored: short episodes are not over-represented. `policy` may be a function like a
+    policy's `act`, and `memory` its initial recurrent state, leading axis N. A compiled call makes
+    `block` steps. InputError for a policy of another task, and for episodes that do not end within
+    `max_steps`.
     """
     act, memory = make_act(policy, env, env.num_envs, memory)
-    evaluator = Evaluator(env, lambda params, *seen: act(*seen), memory, block=block, max_steps=max_steps)
+    evaluator = Evaluator(
+        env, lambda params, *seen: act(*seen), memory, block=block, max_steps=max_steps
+    )
     return evaluator(None, episodes, key[None])[0]
 
 
 class Evaluator:
     """Evaluates B policies in one compiled program; see `evaluate_batch`.
 
-    `act(params, seen, memory, key) -> (action, memory)` is the policy, `seen` its `Observations`. `params` has one set
-    for each evaluation, on a leading axis B, or is None if all evaluations share one policy.
+    `act(params, seen, memory, key) -> (action, memory)` is the policy, `seen` its `Observations`.
+    `params` has one set for each evaluation, on a leading axis B, or is None if all evaluations
+    share one policy.
     """
 
     def __init__(
@@ -301,16 +377,29 @@ class Evaluator:
         block: int = 50,
         max_steps: int = 1_000_000,
     ) -> None:
-        block, max_steps = check("block", block, Horizon), check("max_steps", max_steps, PositiveInt)
-        self._env, self._block, self._max_steps = env, block, max_steps
+        block = check("block", block, Horizon)
+        max_steps = check("max_steps", max_steps, PositiveInt)
+        self._env = env
+        self._block = block
+        self._max_steps = max_steps
 
-        def run_one(progress: _Progress, params: Any, key: jax.Array, quota: jax.Array) -> _Progress:
-            return _run_block(env, functools.partial(act, params), progress, key, memory, quota, block)
+        def run_one(
+            progress: _Progress, params: Any, key: jax.Array, quota: jax.Array
+        ) -> _Progress:
+            return _run_block(
+                env, functools.partial(act, params), progress, key, memory, quota, block
+            )
 
         def run(
-            progress: _Progress, params: Any, keys: jax.Array, done_steps: jax.Array, quota: jax.Array
+            progress: _Progress,
+            params: Any,
+            keys: jax.Array,
+            done_steps: jax.Array,
+            quota: jax.Array,
         ) -> _Progress:
-            keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.split(key)[1], done_steps))(keys)
+            keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.split(key)[1], done_steps))(
+                keys
+            )
             return jax.vmap(run_one, in_axes=(0, 0, 0, None))(progress, params, keys, quota)
 
         # Random keys are computed inside of both: separate programs would delay the first block.
@@ -319,7 +408,9 @@ class Evaluator:
 
     @single
     def __call__(self, params: Any, episodes: int, keys: jax.Array) -> list[Result]:
-        """Returns the results of B evaluations, for random keys (B, 2); errors as in `evaluate_batch`."""
+        """Returns the results of B evaluations, for random keys (B, 2); errors as in
+        `evaluate_batch`.
+        """
         episodes = check("episodes", episodes, Episodes)
         count = self._env.num_envs
         quota = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)
@@ -331,30 +422,48 @@ class Evaluator:
                 sums = jax.device_get(progress._replace(env_state=(), memory=()))
                 each = [jax.tree.map(lambda x: x[i], sums) for i in range(len(keys))]  # noqa: B023
                 return [_result(self._env.name, episodes, own) for own in each]
-        raise InputError(f"episodes: {episodes} of {self._env.name} are not finished after {self._max_steps} steps")
+        raise InputError(
+            f"episodes: {episodes} of {self._env.name} are not finished after {self._max_steps} "
+            "steps"
+        )
 
 
 def _begin(env: VectorEnv, key: jax.Array, memory: Memory) -> _Progress:
     state = env.reset(key)
-    zero, none = jnp.zeros((env.num_envs,)), jnp.zeros((env.num_envs,), jnp.int32)
-    sums = dict.fromkeys(state.metrics, zero), jax.tree.map(lambda x: jnp.zeros(x.shape), state.outcome)
+    zero = jnp.zeros((env.num_envs,))
+    none = jnp.zeros((env.num_envs,), jnp.int32)
+    sums = (
+        dict.fromkeys(state.metrics, zero),
+        jax.tree.map(lambda x: jnp.zeros(x.shape), state.outcome),
+    )
     return _Progress(state, memory, none, none, zero, *sums, zero)
 
 
 def _run_block(
-    env: VectorEnv, act: Act, progress: _Progress, key: jax.Array, initial_memory: Memory, quota: jax.Array, block: int
+    env: VectorEnv,
+    act: Act,
+    progress: _Progress,
+    key: jax.Array,
+    initial_memory: Memory,
+    quota: jax.Array,
+    block: int,
 ) -> _Progress:
     own = np.array(teams_of(env)[0])
 
     def one_step(p: _Progress, step_key: jax.Array) -> tuple[_Progress, None]:
         action, memory = act(observations(p.env_state), p.memory, step_key)
         state = env.step(p.env_state, action)
-        done, active = state.terminated | state.truncated, active_of(p.env_state)
+        done = state.terminated | state.truncated
+        active = active_of(p.env_state)
         counted = p.finished < quota
 
-        step_sums = {n: s + jnp.where(counted, state.metrics[n], 0.0) for n, s in p.step_sums.items()}
+        step_sums = {
+            n: s + jnp.where(counted, state.metrics[n], 0.0) for n, s in p.step_sums.items()
+        }
         last = counted & done
-        ends = jax.tree.map(lambda s, x: s + where_rows(last, x, jnp.zeros_like(s)), p.outcome, state.outcome)
+        ends = jax.tree.map(
+            lambda s, x: s + where_rows(last, x, jnp.zeros_like(s)), p.outcome, state.outcome
+        )
         diverged = p.diverged + jnp.where(last, state.metrics.get("diverged", 0.0), 0.0)
         return (
             _Progress(
@@ -362,7 +471,8 @@ def _run_block(
                 memory=where_rows(done, initial_memory, memory),
                 finished=p.finished + last.astype(jnp.int32),
                 steps=p.steps + counted.astype(jnp.int32),
-                returns=p.returns + jnp.where(counted, mean_of_team(state.reward[:, own], active[:, own]), 0.0),
+                returns=p.returns
+                + jnp.where(counted, mean_of_team(state.reward[:, own], active[:, own]), 0.0),
                 step_sums=step_sums,
                 outcome=ends,
                 diverged=diverged,
@@ -380,18 +490,25 @@ def _result(task: str, episodes: int, progress: _Progress) -> Result:
     steps = total(progress.steps)
     per_step = {name: total(x) / steps for name, x in progress.step_sums.items()}
     ended = progress.outcome
-    rate = lambda x: math.nan if x is None else total(x[:, 0]) / episodes  # noqa: E731
+
+    def rate(x):
+        return math.nan if x is None else total(x[:, 0]) / episodes
+
     return Result(
         task=task,
         episodes=episodes,
         success_rate=rate(ended.success),
         average_step_reward=per_step.get("average_step_reward", float("nan")),
-        terms={n.removeprefix("reward/"): v for n, v in per_step.items() if n.startswith("reward/")},
+        terms={
+            n.removeprefix("reward/"): v for n, v in per_step.items() if n.startswith("reward/")
+        },
         episode_return=total(progress.returns) / episodes,
         episode_length=steps / episodes,
         overflow=round(per_step.get("overflow", 0.0) * steps),
         diverged=round(total(progress.diverged)),
         endings={name: total(x) / episodes for name, x in ended.ending.items()},
         outcomes={name: rate(x) for name, x in ended.further.items()},
-        match={} if ended.win is None else {f"{name}_rate": rate(getattr(ended, name)) for name in RESULTS},
+        match={}
+        if ended.win is None
+        else {f"{name}_rate": rate(getattr(ended, name)) for name in RESULTS},
     )

@@ -1,10 +1,10 @@
 """A run folder: its files, and what is checked and locked before a training writes to it.
 
-config.yaml            settings
-metrics.csv            one row an update (`logs.CsvLog`); tensorboard/ and wandb/ by the other loggers
-policy.safetensors     the newest policy (`policy.save_policy`)
-checkpoints/           complete learner states (`checkpoint.save_checkpoint`)
-evaluations.json       evaluations during training, best/ the policy of the best one (`monitor.EvaluationLog`)
+config.yaml            settings metrics.csv            one row an update (`logs.CsvLog`);
+tensorboard/ and wandb/ by the other loggers policy.safetensors     the newest policy
+(`policy.save_policy`) checkpoints/           complete learner states (`checkpoint.save_checkpoint`)
+evaluations.json       evaluations during training, best/ the policy of the best one
+(`monitor.EvaluationLog`)
 """
 
 import contextlib
@@ -32,7 +32,9 @@ _OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of thei
 
 @contextlib.contextmanager
 def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
-    """Creates and locks run folders; InputError for one with a run, or with `resume` one that cannot be resumed."""
+    """Creates and locks run folders; InputError for one with a run, or with `resume` one that
+    cannot be resumed.
+    """
     with contextlib.ExitStack() as locks:
         check_folders(folders, resume)
         for folder in folders:
@@ -43,7 +45,9 @@ def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
 
 
 def check_folders(folders: Sequence[Path], resume: bool) -> None:
-    """Raises an InputError for folders in which a training could not start or, with `resume`, continue."""
+    """Raises an InputError for folders in which a training could not start or, with `resume`,
+    continue.
+    """
     for folder in folders:
         check_links(folder)
         check_alone(folder)
@@ -55,7 +59,9 @@ def check_folders(folders: Sequence[Path], resume: bool) -> None:
 
 def write_config(folder: Path, config: TrainConfig) -> None:
     """Writes the settings of a run."""
-    write_atomically(folder / CONFIG_FILE, yaml.safe_dump(to_mapping(config), sort_keys=False).encode())
+    write_atomically(
+        folder / CONFIG_FILE, yaml.safe_dump(to_mapping(config), sort_keys=False).encode()
+    )
 
 
 def load_run_config(run_dir: str | Path) -> TrainConfig:
@@ -64,29 +70,42 @@ def load_run_config(run_dir: str | Path) -> TrainConfig:
 
 
 def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
-    """Returns each folder's checkpoint at the newest common step; None (start from scratch) if any has none."""
+    """Returns each folder's checkpoint at the newest common step; None (start from scratch) if any
+    has none.
+    """
     if not folders:
         return []
-    by_step = [{checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders]
+    by_step = [
+        {checkpoint_step(path): path for path in list_checkpoints(folder)} for folder in folders
+    ]
     common = set.intersection(*map(set, by_step))
     if common:
         return [steps[max(common)] for steps in by_step]
     if all(not steps or 0 in steps for steps in by_step):
         return [None] * len(folders)
-    newest = [f"{run.name} {max(steps, default='none')}" for run, steps in zip(folders, by_step, strict=True)]
+    newest = [
+        f"{run.name} {max(steps, default='none')}"
+        for run, steps in zip(folders, by_step, strict=True)
+    ]
     hint = f"({', '.join(newest)}); resume them separately"
     raise InputError(f"run_dir: {folders[0].parent}: no step has checkpoints of all seeds {hint}")
 
 
 def check_links(run_dir: Path) -> None:
-    """Raises an InputError if something in the folder that a training replaces or removes is a link."""
+    """Raises an InputError if something in the folder that a training replaces or removes is a
+    link.
+    """
     for name in (*RUN_FILES, *_FOLDERS):
         if (run_dir / name).is_symlink():
-            raise InputError(f"run_dir: {run_dir / name} is a symbolic link; it must be in the run folder itself")
+            raise InputError(
+                f"run_dir: {run_dir / name} is a symbolic link; it must be in the run folder itself"
+            )
 
 
 def check_alone(run_dir: Path) -> None:
-    """Raises an InputError for a folder inside another run's, or one that holds the runs of several seeds."""
+    """Raises an InputError for a folder inside another run's, or one that holds the runs of several
+    seeds.
+    """
     seeds = [folder for folder in sorted(run_dir.glob("seed*")) if latest(folder)]
     others = [run_dir.parent] * (latest(run_dir.parent) is not None) + seeds
     if others:
@@ -97,11 +116,17 @@ def check_alone(run_dir: Path) -> None:
 
 
 def check_run(run_dir: Path, resume: bool = False) -> None:
-    """Raises an InputError for a folder with a run that is not to be resumed, or with other files but no checkpoint."""
+    """Raises an InputError for a folder with a run that is not to be resumed, or with other files
+    but no checkpoint.
+    """
     checkpoint = latest(run_dir)
     if checkpoint is not None and not resume:
-        raise InputError(f"run_dir: {run_dir} already holds a run; resume it, or name another folder")
+        raise InputError(
+            f"run_dir: {run_dir} already holds a run; resume it, or name another folder"
+        )
     inside = [path for path in sorted(run_dir.glob("[!.]*")) if path.suffix not in _OUTPUT]
     held = [path.name for path in inside if not path.is_dir() or any(path.glob("[!.]*"))]
     if held and checkpoint is None:
-        raise InputError(f"run_dir: {run_dir} holds {', '.join(held[:3])} but no checkpoint; name another folder")
+        raise InputError(
+            f"run_dir: {run_dir} holds {', '.join(held[:3])} but no checkpoint; name another folder"
+        )

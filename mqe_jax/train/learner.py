@@ -1,7 +1,8 @@
 """Multi-agent PPO as one pure function from a learner state to the next.
 
-A rollout of all environments, advantages, then epochs of minibatches. MAPPO, JRPO, independent PPO and their variants
-differ in the ratio that PPO clips, the value (per agent or per team) and the network; all three are settings.
+A rollout of all environments, advantages, then epochs of minibatches. MAPPO, JRPO, independent PPO
+and their variants differ in the ratio that PPO clips, the value (per agent or per team) and the
+network; all three are settings.
 """
 
 import dataclasses
@@ -41,7 +42,13 @@ from mqe_jax.train.normalize import (
     value_update,
 )
 from mqe_jax.train.optim import AdamState, restart
-from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, chunks, normalize_obs, rollout
+from mqe_jax.train.rollout import (
+    ObservationNormalizer,
+    RolloutState,
+    chunks,
+    normalize_obs,
+    rollout,
+)
 from mqe_jax.train.schedules import Scheduled, current_values
 from mqe_jax.train.stages import Metrics, Stages
 
@@ -49,7 +56,10 @@ from mqe_jax.train.stages import Metrics, Stages
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """Complete learner state. Restoring it resumes training exactly (bit for bit on deterministic backends)."""
+    """Complete learner state.
+
+    Restoring it resumes training exactly (bit for bit on deterministic backends).
+    """
 
     params: Params
     optimizer: AdamState
@@ -63,7 +73,9 @@ class TrainState:
 
 
 class Learner(NamedTuple):
-    """`init(key) -> TrainState`; `update(TrainState) -> (TrainState, metrics)`; both pure, neither jitted."""
+    """`init(key) -> TrainState`; `update(TrainState) -> (TrainState, metrics)`; both pure, neither
+    jitted.
+    """
 
     init: Callable[[jax.Array], TrainState]
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
@@ -81,18 +93,21 @@ def make_learner(
 ) -> Learner:
     """Returns the learner of an environment; InputError if the settings do not fit it.
 
-    Of several `processes`, `env` is the share of one, and `devices.Processes` compiles the functions. `teacher` is the
-    policy that `imitation` imitates. A subclass of `Stages` (advantages, loss and update) is another algorithm.
+    Of several `processes`, `env` is the share of one, and `devices.Processes` compiles the
+    functions. `teacher` is the policy that `imitation` imitates. A subclass of `Stages`
+    (advantages, loss and update) is another algorithm.
     """
     check_environment(env, config, processes)
     check_teacher(config, teacher)
     if not (isinstance(stages, type) and issubclass(stages, Stages)):
         fail("stages", stages, "a subclass of mqe_jax.train.stages.Stages")
     dims = needs_of(env, config).dims
-    network, features = config.network.build(dims), config.network.features(dims)
+    network = config.network.build(dims)
+    features = config.network.features(dims)
     check_divisible(config, network, processes)
     algorithm = stages(network, config)
-    moving = getattr(getattr(env, "env", env), "moving", lambda action: action)  # messages are not imitated
+    # messages are not imitated
+    moving = getattr(getattr(env, "env", env), "moving", lambda action: action)
 
     @single
     @check_arguments(key=RandomKey)
@@ -123,7 +138,11 @@ def make_learner(
                 updates=jnp.zeros((), jnp.int32),
             )
         )
-        return state if league is None else league.seat(dataclasses.replace(state, extra=league.begin(state)))
+        return (
+            state
+            if league is None
+            else league.seat(dataclasses.replace(state, extra=league.begin(state)))
+        )
 
     @single
     @check_arguments(state=TrainState)
@@ -135,7 +154,9 @@ def make_learner(
             network,
             state.params,
             state.obs_normalizer,
-            _set_assistance(state.rollout, now.assistance) if config.curriculum.assistance else state.rollout,
+            _set_assistance(state.rollout, now.assistance)
+            if config.curriculum.assistance
+            else state.rollout,
             rollout_key,
             config.rollout_steps,
             normalize=config.normalization.observations,
@@ -144,7 +165,9 @@ def make_learner(
             group=config.group,
             teacher=teacher,
         )
-        batch, value_normalizer, batch_metrics = _prepare(algorithm, now, state, transitions, features)
+        batch, value_normalizer, batch_metrics = _prepare(
+            algorithm, now, state, transitions, features
+        )
         if teacher is not None:
             labels = moving(transitions.teacher_action) / config.action_scale
             batch = batch._replace(teacher_action=chunks(labels, network.chunk_length))
@@ -181,35 +204,56 @@ def make_learner(
 
 def _set_assistance(state: RolloutState, assistance: jax.Array) -> RolloutState:
     """Sets the assistance of every environment, which takes effect with its next episode."""
-    env_state = replace_fields(state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance))
+    env_state = replace_fields(
+        state.env_state, assistance=jnp.full_like(state.env_state.assistance, assistance)
+    )
     return state._replace(env_state=env_state)
 
 
 def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
-    """Sets every environment's step counter to a random value, so that the first episodes end at different steps."""
+    """Sets every environment's step counter to a random value, so that the first episodes end at
+    different steps.
+    """
     limit: int = getattr(env, "max_episode_steps")  # noqa: B009
-    draw = lambda n: jax.random.randint(key, (n,), 0, limit, env_state.step.dtype)  # noqa: E731
+
+    def draw(n):
+        return jax.random.randint(key, (n,), 0, limit, env_state.step.dtype)
+
     step = devices.rows(draw, len(env_state.step))
     return replace_fields(env_state, step=step)
 
 
 def _strongly_typed(state: TrainState) -> TrainState:
-    """Removes weak types, so that input and output states have the same types and `update` is traced once."""
+    """Removes weak types, so that input and output states have the same types and `update` is
+    traced once.
+    """
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), state)
 
 
 def _prepare(
-    stages: Stages, now: Scheduled, state: TrainState, transitions: Transition, features: Features | None
+    stages: Stages,
+    now: Scheduled,
+    state: TrainState,
+    transitions: Transition,
+    features: Features | None,
 ) -> tuple[Batch, ValueStatistics, Metrics]:
     """Computes values, advantages and targets of a rollout and splits it into chunks (L, C, ...).
 
-    The critic evaluates each step's observation and final observation as a chunk of two, batched over all steps. The
-    next value then uses the recurrent state after the step's observation, even if the episode ended there.
+    The critic evaluates each step's observation and final observation as a chunk of two, batched
+    over all steps. The next value then uses the recurrent state after the step's observation, even
+    if the episode ended there.
     """
-    network, config = stages.network, stages.config
-    active, normalize = transitions.active, config.normalization.observations
+    network = stages.network
+    config = stages.config
+    active = transitions.active
+    normalize = config.normalization.observations
     obs, privileged = normalize_obs(
-        state.obs_normalizer, transitions.obs, transitions.privileged_obs, active, normalize, features
+        state.obs_normalizer,
+        transitions.obs,
+        transitions.privileged_obs,
+        active,
+        normalize,
+        features,
     )
     # What the critic does not read may be missing; these observations take its place.
     last = transitions.obs if transitions.final_obs is None else transitions.final_obs
@@ -231,9 +275,16 @@ def _prepare(
     advantage, target = stages.advantages(now, transitions, value, next_value)
     counted = stages.value_mask(transitions.learners)
     if config.normalization.values:
-        value_normalizer = value_update(value_normalizer, target, counted, config.normalization.value_decay)
-    unexplained = devices.variance(target - value, counted) / jnp.maximum(devices.variance(target, counted), 1e-8)
-    metrics = {"value_mean": devices.mean_where(value, counted), "explained_variance": 1.0 - unexplained}
+        value_normalizer = value_update(
+            value_normalizer, target, counted, config.normalization.value_decay
+        )
+    unexplained = devices.variance(target - value, counted) / jnp.maximum(
+        devices.variance(target, counted), 1e-8
+    )
+    metrics = {
+        "value_mean": devices.mean_where(value, counted),
+        "explained_variance": 1.0 - unexplained,
+    }
     steps = network.chunk_length
     batch = Batch(
         memory=jax.tree.map(lambda x: x[::steps].reshape(-1, *x.shape[2:]), transitions.memory),

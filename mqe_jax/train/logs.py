@@ -62,7 +62,10 @@ class CsvLog(MetricsLog):
             _, rows = _read_rows(self._path, math.inf)
             self._columns += new
             self._rewrite(rows)
-        append(self._path, (",".join(number(row.get(name, math.nan)) for name in self._columns) + "\n").encode())
+        append(
+            self._path,
+            (",".join(number(row.get(name, math.nan)) for name in self._columns) + "\n").encode(),
+        )
 
     def _rewrite(self, rows: list[dict[str, str]]) -> None:
         text = io.StringIO()
@@ -73,7 +76,9 @@ class CsvLog(MetricsLog):
 
 
 def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
-    """Reads the columns of a metrics.csv (U,) each; InputError naming the file, if it is missing or malformed."""
+    """Reads the columns of a metrics.csv (U,) each; InputError naming the file, if it is missing or
+    malformed.
+    """
     path = Path(check("path", path, PathText))
     if not path.exists():
         raise InputError(f"{path}: no such file; a run folder has one after its first update")
@@ -89,11 +94,17 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
 
 def number(value: float, digits: int = 8) -> str:
     """Returns a number with `digits` significant digits; integers, such as steps, in full."""
-    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{float(value):.{digits}g}"
+    return (
+        str(int(value))
+        if float(value).is_integer() and abs(value) < 1e15
+        else f"{float(value):.{digits}g}"
+    )
 
 
 def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns columns and complete rows up to the environment step `last`; a partial last row is dropped."""
+    """Returns columns and complete rows up to the environment step `last`; a partial last row is
+    dropped.
+    """
     if not path.is_file():
         return [], []
     lines = read_rows(path)
@@ -110,7 +121,8 @@ def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]
 class TensorBoardLog(MetricsLog):
     """TensorBoard events if tensorboardX is installed, otherwise nothing.
 
-    TensorBoard's writer has a thread that dies if the disk is full, and the training would wait for it for ever.
+    TensorBoard's writer has a thread that dies if the disk is full, and the training would wait for
+    it for ever.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -147,8 +159,9 @@ class TensorBoardLog(MetricsLog):
 class WandbLog(MetricsLog):
     """A Weights & Biases run, logged offline to `run_dir/wandb` unless WANDB_MODE=online is set.
 
-    `wandb sync` uploads it later. A resumed training run keeps its run id. wandb's own process writes the file, and
-    finishes it when the program ends. `wandb.teardown()` finishes it at once, but ends all runs of the program.
+    `wandb sync` uploads it later. A resumed training run keeps its run id. wandb's own process
+    writes the file, and finishes it when the program ends. `wandb.teardown()` finishes it at once,
+    but ends all runs of the program.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -178,27 +191,39 @@ class WandbLog(MetricsLog):
         self._run.finish()
 
 
-LOGGERS: dict[str, Callable[[Path, int], MetricsLog]] = {"tensorboard": TensorBoardLog, "wandb": WandbLog}
+LOGGERS: dict[str, Callable[[Path, int], MetricsLog]] = {
+    "tensorboard": TensorBoardLog,
+    "wandb": WandbLog,
+}
 
 
 def check_loggers(names: tuple[str, ...]) -> None:
-    """Raises an InputError if a logger needs a package that is not installed; TensorBoard is optional."""
+    """Raises an InputError if a logger needs a package that is not installed; TensorBoard is
+    optional.
+    """
     if "wandb" in names and importlib.util.find_spec("wandb") is None:
         raise InputError("loggers: 'wandb' needs the package wandb; pip install 'mqe-jax[log]'")
 
 
 class ProgressLog:
-    """Progress: a live bar on a terminal or in a notebook, otherwise a plain line on standard error every ten seconds.
+    """Progress: a live bar on a terminal or in a notebook, otherwise a plain line on standard error
+    every ten seconds.
 
     The time left leaves out compilation and evaluation.
     """
 
     def __init__(self, title: str, total_steps: int, *, shown: bool = True) -> None:
-        self._title, self._total, self._silent = title, total_steps, not shown
+        self._title = title
+        self._total = total_steps
+        self._silent = not shown
         self._first = self._step = 0
         self._numbers = ""
-        self._doing, self._active, self._began = "", False, 0.0
-        self._since, self._seconds = time.perf_counter(), 0.0  # start of this update, time of those before
+        self._doing = ""
+        self._active = False
+        self._began = 0.0
+        # start of this update, time of those before
+        self._since = time.perf_counter()
+        self._seconds = 0.0
         self._last_line = -math.inf
         self._bar: Progress | None = None
         self._output: Any = None  # of a notebook's cell
@@ -209,7 +234,9 @@ class ProgressLog:
         if shown and console.is_terminal:
             text: Any = TextColumn("")  # what follows the bar
             text.render = lambda task: Text(self._text())
-            self._bar = Progress(TextColumn("{task.description}"), BarColumn(10), text, console=console)
+            self._bar = Progress(
+                TextColumn("{task.description}"), BarColumn(10), text, console=console
+            )
             self._task = self._bar.add_task(title, total=total_steps)
 
     def __enter__(self) -> Self:
@@ -227,14 +254,17 @@ class ProgressLog:
         if self._bar is not None:
             self._bar.update(self._task, completed=env_steps)
         self._since = time.perf_counter()
-        self._doing, self._began, self._active = "first update", self._since, True
+        self._doing = "first update"
+        self._began = self._since
+        self._active = True
 
     @contextlib.contextmanager
     def doing(self, what: str) -> Iterator[None]:
         """Shows what is done between updates, and for how long."""
         now = time.perf_counter()
         if what != self._doing:
-            self._doing, self._began = what, now
+            self._doing = what
+            self._began = now
             if self._bar is None and self._output is None:
                 self._print(what)
         self._active = True
@@ -245,9 +275,12 @@ class ProgressLog:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Shows steps, speed, remaining time, reward per step (else return) and success."""
-        now, first = time.perf_counter(), not self._numbers
+        now = time.perf_counter()
+        first = not self._numbers
         self._seconds += now - self._since
-        self._since, self._step, self._active = now, int(row["env_steps"]), False
+        self._since = now
+        self._step = int(row["env_steps"])
+        self._active = False
         known = {name: value for name, value in row.items() if math.isfinite(value)}
         rewards = {"average_step_reward": "reward", "episode_return": "return"}
         parts = [f"{word} {known[name]:.3g}" for name, word in rewards.items() if name in known][:1]
@@ -300,9 +333,15 @@ def _clock(seconds: float) -> str:
 
 
 def row_of(
-    updates: int, metrics: Mapping[str, Any], config: TrainConfig, start_time: float, update_began: float
+    updates: int,
+    metrics: Mapping[str, Any],
+    config: TrainConfig,
+    start_time: float,
+    update_began: float,
 ) -> dict[str, float]:
-    """Returns a row of metrics.csv: steps and times, then the metrics by name; means over no episodes are NaN."""
+    """Returns a row of metrics.csv: steps and times, then the metrics by name; means over no
+    episodes are NaN.
+    """
     now = time.perf_counter()
     row: dict[str, float] = {
         "env_steps": updates * config.steps_per_update,
@@ -312,6 +351,8 @@ def row_of(
     }
     ended = dict(metrics["ended"])
     episodes = float(ended.pop("episodes"))
-    values = {name: float(x) for name, x in metrics.items() if name != "ended"} | {"episodes": episodes}
+    values = {name: float(x) for name, x in metrics.items() if name != "ended"} | {
+        "episodes": episodes
+    }
     values |= {name: float(x) if episodes else math.nan for name, x in ended.items()}
     return row | dict(sorted(values.items()))

@@ -1,10 +1,12 @@
-"""The network `mat`: a transformer over agents that act sequentially, conditioned on their predecessors' actions.
+"""The network `mat`: a transformer over agents that act sequentially, conditioned on their
+predecessors' actions.
 
-An encoder attends over the observations of all agents and outputs each agent's value; a decoder attends over the
-actions of preceding agents. Acting is sequential, evaluation is parallel under a causal mask, and both give the same
-log-probabilities.
+An encoder attends over the observations of all agents and outputs each agent's value; a decoder
+attends over the actions of preceding agents. Acting is sequential, evaluation is parallel under a
+causal mask, and both give the same log-probabilities.
 
-Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as in OpenRL.
+Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as
+in OpenRL.
 """
 
 import math
@@ -32,14 +34,19 @@ def attention(
 
     def split(name: str, x: jax.Array) -> jax.Array:
         x = nn.dense(params[name], x)
-        return jnp.moveaxis(x.reshape(*x.shape[:-1], heads, -1), -2, -3)  # (..., heads, A, W / heads)
+        # (..., heads, A, W / heads)
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], heads, -1), -2, -3)
 
-    q, k, v = split("query", query), split("key", context), split("value", context)
+    q = split("query", query)
+    k = split("key", context)
+    v = split("value", context)
     weight = jnp.matmul(q, jnp.swapaxes(k, -1, -2), precision=nn.PRECISION) / math.sqrt(q.shape[-1])
     if causal:
         weight = jnp.where(np.tri(weight.shape[-1], dtype=bool), weight, -jnp.inf)
     if active is not None:
-        weight = jnp.where(active[..., None, None, :] | np.eye(weight.shape[-1], dtype=bool), weight, -jnp.inf)
+        weight = jnp.where(
+            active[..., None, None, :] | np.eye(weight.shape[-1], dtype=bool), weight, -jnp.inf
+        )
     weight = jax.nn.softmax(weight, axis=-1)
     mixed = jnp.moveaxis(jnp.matmul(weight, v, precision=nn.PRECISION), -3, -2)
     return nn.dense(params["projection"], mixed.reshape(*mixed.shape[:-2], -1))
@@ -50,23 +57,33 @@ def _gelu(x: jax.Array) -> jax.Array:
 
 
 def _head(params: Params, x: jax.Array) -> jax.Array:
-    return nn.dense(params["out"], nn.layer_norm(params["norm"], _gelu(nn.dense(params["hidden"], x))))
+    return nn.dense(
+        params["out"], nn.layer_norm(params["norm"], _gelu(nn.dense(params["hidden"], x)))
+    )
 
 
 def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
     """Initialises encoder, value head, decoder and the standard-deviation parameter."""
-    width, small, large = settings.width, settings.gain, math.sqrt(2.0)
+    width = settings.width
+    small = settings.gain
+    large = math.sqrt(2.0)
     square_key, *keys = jax.random.split(key, 5)
     # One vmapped program for all square matrices compiles much faster than one program each.
     count = 2 + settings.blocks * (6 + 10)
-    squares = iter(jax.vmap(lambda k: nn.orthogonal(k, (width, width), 1.0))(jax.random.split(square_key, count)))
+    squares = iter(
+        jax.vmap(lambda k: nn.orthogonal(k, (width, width), 1.0))(
+            jax.random.split(square_key, count)
+        )
+    )
 
     def square(gain: float) -> Params:
         return {"weight": gain * next(squares), "bias": jnp.zeros((width,), jnp.float32)}
 
     def block(attentions: int) -> Params:
         layers: Params = {
-            f"attention{i}": {name: square(small) for name in ("query", "key", "value", "projection")}
+            f"attention{i}": {
+                name: square(small) for name in ("query", "key", "value", "projection")
+            }
             for i in range(attentions)
         }
         layers |= {f"norm{i}": nn.layer_norm_init(width) for i in range(attentions + 1)}
@@ -99,24 +116,35 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
 
 
 def encode(params: Params, obs: jax.Array, heads: int, active: Mask = None) -> jax.Array:
-    """Returns features of each agent from the observations of all active ones: (..., A, O) -> (..., A, W)."""
-    x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], nn.layer_norm(params["norm_in"], obs))))
+    """Returns features of each agent from the observations of all active ones: (..., A, O) -> (...,
+    A, W).
+    """
+    x = nn.layer_norm(
+        params["norm"], _gelu(nn.dense(params["embed"], nn.layer_norm(params["norm_in"], obs)))
+    )
     for block in params["blocks"]:
-        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, active, causal=False))
+        x = nn.layer_norm(
+            block["norm0"], x + attention(block["attention0"], x, x, heads, active, causal=False)
+        )
         x = nn.layer_norm(block["norm1"], x + nn.mlp(block["mlp"], x, _gelu))
     return x
 
 
-def decode(params: Params, features: jax.Array, action: jax.Array, heads: int, active: Mask = None) -> jax.Array:
-    """Returns mean actions given those of preceding active agents: (..., A, W), (..., A, D) -> (..., A, D).
+def decode(
+    params: Params, features: jax.Array, action: jax.Array, heads: int, active: Mask = None
+) -> jax.Array:
+    """Returns mean actions given those of preceding active agents: (..., A, W), (..., A, D) ->
+    (..., A, D).
 
-    An agent's own and later actions have no effect on its mean; its token is the action of the active agent before it,
-    and zero for the first one.
+    An agent's own and later actions have no effect on its mean; its token is the action of the
+    active agent before it, and zero for the first one.
     """
     token = _preceding(action, active)
     x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], token)))
     for block in params["blocks"]:
-        x = nn.layer_norm(block["norm0"], x + attention(block["attention0"], x, x, heads, active, causal=True))
+        x = nn.layer_norm(
+            block["norm0"], x + attention(block["attention0"], x, x, heads, active, causal=True)
+        )
         mixed = attention(block["attention1"], features, x, heads, active, causal=True)
         x = nn.layer_norm(block["norm1"], features + mixed)
         x = nn.layer_norm(block["norm2"], x + nn.mlp(block["mlp"], x, _gelu))
@@ -124,8 +152,11 @@ def decode(params: Params, features: jax.Array, action: jax.Array, heads: int, a
 
 
 def _preceding(action: jax.Array, active: Mask) -> jax.Array:
-    """Returns the action (..., A, D) of each agent's predecessor among the active ones, zero without one."""
-    tokens, last = [], jnp.zeros_like(action[..., 0, :])
+    """Returns the action (..., A, D) of each agent's predecessor among the active ones, zero
+    without one.
+    """
+    tokens = []
+    last = jnp.zeros_like(action[..., 0, :])
     for agent in range(action.shape[-2]):
         tokens.append(last)
         own = action[..., agent, :]
@@ -165,9 +196,16 @@ def network(settings: Mat, dims: EnvDims) -> Network:
         return action, log_prob(action, mean, log_std), memory
 
     def value(
-        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array, active: Mask = None
+        params: Params,
+        memory: Memory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        active: Mask = None,
     ) -> tuple[jax.Array, Memory]:
-        return _head(params["value_head"], encode(params["encoder"], obs, heads, active))[..., 0], memory
+        return _head(params["value_head"], encode(params["encoder"], obs, heads, active))[
+            ..., 0
+        ], memory
 
     def evaluate(
         params: Params,
@@ -186,7 +224,9 @@ def network(settings: Mat, dims: EnvDims) -> Network:
 
     return Network(
         init=lambda key: init_params(key, dims, settings),
-        policy_params=lambda params: {name: params[name] for name in ("encoder", "decoder", "deviation")},
+        policy_params=lambda params: {
+            name: params[name] for name in ("encoder", "decoder", "deviation")
+        },
         initial_memory=lambda num_envs: NetworkMemory((), ()),
         act=act,
         value=value,

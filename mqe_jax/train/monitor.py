@@ -32,7 +32,8 @@ EVALUATIONS_FILE = "evaluations.json"
 ABSOLUTE_FACTOR = 10
 """Number of episodes of the absolute metric, relative to an evaluation."""
 
-_SAMPLED, _DETERMINISTIC = 0, 1
+_SAMPLED = 0
+_DETERMINISTIC = 1
 
 
 class Evaluation(TypedDict):
@@ -51,32 +52,50 @@ class _Evaluations(TypedDict):
 
 
 class Monitor:
-    """Evaluates the policies of several seeds in one program, with sampled and with mean actions."""
+    """Evaluates the policies of several seeds in one program, with sampled and with mean
+    actions.
+    """
 
     def __init__(self, env: VectorEnv, config: TrainConfig) -> None:
         if env.num_envs != config.evaluation.episodes:
-            fail("evaluation.episodes", config.evaluation.episodes, f"the number of environments, {env.num_envs}")
+            fail(
+                "evaluation.episodes",
+                config.evaluation.episodes,
+                f"the number of environments, {env.num_envs}",
+            )
         dims = needs_of(env, config).dims
         act_of = policy_act(dims, config.network, config.normalization.observations)
 
-        def act(params: Any, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        def act(
+            params: Any, seen: Observations, memory: Memory, key: jax.Array
+        ) -> tuple[jax.Array, Memory]:
             arrays, mode = params
-            sampled, mean = (act_of(arrays, seen.group(config.group), memory, k, seen.active) for k in (key, None))
+            sampled = act_of(arrays, seen.group(config.group), memory, key, seen.active)
+            mean = act_of(arrays, seen.group(config.group), memory, None, seen.active)
             return jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), sampled, mean)
 
         self._config = config
-        self._evaluator = Evaluator(env, act, config.network.build(dims).initial_memory(env.num_envs).actor)
+        self._evaluator = Evaluator(
+            env, act, config.network.build(dims).initial_memory(env.num_envs).actor
+        )
 
     def evaluate(
-        self, policies: Sequence[TrainedPolicy], env_steps: Sequence[int], episodes: int, *, absolute: bool = False
+        self,
+        policies: Sequence[TrainedPolicy],
+        env_steps: Sequence[int],
+        episodes: int,
+        *,
+        absolute: bool = False,
     ) -> list[dict[str, Any]]:
-        """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with mean actions.
+        """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with
+        mean actions.
 
         The `absolute` metric has other episodes than the evaluations that chose its policy.
         """
         stacked = _twice([policy.arrays for policy in policies])
         modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
-        # The same random keys for every policy and training step, to reduce the variance of comparisons.
+        # The same random keys for every policy and training step, to reduce the variance of
+        # comparisons.
         key = jax.random.PRNGKey(self._config.seed)
         keys = jnp.tile(jax.random.fold_in(key, 2) if absolute else key, (2 * len(policies), 1))
         results = self._evaluator((stacked, modes), episodes, keys)
@@ -99,15 +118,22 @@ def _twice(trees: Sequence[Any]) -> Any:
 
 def _plain(result: Result) -> dict[str, Any]:
     """Returns a result as JSON values; numbers that are not finite become null."""
-    values = {k: v for k, v in result.to_dict().items() if k not in ("task", "episodes", "terms", "intervals")}
+    values = {
+        k: v
+        for k, v in result.to_dict().items()
+        if k not in ("task", "episodes", "terms", "intervals")
+    }
     values |= {f"reward/{name}": value for name, value in result.terms.items()}
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+    return {
+        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()
+    }
 
 
 def score(evaluation: dict[str, Any]) -> tuple[float, float]:
     """Returns the score by which evaluations are ranked, under sampled actions.
 
-    It is the average step reward; in a match first the win rate against the opponents of the evaluation.
+    It is the average step reward; in a match first the win rate against the opponents of the
+    evaluation.
     """
     sampled = evaluation["sampled"]
     values = (sampled.get("win_rate", 0.0), sampled["average_step_reward"])
@@ -122,10 +148,17 @@ class EvaluationLog:
     """
 
     def __init__(self, run_dir: Path | None, env_steps: int) -> None:
-        self._run_dir, self._best = run_dir, None
-        before: dict[str, Any] = {"evaluations": [], "absolute": None} if run_dir is None else read_evaluations(run_dir)
+        self._run_dir = run_dir
+        self._best = None
+        before: dict[str, Any] = (
+            {"evaluations": [], "absolute": None} if run_dir is None else read_evaluations(run_dir)
+        )
         self.evaluations = [e for e in before["evaluations"] if e["env_steps"] <= env_steps]
-        self.absolute = before["absolute"] if before["absolute"] and before.get("ended_at") == env_steps else None
+        self.absolute = (
+            before["absolute"]
+            if before["absolute"] and before.get("ended_at") == env_steps
+            else None
+        )
 
     def add(self, evaluation: dict[str, Any], policy: TrainedPolicy) -> None:
         """Appends an evaluation, and saves its policy if it scores higher than those before."""
@@ -165,7 +198,9 @@ class EvaluationLog:
         self._write({"ended_at": env_steps})
 
     def prune(self) -> None:
-        """Removes all policies but the best; called once the checkpoint that includes it is on disk."""
+        """Removes all policies but the best; called once the checkpoint that includes it is on
+        disk.
+        """
         assert self._run_dir is not None
         check_locks(self._run_dir / EVALUATIONS_FILE)
         best = self.best()
@@ -175,16 +210,22 @@ class EvaluationLog:
 
     def _write(self, more: dict[str, Any]) -> None:
         if self._run_dir is not None:
-            write_evaluations(self._run_dir, {"evaluations": self.evaluations, "absolute": self.absolute, **more})
+            write_evaluations(
+                self._run_dir, {"evaluations": self.evaluations, "absolute": self.absolute, **more}
+            )
 
 
 def write_evaluations(run_dir: Path, evaluations: dict[str, Any]) -> None:
     """Writes a run's evaluations, as `read_evaluations` returns them."""
-    write_atomically(run_dir / EVALUATIONS_FILE, (json.dumps(evaluations, indent=1) + "\n").encode())
+    write_atomically(
+        run_dir / EVALUATIONS_FILE, (json.dumps(evaluations, indent=1) + "\n").encode()
+    )
 
 
 def read_evaluations(run_dir: Path) -> dict[str, Any]:
-    """Reads a run's evaluations, as they were written; without the file none; InputError if the file is damaged."""
+    """Reads a run's evaluations, as they were written; without the file none; InputError if the
+    file is damaged.
+    """
     path = run_dir / EVALUATIONS_FILE
     if not path.is_file():
         return {"evaluations": [], "absolute": None}

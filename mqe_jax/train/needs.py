@@ -1,4 +1,6 @@
-"""What a policy needs of its environment: its file holds it, and `mqe_jax.train.policy.check_policy` compares it."""
+"""What a policy needs of its environment: its file holds it, and
+`mqe_jax.train.policy.check_policy` compares it.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,7 +8,15 @@ from typing import Any
 
 from mqe_jax.core.blocks import Block, entities
 from mqe_jax.core.limits import PositiveInt
-from mqe_jax.core.settings import FrozenMapping, Parameters, Range, check_arguments, fail, leaves, settings_class
+from mqe_jax.core.settings import (
+    FrozenMapping,
+    Parameters,
+    Range,
+    check_arguments,
+    fail,
+    leaves,
+    settings_class,
+)
 from mqe_jax.core.types import AnyEnvironment, teams_of
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
@@ -17,7 +27,9 @@ ACTIONS = ("robot", "control", "skill", "gait", "commands", "command_ranges", "p
 
 @settings_class
 class Needs:
-    """What a policy needs of its environment; None for what the environment does not describe or its actions ignore."""
+    """What a policy needs of its environment; None for what the environment does not describe or
+    its actions ignore.
+    """
 
     task: str
     """Id of the task."""
@@ -49,27 +61,45 @@ class Needs:
     def by_name(self) -> dict[str, Any]:
         """Returns what must be equal in an environment, by name.
 
-        These include each setting of the sensors, and the form of blocks of entities and images, if known.
+        These include each setting of the sensors, and the form of blocks of entities and images, if
+        known.
         """
         names = ("version", *ACTIONS, "group")
-        needs = {"task": self.task, "agents": self.dims.agents, **{x: getattr(self, x) for x in names}}
+        needs = {
+            "task": self.task,
+            "agents": self.dims.agents,
+            **{x: getattr(self, x) for x in names},
+        }
         sensors = {sensor["name"]: sensor for sensor in self.senses}
         needs |= {"senses": tuple(sensors)} | dict(leaves(sensors, "senses."))
-        forms = {f"layout.{block.name}": block.entities or block.image for block in self.dims.blocks}
+        forms = {
+            f"layout.{block.name}": block.entities or block.image for block in self.dims.blocks
+        }
         needs |= {"layout": self.layout} | {name: form for name, form in forms.items() if form}
         return needs | {"observation": self.dims.observation, "action": self.dims.action}
 
     def at_size(self, found: "Needs") -> "Needs":
-        """Returns these needs with the numbers of agents and entities in others, if blocks differ in nothing else."""
+        """Returns these needs with the numbers of agents and entities in others, if blocks differ
+        in nothing else.
+        """
         own, other = ([_one(block) for block in needs.dims.blocks] for needs in (self, found))
         if not own or own != other:
             return self
-        return dataclasses.replace(self, dims=found.dims._replace(action=self.dims.action), layout=found.layout)
+        return dataclasses.replace(
+            self, dims=found.dims._replace(action=self.dims.action), layout=found.layout
+        )
 
     def mismatches(self, found: "Needs") -> dict[str, tuple[Any, Any]]:
-        """Returns what these needs and those of an environment differ in: the values of both by name."""
-        own, other = self.by_name(), found.by_name()
-        known = [x for x in dict.fromkeys((*own, *other)) if self.dims.blocks or not x.startswith("layout.")]
+        """Returns what these needs and those of an environment differ in: the values of both by
+        name.
+        """
+        own = self.by_name()
+        other = found.by_name()
+        known = [
+            x
+            for x in dict.fromkeys((*own, *other))
+            if self.dims.blocks or not x.startswith("layout.")
+        ]
         return {x: (own.get(x), other.get(x)) for x in known if own.get(x) != other.get(x)}
 
 
@@ -88,7 +118,8 @@ def needs_of(env: Any, config: TrainConfig) -> Needs:
     sizes = {"policy": env.observation_size, **getattr(env, "group_sizes", {})}
     if config.group not in sizes:
         fail("group", config.group, f"one of {env.name}: {', '.join(sizes)}")
-    task, agents = getattr(env, "env", env), len(teams_of(env)[0])
+    task = getattr(env, "env", env)
+    agents = len(teams_of(env)[0])
     described = task.describe(config.group) if hasattr(task, "describe") else {}
     dims = EnvDims(
         agents=agents,

@@ -1,7 +1,7 @@
 """The network protocol and the registry of networks.
 
-A network is one registered settings class whose `build` returns the functions that the learner, the rollout and a
-saved policy use. To add an architecture, register another settings class:
+A network is one registered settings class whose `build` returns the functions that the learner, the
+rollout and a saved policy use. To add an architecture, register another settings class:
 
     @register_network("mine")
     class MyNetwork(NetworkSettings):
@@ -11,8 +11,8 @@ saved policy use. To add an architecture, register another settings class:
 
 The settings import no JAX, so that a wrong flag of `mqe train` is named at once.
 
-Shapes: N environments (or any leading axes), A agents, observations O, privileged observation P, actions D, values V,
-chunks of L steps.
+Shapes: N environments (or any leading axes), A agents, observations O, privileged observation P,
+actions D, values V, chunks of L steps.
 """
 
 from __future__ import annotations
@@ -66,17 +66,18 @@ class Network(NamedTuple):
     - `init(key) -> params`
     - `policy_params(params) -> params` returns the parameters of `act`, which a saved policy has.
     - `initial_memory(num_envs) -> memory` returns a recurrent state of zeros with leading axis N.
-    - `act(policy_params, actor_memory, obs, key, active) -> (action, log_prob, actor_memory)`, with obs (N, A, O),
-      active (N, A), action and log_prob (N, A, D). Actions are unbounded, and without a key deterministic. Agents may
-      act autoregressively within one call.
-    - `value(params, critic_memory, is_first, obs, privileged, active) -> (value, critic_memory)`, with is_first (L, N),
-      obs (L, N, A, O), privileged (L, N, P), active (L, N, A), value (L, N, V).
-    - `evaluate(params, memory, is_first (L, C), obs, privileged, action, active) -> ChunkResult` takes all agents in
-      parallel.
+    - `act(policy_params, actor_memory, obs, key, active) -> (action, log_prob, actor_memory)`, with
+      obs (N, A, O), active (N, A), action and log_prob (N, A, D). Actions are unbounded, and
+      without a key deterministic. Agents may act autoregressively within one call.
+    - `value(params, critic_memory, is_first, obs, privileged, active) -> (value, critic_memory)`,
+      with is_first (L, N), obs (L, N, A, O), privileged (L, N, P), active (L, N, A), value (L, N,
+      V).
+    - `evaluate(params, memory, is_first (L, C), obs, privileged, action, active) -> ChunkResult`
+      takes all agents in parallel.
 
-    `active` marks the agents that take part; None: all. The observations of the others are 0; a network in which agents
-    see each other must leave them out. `chunk_length` is the number of steps of truncated backpropagation through time,
-    1 for feed-forward networks.
+    `active` marks the agents that take part; None: all. The observations of the others are 0; a
+    network in which agents see each other must leave them out. `chunk_length` is the number of
+    steps of truncated backpropagation through time, 1 for feed-forward networks.
     """
 
     init: Callable[[jax.Array], Params]
@@ -96,16 +97,22 @@ class NetworkSettings:
 
     @property
     def critic_reads(self) -> tuple[str, ...]:
-        """The observations on which `Network.value` depends; others may be missing at the end of a step."""
+        """The observations on which `Network.value` depends; others may be missing at the end of a
+        step.
+        """
         return "obs", "privileged_obs"
 
     @property
     def any_size(self) -> bool:
-        """Whether what a policy holds does not depend on the numbers of agents and of entities in a block."""
+        """Whether what a policy holds does not depend on the numbers of agents and of entities in a
+        block.
+        """
         return False
 
     def features(self, dims: EnvDims) -> Features | None:
-        """Returns which statistics normalise the entries of an observation; None: each entry has its own."""
+        """Returns which statistics normalise the entries of an observation; None: each entry has
+        its own.
+        """
         return None
 
     def build(self, dims: EnvDims) -> Network:
@@ -124,7 +131,8 @@ class GaussianSettings(NetworkSettings):
     log_std_max: float | None = None
     """Upper bound on the log standard deviation; none sets no bound."""
     log_std_min: float | None = None
-    """Lower bound on the log standard deviation, which maintains exploration; none sets no bound."""
+    """Lower bound on the log standard deviation, which maintains exploration; none sets no
+    bound."""
 
     def __post_init__(self) -> None:
         if self.log_std_max is not None and self.log_std_init > self.log_std_max:
@@ -147,7 +155,9 @@ NETWORKS: dict[str, type[NetworkSettings]] = {}
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
-    """Makes a class a settings class and registers it; the functions of its network compute in single precision."""
+    """Makes a class a settings class and registers it; the functions of its network compute in
+    single precision.
+    """
     check("name", name, str)
 
     def register(cls: type[Any]) -> type[Any]:
@@ -159,7 +169,9 @@ def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
         def build_single(self: Any, dims: EnvDims) -> Network:
             from mqe_jax.core.precision import single
 
-            return Network._make(single(part) if callable(part) else part for part in build_own(self, dims))
+            return Network._make(
+                single(part) if callable(part) else part for part in build_own(self, dims)
+            )
 
         cls.build = build_single
         cls.__annotations__ = {"name": Literal[name], **cls.__annotations__}
@@ -196,14 +208,15 @@ class ActorCritic(GaussianSettings):
     critic_input: Literal["privileged", "observations", "own"] = "privileged"
     """Critic input: the privileged observation, all agents' observations, or each agent's own."""
     share_policy: bool = True
-    """Share one actor between all agents, distinguished only by an id in their observations; else one per agent."""
+    """Share one actor between all agents, distinguished only by an id in their observations; else
+    one per agent."""
     hidden_sizes: Widths = (64,)
     """Widths of the hidden layers of actor and critic."""
     activation: Literal["relu", "elu", "tanh"] = "relu"
     """Activation after each hidden layer."""
     openrl_layers: bool = False
-    """Add the layers of OpenRL's networks: a normalisation after each hidden layer and after the recurrent unit, and a
-    linear layer with its own normalisation after the hidden layers."""
+    """Add the layers of OpenRL's networks: a normalisation after each hidden layer and after the
+    recurrent unit, and a linear layer with its own normalisation after the hidden layers."""
     recurrent: bool = True
     """Use a gated recurrent unit after the hidden layers of actor and critic."""
     gru_size: Width = 64
@@ -227,14 +240,17 @@ class ActorCritic(GaussianSettings):
 
 @register_network("blocks")
 class Blocks(ActorCritic):
-    """Settings of an actor and critic that encode an observation by its blocks, as the layout describes them.
+    """Settings of an actor and critic that encode an observation by its blocks, as the layout
+    describes them.
 
-    Entities of one kind share parameters, so that the sizes of the actor do not depend on their number; convolutions
-    encode images. Entities of a kind share the statistics of their features, and masks and pixels have none.
+    Entities of one kind share parameters, so that the sizes of the actor do not depend on their
+    number; convolutions encode images. Entities of a kind share the statistics of their features,
+    and masks and pixels have none.
     """
 
     entity_sizes: Widths = (64, 64)
-    """Widths of the layers that encode each entity; maxima and means over a block's entities follow."""
+    """Widths of the layers that encode each entity; maxima and means over a block's entities
+    follow."""
     image_channels: Widths = (16, 32)
     """Channels of the convolutions of images, each of which halves height and width."""
     image_size: Width = 64
@@ -266,10 +282,11 @@ class Mat(GaussianSettings):
     width: Width = 64
     """Width of every layer."""
     gain: Positive = 0.01
-    """Gain of the orthogonal initialisation of attention, of residual branches' last layers, and of output layers."""
+    """Gain of the orthogonal initialisation of attention, of residual branches' last layers, and of
+    output layers."""
     deviation: Literal["sigmoid", "free"] = "sigmoid"
-    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 initially (OpenRL), or an unconstrained
-    log, the only choice that uses log_std_*."""
+    """Standard deviation of the actions: 0.5 x sigmoid(parameter), 0.366 initially (OpenRL), or an
+    unconstrained log, the only choice that uses log_std_*."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

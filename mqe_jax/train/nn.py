@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from mqe_jax.core.types import Params
 
 PRECISION = "highest"
-"""Precision of the learner's matrix products: full float32, so that results do not depend on the GPU model."""
+"""Precision of the learner's matrix products: full float32, so that results do not depend on the
+GPU model."""
 
 
 def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Array:
@@ -23,18 +24,26 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Arra
     def add_column(j: jax.Array, q: jax.Array) -> jax.Array:
         column = normal[:, j]
         for _ in range(2):  # the second pass removes rounding errors
-            column = column - jnp.matmul(q, jnp.matmul(column, q, precision=PRECISION), precision=PRECISION)
+            column = column - jnp.matmul(
+                q, jnp.matmul(column, q, precision=PRECISION), precision=PRECISION
+            )
         return q.at[:, j].set(column / jnp.linalg.norm(column))
 
-    # Gram-Schmidt in place of jnp.linalg.qr, which can deadlock on a CPU with few cores: LAPACK decompositions in one
-    # program run concurrently in XLA's threads, and each waits for a free thread.
+    # Gram-Schmidt in place of jnp.linalg.qr, which can deadlock on a CPU with few cores: LAPACK
+    # decompositions in one program run concurrently in XLA's threads, and each waits for a free
+    # thread.
     q = jax.lax.fori_loop(0, min(shape), add_column, jnp.zeros_like(normal))
     return scale * (q if rows >= columns else q.T)
 
 
 def dense_init(key: jax.Array, n_in: int, n_out: int, scale: float = math.sqrt(2.0)) -> Params:
-    """Initialises an affine layer: orthogonal weight (n_in, n_out) of gain `scale`, zero bias (n_out,)."""
-    return {"weight": orthogonal(key, (n_in, n_out), scale), "bias": jnp.zeros((n_out,), jnp.float32)}
+    """Initialises an affine layer: orthogonal weight (n_in, n_out) of gain `scale`, zero bias
+    (n_out,).
+    """
+    return {
+        "weight": orthogonal(key, (n_in, n_out), scale),
+        "bias": jnp.zeros((n_out,), jnp.float32),
+    }
 
 
 def dense(params: Params, x: jax.Array, *, precision: str | None = PRECISION) -> jax.Array:
@@ -43,7 +52,9 @@ def dense(params: Params, x: jax.Array, *, precision: str | None = PRECISION) ->
 
 
 def mlp_init(key: jax.Array, sizes: Sequence[int], *, final_scale: float = 1.0) -> Params:
-    """Initialises affine layers `"0"`, `"1"`, ... of shapes (sizes[i], sizes[i + 1]); the last has `final_scale`."""
+    """Initialises affine layers `"0"`, `"1"`, ... of shapes (sizes[i], sizes[i + 1]); the last has
+    `final_scale`.
+    """
     count = len(sizes) - 1
     keys = jax.random.split(key, count)
     gains = [math.sqrt(2.0)] * (count - 1) + [final_scale]
@@ -58,7 +69,8 @@ def mlp(
     activate_last: bool = False,
     precision: str | None = PRECISION,
 ) -> jax.Array:
-    """Applies the layers in order with `activation` between them (and after the last with `activate_last`).
+    """Applies the layers in order with `activation` between them (and after the last with
+    `activate_last`).
 
     Shapes: (..., sizes[0]) -> (..., sizes[-1]).
     """
@@ -76,7 +88,8 @@ def layer_norm_init(width: int) -> Params:
 
 
 def layer_norm(params: Params, x: jax.Array) -> jax.Array:
-    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it: (..., W) -> (..., W).
+    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it: (..., W) ->
+    (..., W).
 
     Source: Ba et al., arXiv 1607.06450.
     """
@@ -86,7 +99,9 @@ def layer_norm(params: Params, x: jax.Array) -> jax.Array:
 
 
 def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
-    """Initialises a gated recurrent unit: gates reset, update, candidate concatenated, each orthogonal."""
+    """Initialises a gated recurrent unit: gates reset, update, candidate concatenated, each
+    orthogonal.
+    """
     keys = jax.random.split(key, 6)
 
     def three_gates(gate_keys: jax.Array, rows: int) -> Params:
@@ -114,13 +129,15 @@ def gru(params: Params, h: jax.Array, x: jax.Array) -> jax.Array:
 def clip_parameter(x: jax.Array, low: float, high: float) -> jax.Array:
     """Clips a parameter to [low, high] with a custom gradient.
 
-    Within the bounds the gradient is that of the identity. Outside, it is passed if a descent step reduces the
-    violation and zero if it would increase it.
+    Within the bounds the gradient is that of the identity. Outside, it is passed if a descent step
+    reduces the violation and zero if it would increase it.
     """
     return jnp.clip(x, low, high)
 
 
-def _bounded_forward(x: jax.Array, low: float, high: float) -> tuple[jax.Array, tuple[jax.Array, float, float]]:
+def _bounded_forward(
+    x: jax.Array, low: float, high: float
+) -> tuple[jax.Array, tuple[jax.Array, float, float]]:
     return jnp.clip(x, low, high), (x, low, high)
 
 

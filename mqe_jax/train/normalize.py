@@ -19,7 +19,9 @@ _TINY = 1e-12
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Features:
-    """Which statistics normalise the entries of an observation: entries of one feature share them."""
+    """Which statistics normalise the entries of an observation: entries of one feature share
+    them.
+    """
 
     index: np.ndarray
     """Feature of each entry (size,); `count` for entries that are not normalised."""
@@ -30,17 +32,23 @@ class Features:
 
 
 def features_of(blocks: Sequence[Block]) -> Features:
-    """Returns the features of blocks: entities of a kind share theirs; masks and pixels are not normalised."""
+    """Returns the features of blocks: entities of a kind share theirs; masks and pixels are not
+    normalised.
+    """
     names: dict[tuple[str, int, int], int] = {}
-    index, mask = [], []
+    index = []
+    mask = []
     size = sum(block.width for block in blocks)
     for block in blocks:
-        entities, start = block.entities, len(index)
+        entities = block.entities
+        start = len(index)
         length = block.width if entities is None else entities.width + entities.masked
         for entry in range(block.width):
             column = entry % length
             hidden = block.image is not None or (entities is not None and column == entities.width)
-            kind = ("", start, entry) if entities is None else (entities.kind, entities.width, column)
+            kind = (
+                ("", start, entry) if entities is None else (entities.kind, entities.width, column)
+            )
             index.append(-1 if hidden else names.setdefault(kind, len(names)))
             masked = entities is not None and entities.masked and not hidden
             mask.append(start + entry - column + length - 1 if masked else size)
@@ -49,7 +57,9 @@ def features_of(blocks: Sequence[Block]) -> Features:
 
 
 class RunningStatistics(NamedTuple):
-    """Mean (size,), variance (size,) and number () float32 of all samples so far; with `Features`, each is (F,)."""
+    """Mean (size,), variance (size,) and number () float32 of all samples so far; with `Features`,
+    each is (F,).
+    """
 
     mean: jax.Array
     variance: jax.Array
@@ -59,11 +69,16 @@ class RunningStatistics(NamedTuple):
 def running_init(size: int, features: Features | None = None) -> RunningStatistics:
     """Returns statistics that leave data unchanged until the first update."""
     shape = (size,) if features is None else (features.count,)
-    return RunningStatistics(jnp.zeros(shape), jnp.ones(shape), jnp.zeros(() if features is None else shape))
+    return RunningStatistics(
+        jnp.zeros(shape), jnp.ones(shape), jnp.zeros(() if features is None else shape)
+    )
 
 
 def running_update(
-    statistics: RunningStatistics, batch: jax.Array, active: jax.Array, features: Features | None = None
+    statistics: RunningStatistics,
+    batch: jax.Array,
+    active: jax.Array,
+    features: Features | None = None,
 ) -> RunningStatistics:
     """Merges the samples (..., size) of a batch that are active (...) bool into the statistics.
 
@@ -89,8 +104,12 @@ def running_update(
     return RunningStatistics(mean, variance, samples)
 
 
-def _moments(batch: jax.Array, mask: jax.Array, features: Features) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns number, mean and variance of each feature (F,) in a batch (B, size), of entries with a mask (B, size)."""
+def _moments(
+    batch: jax.Array, mask: jax.Array, features: Features
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns number, mean and variance of each feature (F,) in a batch (B, size), of entries with
+    a mask (B, size).
+    """
     one_hot = np.asarray(features.index[:, None] == np.arange(features.count), np.float32)
 
     def by_feature(x: jax.Array) -> jax.Array:
@@ -103,17 +122,26 @@ def _moments(batch: jax.Array, mask: jax.Array, features: Features) -> tuple[jax
     return samples, mean, by_feature(jnp.square(deviation)) / jnp.maximum(samples, 1.0)
 
 
-def running_normalize(statistics: RunningStatistics, x: jax.Array, features: Features | None = None) -> jax.Array:
-    """Returns x (..., size) normalised to mean 0 and deviation 1, clipped to +-10; constant entries become 0."""
-    mean, variance = statistics.mean, statistics.variance
+def running_normalize(
+    statistics: RunningStatistics, x: jax.Array, features: Features | None = None
+) -> jax.Array:
+    """Returns x (..., size) normalised to mean 0 and deviation 1, clipped to +-10; constant entries
+    become 0.
+    """
+    mean = statistics.mean
+    variance = statistics.variance
     if features is not None:
-        mean, variance = (jnp.append(y, own)[features.index] for y, own in ((mean, 0.0), (variance, 1.0)))
+        mean, variance = (
+            jnp.append(y, own)[features.index] for y, own in ((mean, 0.0), (variance, 1.0))
+        )
     std = jnp.maximum(jnp.sqrt(variance), _OBSERVATION_MIN_STD)
     return jnp.clip((x - mean) / std, -10.0, 10.0)
 
 
 class ValueStatistics(NamedTuple):
-    """Exponential averages of value targets () and of their squares (), and the accumulated weight ()."""
+    """Exponential averages of value targets () and of their squares (), and the accumulated weight
+    ().
+    """
 
     mean: jax.Array
     square: jax.Array
@@ -121,17 +149,24 @@ class ValueStatistics(NamedTuple):
 
 
 def value_init(enabled: bool = True) -> ValueStatistics:
-    """Returns statistics with which values denormalise to 0; if not `enabled`, those that leave values unchanged."""
+    """Returns statistics with which values denormalise to 0; if not `enabled`, those that leave
+    values unchanged.
+    """
     return ValueStatistics(jnp.zeros(()), jnp.float32(not enabled), jnp.float32(not enabled))
 
 
-def value_update(statistics: ValueStatistics, target: jax.Array, active: jax.Array, decay: float) -> ValueStatistics:
-    """Updates the averages with a rollout's targets where `active`, of the same shape; weights remove the initial bias.
+def value_update(
+    statistics: ValueStatistics, target: jax.Array, active: jax.Array, decay: float
+) -> ValueStatistics:
+    """Updates the averages with a rollout's targets where `active`, of the same shape; weights
+    remove the initial bias.
 
     Source: Yu et al., arXiv 2103.01955 (there with decay 0.99999 per minibatch; here per rollout).
     """
     mean = decay * statistics.mean + (1.0 - decay) * devices.mean_where(target, active)
-    square = decay * statistics.square + (1.0 - decay) * devices.mean_where(jnp.square(target), active)
+    square = decay * statistics.square + (1.0 - decay) * devices.mean_where(
+        jnp.square(target), active
+    )
     weight = decay * statistics.weight + (1.0 - decay)
     return ValueStatistics(mean, square, weight)
 
@@ -139,10 +174,12 @@ def value_update(statistics: ValueStatistics, target: jax.Array, active: jax.Arr
 def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
     """Returns mean and standard deviation, both 0 before the first update.
 
-    The standard deviation is at least a thousandth of the root mean square: rounding errors are not magnified.
+    The standard deviation is at least a thousandth of the root mean square: rounding errors are not
+    magnified.
     """
     weight = jnp.where(statistics.weight > 0.0, statistics.weight, 1.0)
-    mean, square = statistics.mean / weight, statistics.square / weight
+    mean = statistics.mean / weight
+    square = statistics.square / weight
     return mean, jnp.sqrt(jnp.maximum(square - jnp.square(mean), _VALUE_MIN_STD**2 * square))
 
 

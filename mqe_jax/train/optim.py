@@ -8,7 +8,9 @@ import jax.numpy as jnp
 
 from mqe_jax.core.types import PyTree
 
-_B1, _B2 = 0.9, 0.999  # decays of the moments
+# decays of the moments
+_B1 = 0.9
+_B2 = 0.999
 
 
 class AdamState(NamedTuple):
@@ -20,18 +22,27 @@ class AdamState(NamedTuple):
 
 
 class Optimizer(NamedTuple):
-    """`init(params) -> state`; `update(grads, state, params, learning_rate) -> (params, state, grad_norm)`."""
+    """`init(params) -> state`; `update(grads, state, params, learning_rate) -> (params, state,
+    grad_norm)`.
+    """
 
     init: Callable[[PyTree], AdamState]
-    update: Callable[[PyTree, AdamState, PyTree, jax.Array | float], tuple[PyTree, AdamState, jax.Array]]
+    update: Callable[
+        [PyTree, AdamState, PyTree, jax.Array | float], tuple[PyTree, AdamState, jax.Array]
+    ]
 
 
 def restart(state: AdamState, when: jax.Array | bool) -> AdamState:
     """Returns the initial state if `when` is true, else the state itself.
 
-    After updates with gradients of 0, without corrections of the moments, the first real steps would be too long.
+    After updates with gradients of 0, without corrections of the moments, the first real steps
+    would be too long.
     """
-    return state if when is False else jax.tree.map(lambda x: jnp.where(when, jnp.zeros_like(x), x), state)
+    return (
+        state
+        if when is False
+        else jax.tree.map(lambda x: jnp.where(when, jnp.zeros_like(x), x), state)
+    )
 
 
 def adam(eps: float = 1e-5, max_grad_norm: float | None = None) -> Optimizer:
@@ -58,7 +69,9 @@ def adam(eps: float = 1e-5, max_grad_norm: float | None = None) -> Optimizer:
         updates = state.updates + 1
         steps = updates.astype(jnp.float32)
         mean = jax.tree.map(lambda m, g: _B1 * m + (1.0 - _B1) * g, state.mean, grads)
-        square = jax.tree.map(lambda s, g: _B2 * s + (1.0 - _B2) * jnp.square(g), state.square, grads)
+        square = jax.tree.map(
+            lambda s, g: _B2 * s + (1.0 - _B2) * jnp.square(g), state.square, grads
+        )
         mean_scale = 1.0 / (1.0 - _B1**steps)
         square_scale = 1.0 / (1.0 - _B2**steps)
 

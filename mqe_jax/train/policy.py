@@ -1,4 +1,6 @@
-"""Policies: the protocol of what acts for a team, and trained policies, which are saved, loaded and exchanged."""
+"""Policies: the protocol of what acts for a team, and trained policies, which are saved, loaded and
+exchanged.
+"""
 
 import dataclasses
 import functools
@@ -39,11 +41,13 @@ POLICY_FILE = "policy.safetensors"
 
 
 class Policy(Protocol):
-    """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled code.
+    """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled
+    code.
 
     `initial_memory(num_envs)` returns the recurrent state at an episode's start, leading axis N.
-    `act(obs, memory, key) -> (action, memory)` maps observations (N, A, O) to actions (N, A, D) in [-1, 1]. A policy
-    with `groups`, the names of the observation groups that it sees, also accepts `Observations`.
+    `act(obs, memory, key) -> (action, memory)` maps observations (N, A, O) to actions (N, A, D) in
+    [-1, 1]. A policy with `groups`, the names of the observation groups that it sees, also accepts
+    `Observations`.
     """
 
     @property
@@ -66,7 +70,9 @@ def groups_of(*policies: Any) -> set[str]:
 
 
 class Composed:
-    """What policies made of others share: the task and the agents of the first, and the groups of all."""
+    """What policies made of others share: the task and the agents of the first, and the groups of
+    all.
+    """
 
     _parts: Any  # the policies
 
@@ -155,7 +161,9 @@ class TrainedPolicy:
 
     @property
     def architecture(self) -> dict[str, Any]:
-        """Everything but the arrays by name; policies with equal ones can be exchanged within compiled code."""
+        """Everything but the arrays by name; policies with equal ones can be exchanged within
+        compiled code.
+        """
         settings = {"normalization.observations": self.config.normalization.observations}
         network = {f"network.{name}": value for name, value in vars(self.config.network).items()}
         return {**self.needs.by_name(), **network, **settings, "deterministic": self.deterministic}
@@ -165,8 +173,12 @@ class TrainedPolicy:
         return dataclasses.replace(self, deterministic=deterministic)
 
     def at_size(self, env: Any) -> Self:
-        """Returns the policy for the numbers of agents and entities in an environment; itself if it has its own."""
-        if not self.config.network.any_size or self.needs.group not in getattr(env, "group_sizes", {}):
+        """Returns the policy for the numbers of agents and entities in an environment; itself if it
+        has its own.
+        """
+        if not self.config.network.any_size or self.needs.group not in getattr(
+            env, "group_sizes", {}
+        ):
             return self
         needs = self.needs.at_size(needs_of(env, self.config))
         return self if needs == self.needs else dataclasses.replace(self, needs=needs)
@@ -177,11 +189,14 @@ class TrainedPolicy:
         memory = self.config.network.build(self.dims).initial_memory(num_envs or 1).actor
         return jax.tree.map(lambda x: x[0], memory) if num_envs is None else memory
 
-    def act(self, obs: Any, memory: Memory, key: jax.Array | None = None) -> tuple[jax.Array, Memory]:
-        """Returns actions in [-1, 1] and the next memory: obs (N, A, O) or (A, O) -> (N, A, D) or (A, D).
+    def act(
+        self, obs: Any, memory: Memory, key: jax.Array | None = None
+    ) -> tuple[jax.Array, Memory]:
+        """Returns actions in [-1, 1] and the next memory: obs (N, A, O) or (A, O) -> (N, A, D) or
+        (A, D).
 
-        `obs` may also be `Observations`. `memory` is the recurrent state; the caller resets it to `initial_memory` at
-        an episode's start. Without a key, the action is the mean.
+        `obs` may also be `Observations`. `memory` is the recurrent state; the caller resets it to
+        `initial_memory` at an episode's start. Without a key, the action is the mean.
 
         Raises:
             InputError: for an observation of another shape.
@@ -211,22 +226,31 @@ def _template(dims: EnvDims, settings: NetworkSettings) -> dict[str, Any]:
 
     def arrays() -> dict[str, Any]:
         params = network.policy_params(network.init(jax.random.PRNGKey(0)))
-        return {"params": params, "normalizer": running_init(dims.observation, settings.features(dims))}
+        return {
+            "params": params,
+            "normalizer": running_init(dims.observation, settings.features(dims)),
+        }
 
     return jax.eval_shape(arrays)
 
 
 @functools.lru_cache(maxsize=32)
 def policy_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> Any:
-    """Returns a network's compiled `act(arrays, obs, memory, key or None, active)`, scaled and clipped.
+    """Returns a network's compiled `act(arrays, obs, memory, key or None, active)`, scaled and
+    clipped.
 
     It returns the action and the next recurrent state.
     """
-    network, features = settings.build(dims), settings.features(dims)
+    network = settings.build(dims)
+    features = settings.features(dims)
 
     @jax.jit
     def act(
-        arrays: PolicyArrays, obs: jax.Array, memory: Memory, key: jax.Array | None, active: jax.Array | None = None
+        arrays: PolicyArrays,
+        obs: jax.Array,
+        memory: Memory,
+        key: jax.Array | None,
+        active: jax.Array | None = None,
     ) -> tuple[jax.Array, Memory]:
         if normalize:
             obs = running_normalize(arrays.normalizer, obs, features)
@@ -246,13 +270,16 @@ def check_obs(obs: Any, agents: int, size: int | None = None) -> jax.Array:
         fail("obs", obs, "an array of numbers")
     if obs.ndim < 2 or obs.shape[-2] != agents or size not in (None, obs.shape[-1]):
         raise InputError(
-            f"obs: shape {obs.shape} is not allowed; it must end in ({agents} agents, {size or 'their'} numbers)"
+            f"obs: shape {obs.shape} is not allowed; it must end in ({agents} agents, "
+            f"{size or 'their'} numbers)"
         )
     return obs
 
 
 @check_arguments(state=TrainState, env=AnyEnvironment, config=TrainConfig)
-def policy_of(state: TrainState, env: VectorEnv, config: TrainConfig, **metadata: Any) -> TrainedPolicy:
+def policy_of(
+    state: TrainState, env: VectorEnv, config: TrainConfig, **metadata: Any
+) -> TrainedPolicy:
     """Returns the policy of a learner state, which learns in an environment."""
     needs = needs_of(env, config)
     policy_params = config.network.build(needs.dims).policy_params(state.params)
@@ -260,7 +287,8 @@ def policy_of(state: TrainState, env: VectorEnv, config: TrainConfig, **metadata
 
 
 def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "policy") -> None:
-    """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, a trained one's `Needs`.
+    """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, a
+    trained one's `Needs`.
 
     Raises:
         InputError: naming `field`, the policy and what differs, with the values of both.
@@ -271,7 +299,9 @@ def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "p
         "agents": (policy.agents, len(teams_of(env)[0])),
     }
     trained: Any = policy
-    if isinstance(own := getattr(policy, "needs", None), Needs) and all(a == b for a, b in pairs.values()):
+    if isinstance(own := getattr(policy, "needs", None), Needs) and all(
+        a == b for a, b in pairs.values()
+    ):
         groups = {"policy", *getattr(env, "group_sizes", {})}
         if own.group in groups:
             pairs = own.mismatches(needs_of(env, trained.config))
@@ -279,7 +309,9 @@ def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "p
             pairs = {"group": (own.group, ", ".join(sorted(groups)))}
     for need, (value, found) in pairs.items():
         if value != found:
-            raise InputError(f"{field}: {name} needs {need} {value!r}; the environment has {found!r}")
+            raise InputError(
+                f"{field}: {name} needs {need} {value!r}; the environment has {found!r}"
+            )
 
 
 NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
@@ -287,8 +319,11 @@ NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
 
 
 @check_arguments(run_dir=PathText, policy=TrainedPolicy, name=PathText, half=bool)
-def save_policy(run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False) -> Path:
-    """Writes a policy into a folder, which it creates, atomically; with `half`, its parameters as float16.
+def save_policy(
+    run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False
+) -> Path:
+    """Writes a policy into a folder, which it creates, atomically; with `half`, its parameters as
+    float16.
 
     The file holds whether the policy acts with its mean actions.
 
@@ -311,19 +346,25 @@ def file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], dic
     """Returns the arrays and the metadata of a policy's file."""
     params = policy.params
     if half:
-        params = jax.tree.map(lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params)
+        params = jax.tree.map(
+            lambda x: x.astype(jnp.float16) if x.dtype == jnp.float32 else x, params
+        )
     records = {"needs": to_mapping(policy.needs), "config": to_mapping(policy.config)}
     metadata = {**policy.metadata, **records, "deterministic": policy.deterministic}
     return {"params": params, "normalizer": policy.normalizer}, metadata
 
 
-def write_policy(folder: str | Path, name: str, arrays: PyTree, metadata: Mapping[str, Any]) -> Path:
+def write_policy(
+    folder: str | Path, name: str, arrays: PyTree, metadata: Mapping[str, Any]
+) -> Path:
     """Writes the content of a policy's file; errors as `save_policy`."""
     if Path(name).name != name:
         fail("name", name, "the name of a file, without a folder")
     path = Path(folder) / name
     if wrong := nonfinite(arrays):
-        raise NonFiniteError(f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers")
+        raise NonFiniteError(
+            f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers"
+        )
     check_locks(path)
     check_folder(path.parent)
     save_tree(path, arrays, metadata, kind="policy")
@@ -332,10 +373,12 @@ def write_policy(folder: str | Path, name: str, arrays: PyTree, metadata: Mappin
 
 @single
 def read_policy(run: str | Path) -> TrainedPolicy:
-    """Reads the policy of a run folder, or a policy file; parameters stored as float16 become float32.
+    """Reads the policy of a run folder, or a policy file; parameters stored as float16 become
+    float32.
 
     Raises:
-        InputError: in one line naming the file, if it is missing, damaged, of another format or non-finite.
+        InputError: in one line naming the file, if it is missing, damaged, of another format or
+            non-finite.
     """
     path = policy_path(run)
     metadata = read_metadata(path, kind="policy")
@@ -351,7 +394,9 @@ def policy_path(run: str | Path) -> Path:
 
 
 def policy_in(path: Path, metadata: dict[str, Any], part: str = "") -> TrainedPolicy:
-    """Returns the policy of a file with its metadata, its arrays below the path name `part`; errors as there."""
+    """Returns the policy of a file with its metadata, its arrays below the path name `part`; errors
+    as there.
+    """
     try:
         needs = build(Needs, metadata.pop("needs"))
         config = build(TrainConfig, metadata.pop("config"))
@@ -359,5 +404,7 @@ def policy_in(path: Path, metadata: dict[str, Any], part: str = "") -> TrainedPo
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None
-    tree = load_tree(path, _template(needs.dims, config.network), kind="policy", half=True, part=part).tree
+    tree = load_tree(
+        path, _template(needs.dims, config.network), kind="policy", half=True, part=part
+    ).tree
     return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)

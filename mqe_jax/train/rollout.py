@@ -1,4 +1,6 @@
-"""Steps all environments under the current policy; collects transitions and metrics; forms minibatches."""
+"""Steps all environments under the current policy; collects transitions and metrics; forms
+minibatches.
+"""
 
 from typing import Any, NamedTuple
 
@@ -23,7 +25,9 @@ from mqe_jax.train.normalize import Features, RunningStatistics, running_normali
 
 
 class RolloutState(NamedTuple):
-    """State carried between rollouts: environment states, recurrent states, episode counters; leading axis N."""
+    """State carried between rollouts: environment states, recurrent states, episode counters;
+    leading axis N.
+    """
 
     env_state: Any
     memory: NetworkMemory
@@ -48,7 +52,9 @@ def normalize_obs(
     enabled: bool,
     features: Features | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns both observations as network inputs: normalised where `enabled`, 0 of agents that are not `active`."""
+    """Returns both observations as network inputs: normalised where `enabled`, 0 of agents that are
+    not `active`.
+    """
     if enabled:
         obs = running_normalize(normalizer.obs, obs, features)
         privileged = running_normalize(normalizer.privileged, privileged)
@@ -62,15 +68,20 @@ def active_of(state: Any) -> jax.Array:
 
 
 def learners_of(state: Any) -> jax.Array:
-    """Returns from which agents of an environment's state the policy learns (N, A) bool: all active ones by default."""
-    active, learners = active_of(state), getattr(state, "learners", None)
+    """Returns from which agents of an environment's state the policy learns (N, A) bool: all active
+    ones by default.
+    """
+    active = active_of(state)
+    learners = getattr(state, "learners", None)
     return active if learners is None else active & learners
 
 
 def mean_of_team(reward: jax.Array, active: jax.Array) -> jax.Array:
     """Returns the mean over the active agents: (..., A) -> (...); 0 without any."""
     count = jnp.sum(active.astype(jnp.float32), axis=-1)
-    return jnp.sum(jnp.where(active, reward.astype(jnp.float32), 0.0), axis=-1) / jnp.maximum(count, 1.0)
+    return jnp.sum(jnp.where(active, reward.astype(jnp.float32), 0.0), axis=-1) / jnp.maximum(
+        count, 1.0
+    )
 
 
 def rollout(
@@ -88,27 +99,42 @@ def rollout(
     features: Features | None = None,
     teacher: Any = None,
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
-    """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and metrics ().
+    """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and
+    metrics ().
 
-    The environment receives `action_scale` times the sampled action. A teacher, which sees its own group of
-    observations, labels every step with its action. Metrics are means over steps and environments, but `diverged` and
-    `overflow` are counts; `ended` has the number of `episodes` that ended and means over them.
+    The environment receives `action_scale` times the sampled action. A teacher, which sees its own
+    group of observations, labels every step with its action. Metrics are means over steps and
+    environments, but `diverged` and `overflow` are counts; `ended` has the number of `episodes`
+    that ended and means over them.
     """
 
-    def one_step(state: RolloutState, key: jax.Array) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
+    def one_step(
+        state: RolloutState, key: jax.Array
+    ) -> tuple[RolloutState, tuple[Transition, Any, Any]]:
         before = state.env_state
         memory = reset_memory(state.memory, state.is_first)
         active = active_of(before)
         seen = observations(before).group(group)
-        obs, privileged = normalize_obs(normalizer, seen, before.privileged_obs, active, normalize, features)
-        action, log_prob, actor_memory = network.act(network.policy_params(params), memory.actor, obs, key, active)
+        obs, privileged = normalize_obs(
+            normalizer, seen, before.privileged_obs, active, normalize, features
+        )
+        action, log_prob, actor_memory = network.act(
+            network.policy_params(params), memory.actor, obs, key, active
+        )
         not_first = jnp.zeros((1, *state.is_first.shape), bool)
-        _, critic_memory = network.value(params, memory.critic, not_first, obs[None], privileged[None], active[None])
-        label, teacher_memory = (), ()
+        _, critic_memory = network.value(
+            params, memory.critic, not_first, obs[None], privileged[None], active[None]
+        )
+        label = ()
+        teacher_memory = ()
         if teacher is not None:
-            teacher_memory = where_rows(state.is_first, teacher.initial_memory(env.num_envs), state.teacher_memory)
+            teacher_memory = where_rows(
+                state.is_first, teacher.initial_memory(env.num_envs), state.teacher_memory
+            )
             seen_by_teacher = observations(before).to(teacher)
-            label, teacher_memory = teacher.act(seen_by_teacher, teacher_memory, jax.random.fold_in(key, 1))
+            label, teacher_memory = teacher.act(
+                seen_by_teacher, teacher_memory, jax.random.fold_in(key, 1)
+            )
         after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
         transition = Transition(
@@ -116,7 +142,9 @@ def rollout(
             is_first=state.is_first,
             obs=seen,
             privileged_obs=before.privileged_obs,
-            final_obs=after.final_obs if group == "policy" else (after.final_groups or {}).get(group),
+            final_obs=after.final_obs
+            if group == "policy"
+            else (after.final_groups or {}).get(group),
             final_privileged_obs=after.final_privileged_obs,
             action=action,
             log_prob=log_prob,
@@ -129,7 +157,10 @@ def rollout(
         )
         episode_steps = state.episode_steps + 1
         episode_return = state.episode_return + mean_of_team(after.reward, active)
-        of_episodes = {"episode_length": episode_steps.astype(jnp.float32), "episode_return": episode_return}
+        of_episodes = {
+            "episode_length": episode_steps.astype(jnp.float32),
+            "episode_return": episode_return,
+        }
         ended = {**after.outcome.by_name(), **of_episodes}
         state = RolloutState(
             env_state=after,
@@ -152,7 +183,9 @@ def _sums(values: dict[str, jax.Array]) -> dict[str, jax.Array]:
     return {name: jnp.sum(value.astype(jnp.float32)) for name, value in values.items()}
 
 
-def _means(steps: dict[str, jax.Array], ended: dict[str, jax.Array], samples: int) -> dict[str, Any]:
+def _means(
+    steps: dict[str, jax.Array], ended: dict[str, jax.Array], samples: int
+) -> dict[str, Any]:
     """Returns the metrics of a rollout from sums over steps and over ended episodes ()."""
     episodes = ended.pop("episodes")
     counts = ("diverged", "overflow")
@@ -163,7 +196,8 @@ def _means(steps: dict[str, jax.Array], ended: dict[str, jax.Array], samples: in
 
 def chunks(x: jax.Array, length: int) -> jax.Array:
     """Splits the time axis into chunks: (T, N, ...) -> (length, T / length x N, ...)."""
-    parts, envs = x.shape[0] // length, x.shape[1]
+    parts = x.shape[0] // length
+    envs = x.shape[1]
     x = x.reshape(parts, length, *x.shape[1:])
     return jnp.swapaxes(x, 0, 1).reshape(length, parts * envs, *x.shape[3:])
 
@@ -175,14 +209,20 @@ def take(batch: Batch, index: jax.Array) -> Batch:
 
 
 def minibatches(ppo: PPO, key: jax.Array, parts: int, envs: int) -> jax.Array:
-    """Returns the chunks of every minibatch (M, C / M), of the C = parts x envs chunks of this process.
+    """Returns the chunks of every minibatch (M, C / M), of the C = parts x envs chunks of this
+    process.
 
-    The chunks of each of `ppo.groups` groups of environments are permuted, every minibatch gets equally many of them.
+    The chunks of each of `ppo.groups` groups of environments are permuted, every minibatch gets
+    equally many of them.
     """
     groups = ppo.groups // devices.size()
-    keys = key[None] if ppo.groups == 1 else devices.rows(lambda n: jax.random.split(key, n), groups)
+    keys = (
+        key[None] if ppo.groups == 1 else devices.rows(lambda n: jax.random.split(key, n), groups)
+    )
     of_group = envs // groups
     permuted = jax.vmap(lambda key: jax.random.permutation(key, parts * envs // groups))(keys)
     part, env = jnp.divmod(permuted, of_group)
     chunk = part * envs + jnp.arange(groups)[:, None] * of_group + env
-    return jnp.swapaxes(chunk.reshape(groups, ppo.minibatches, -1), 0, 1).reshape(ppo.minibatches, -1)
+    return jnp.swapaxes(chunk.reshape(groups, ppo.minibatches, -1), 0, 1).reshape(
+        ppo.minibatches, -1
+    )

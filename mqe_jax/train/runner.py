@@ -26,7 +26,13 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import SeedBatch, without_shared
 from mqe_jax.train.stages import Stages
-from mqe_jax.train.start import check_parameters, first_state, learned_state, own_learner, without_environments
+from mqe_jax.train.start import (
+    check_parameters,
+    first_state,
+    learned_state,
+    own_learner,
+    without_environments,
+)
 
 OnUpdate = Callable[[TrainState, dict[str, float]], None]
 _METRICS = ("loss/policy", "loss/value", "entropy", "approx_kl", "grad_norm")
@@ -42,15 +48,17 @@ def train(
     league: Matchmaker | None = None,
     teacher: Any = None,
 ) -> TrainState:
-    """Trains until `config.total_steps` and returns the last state; without a `run_dir`, nothing is written.
+    """Trains until `config.total_steps` and returns the last state; without a `run_dir`, nothing is
+    written.
 
-    `resume` continues the run in the folder from its newest checkpoint; in an empty folder a new run starts.
-    `on_update` gets the state and the row of metrics.csv of every update. `eval_env` has an environment for each of
-    `config.evaluation.episodes`, `teacher` is the policy that `config.imitation` imitates.
+    `resume` continues the run in the folder from its newest checkpoint; in an empty folder a new
+    run starts. `on_update` gets the state and the row of metrics.csv of every update. `eval_env`
+    has an environment for each of `config.evaluation.episodes`, `teacher` is the policy that
+    `config.imitation` imitates.
 
-    InputError, before anything is changed, for a folder that cannot be written, is in use, or holds a run that cannot
-    be resumed. NonFiniteError after the first update with a loss or weight that is not finite; what is on disk is from
-    before that update.
+    InputError, before anything is changed, for a folder that cannot be written, is in use, or holds
+    a run that cannot be resumed. NonFiniteError after the first update with a loss or weight that
+    is not finite; what is on disk is from before that update.
     """
     return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, league, teacher)[0]
 
@@ -66,10 +74,11 @@ def train_seeds(
     teacher: Any = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[TrainState]:
-    """Trains several seeds in one program, equivalently to separate runs, each with its own run folder; see `train`.
+    """Trains several seeds in one program, equivalently to separate runs, each with its own run
+    folder; see `train`.
 
-    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to all. If `stop()` is
-    true before an update, they are saved and end.
+    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to
+    all. If `stop()` is true before an update, they are saved and end.
     """
     with open_training(env, configs, run_dirs, resume, eval_env, league, teacher) as training:
         return training.run(on_update, stop)
@@ -92,9 +101,13 @@ def open_training(
         check("config", config, TrainConfig)
     run_dirs = [check("run_dir", run_dir, PathText | None) for run_dir in run_dirs]
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
-        raise InputError("seeds: the settings of seeds trained together may differ only in the seed")
+        raise InputError(
+            "seeds: the settings of seeds trained together may differ only in the seed"
+        )
     if configs[0].evaluation.every is not None and eval_env is None:
-        fail("evaluation.every", configs[0].evaluation.every, "none without evaluation environments")
+        fail(
+            "evaluation.every", configs[0].evaluation.every, "none without evaluation environments"
+        )
     check_parameters(env, configs[0], configs[0].training_env)
     if eval_env is not None:
         check_parameters(eval_env, configs[0], configs[0].env)
@@ -104,17 +117,33 @@ def open_training(
     elif resume:
         fail("resume", True, "false without a run_dir")
     learner, processes = own_learner(env, configs[0], league, teacher, stages)
-    with translate_errors(), open_folders(folders, resume) if processes.leads else contextlib.nullcontext():
+    with (
+        translate_errors(),
+        open_folders(folders, resume) if processes.leads else contextlib.nullcontext(),
+    ):
         processes.gather([0])  # the others wait for these checks
         checkpoints = common_checkpoints(folders) or [None] * len(configs)
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
         total = configs[0].num_updates * configs[0].steps_per_update
         with ProgressLog(configs[0].task or env.name, total, shown=processes.leads) as progress:
-            yield Training(env, learner, processes, configs, folders, checkpoints, eval_env, league, progress, stages)
+            yield Training(
+                env,
+                learner,
+                processes,
+                configs,
+                folders,
+                checkpoints,
+                eval_env,
+                league,
+                progress,
+                stages,
+            )
 
 
 class Training:
-    """A training of S seeds, with their states stacked, in checked and locked folders or in none."""
+    """A training of S seeds, with their states stacked, in checked and locked folders or in
+    none.
+    """
 
     def __init__(
         self,
@@ -129,27 +158,38 @@ class Training:
         progress: ProgressLog,
         stages: type[Stages],
     ) -> None:
-        self._env, self._configs, self._folders, self._stages = env, configs, folders, stages
-        self._config, self._processes, self._progress = configs[0], processes, progress
+        self._env = env
+        self._configs = configs
+        self._folders = folders
+        self._stages = stages
+        self._config = configs[0]
+        self._processes = processes
+        self._progress = progress
         self._seeds = seeds = SeedBatch(learner.init, len(configs))
         first = [
-            first_state(env, learner, processes, own, path, seeds.shared, league, progress.doing, stages)
+            first_state(
+                env, learner, processes, own, path, seeds.shared, league, progress.doing, stages
+            )
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stack(seeds.shared)
         self._state = self._stacked.together(jax.jit(seeds.stack)([state for state, _ in first]))
         self._update = self._stacked.compile(seeds.map(learner.update), more=True)
-        self.env_steps = int(first[0][0].updates) * self._config.steps_per_update  # done by each seed
+        # done by each seed
+        self.env_steps = int(first[0][0].updates) * self._config.steps_per_update
         self.resumed = checkpoints[0] is not None
         self._saved = self.env_steps if self.resumed else -1
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
         if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
             self._monitor = Monitor(eval_env, self._config)
-        self.rows: list[list[dict[str, float]]] = [[] for _ in configs]  # of metrics.csv, added by `run`
+        # of metrics.csv, added by `run`
+        self.rows: list[list[dict[str, float]]] = [[] for _ in configs]
         self.evaluations: list[EvaluationLog] = []  # of each seed; empty without evaluation
 
-    def run(self, on_update: OnUpdate | None = None, stop: Callable[[], bool] = lambda: False) -> list[TrainState]:
+    def run(
+        self, on_update: OnUpdate | None = None, stop: Callable[[], bool] = lambda: False
+    ) -> list[TrainState]:
         """Runs the remaining updates, until `stop()`, and returns the last states."""
         config = self._config
         if self._saved == self.env_steps and self._folders:
@@ -177,11 +217,16 @@ class Training:
                 with interrupts.defer() as signalled:
                     while self.env_steps < total_steps and not self._should_stop(stop, signalled):
                         rows = self._step(files)
-                        self._progress.write({name: float(np.mean([row[name] for row in rows])) for name in rows[0]})
+                        self._progress.write(
+                            {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+                        )
                         if on_update is not None:
                             for state, row in zip(self._own(), rows, strict=True):
                                 on_update(state, row)
-                        if self._evaluate_if_due() or int(rows[0]["updates"]) % config.checkpoint.every == 0:
+                        if (
+                            self._evaluate_if_due()
+                            or int(rows[0]["updates"]) % config.checkpoint.every == 0
+                        ):
                             self._save()
                     self._save()
                 if self.env_steps >= total_steps:
@@ -199,7 +244,9 @@ class Training:
         return [self._seeds.take(own, i) for i in range(len(self._configs))]
 
     def _should_stop(self, stop: Callable[[], bool], signalled: Callable[[], int]) -> bool:
-        """Returns whether the run ends here, for all processes; after a signal to one of them, all save and end."""
+        """Returns whether the run ends here, for all processes; after a signal to one of them, all
+        save and end.
+        """
         asked = self._processes.gather([int(stop()), signalled()])
         if number := int(asked[:, 1].max()):
             self._save()
@@ -212,21 +259,25 @@ class Training:
         began = time.perf_counter()
         after, metrics = self._update(self._state)
         metrics, finite = jax.device_get((metrics, _all_finite(learned_state(after))))
-        updates, rows = self.env_steps // self._config.steps_per_update + 1, []
+        updates = self.env_steps // self._config.steps_per_update + 1
+        rows = []
         for i in range(len(self._configs)):
             own = jax.tree.map(lambda x: x[i], metrics)  # noqa: B023
             row = row_of(updates, own, self._config, self._start_time, began)
             row["fps"] *= len(self._configs)
             if not finite or not all(math.isfinite(row[name]) for name in _METRICS):
                 folder = self._folders[i] if self._folders else None
-                _check_finite(learned_state(self._seeds.take(self._stacked.own(after), i)), row, folder)
+                _check_finite(
+                    learned_state(self._seeds.take(self._stacked.own(after), i)), row, folder
+                )
             rows.append(row)
         for logs, done, row in zip(files, self.rows, rows, strict=True):
             for log in logs:
                 log.write(row)
             done.append(row)
         # Assigned after logging, so that an interrupted run saves no update that is not logged.
-        self._state, self.env_steps = after, int(rows[0]["env_steps"])
+        self._state = after
+        self.env_steps = int(rows[0]["env_steps"])
         return rows
 
     def policies(self) -> list[TrainedPolicy]:
@@ -265,8 +316,11 @@ class Training:
             save_policy(folder, policy)
 
     def _evaluate_if_due(self) -> bool:
-        """Evaluates after every `evaluation.every` updates and after the last one; returns whether it was due."""
-        updates, last = self.env_steps // self._config.steps_per_update, self._config.num_updates
+        """Evaluates after every `evaluation.every` updates and after the last one; returns whether
+        it was due.
+        """
+        updates = self.env_steps // self._config.steps_per_update
+        last = self._config.num_updates
         every = self._config.evaluation.every
         due = every is not None and updates > 0 and updates % every == 0
         if due or updates >= last:
@@ -300,7 +354,8 @@ class Training:
 def _all_finite(tree: PyTree) -> jax.Array:
     """Returns whether all numbers of a pytree are finite (), computed on the device."""
     arrays = jax.tree.leaves(raw_keys(tree))
-    return _finite([x for x in arrays if x.size])  # jaxlib cannot compile empty ones of several processes
+    # jaxlib cannot compile empty ones of several processes
+    return _finite([x for x in arrays if x.size])
 
 
 @jax.jit
@@ -309,11 +364,15 @@ def _finite(arrays: list[jax.Array]) -> jax.Array:
 
 
 def _check_finite(learned: PyTree, row: Mapping[str, float], run_dir: Path | None) -> None:
-    """Raises a NonFiniteError naming the first metrics and learned arrays that an update made NaN or infinite."""
+    """Raises a NonFiniteError naming the first metrics and learned arrays that an update made NaN
+    or infinite.
+    """
     wrong = [name for name in _METRICS if not math.isfinite(row[name])] + nonfinite(learned)
     if wrong:
         kept = None if run_dir is None else latest(run_dir)
         raise NonFiniteError(
-            f"{run_dir or 'training'}: update {row['updates']:.0f} ({row['env_steps']:.0f} environment steps) made "
-            f"{', '.join(wrong[:3])} NaN or infinite; the last finite checkpoint is {kept.name if kept else 'missing'}"
+            f"{run_dir or 'training'}: update {row['updates']:.0f} ({row['env_steps']:.0f} "
+            "environment steps) made "
+            f"{', '.join(wrong[:3])} NaN or infinite; the last finite checkpoint is "
+            f"{kept.name if kept else 'missing'}"
         )

@@ -15,15 +15,20 @@ class Scheduled(NamedTuple):
     failure_bootstrap: jax.Array  # `curriculum.failure_bootstrap`
     entropy_coef: jax.Array  # `ppo.entropy_coef`
     imitation: jax.Array  # `imitation.weight`
-    actor_coef: jax.Array | float  # weight of all losses but the critic's: 0 during `ppo.critic_warmup`, then 1
-    actor_begins: jax.Array | bool  # whether it is the first update with all losses after `ppo.critic_warmup`
+    # weight of all losses but the critic's: 0 during `ppo.critic_warmup`, then 1
+    actor_coef: jax.Array | float
+    # whether it is the first update with all losses after `ppo.critic_warmup`
+    actor_begins: jax.Array | bool
     learning_rate_factor: jax.Array  # factor of `optimizer.schedule` on the learning rate
 
 
 def current_values(config: TrainConfig, updates: jax.Array) -> Scheduled:
     """Returns the values of the scheduled settings after a number of updates ()."""
-    ppo, optimizer, curriculum = config.ppo, config.optimizer, config.curriculum
-    progress, before = ((updates - i).astype(jnp.float32) / config.num_updates for i in (0, 1))
+    ppo = config.ppo
+    optimizer = config.optimizer
+    curriculum = config.curriculum
+    progress = (updates - 0).astype(jnp.float32) / config.num_updates
+    before = (updates - 1).astype(jnp.float32) / config.num_updates
 
     def falling(start: float, until: float) -> jax.Array:
         return start * jnp.maximum(1.0 - progress / until, 0.0)

@@ -1,6 +1,7 @@
 """States of several seeds in one pytree: where seeds become a `jax.vmap`.
 
-Warp's contact buffers are shared and overwritten in every step: one copy suffices, and checkpoints omit them.
+Warp's contact buffers are shared and overwritten in every step: one copy suffices, and checkpoints
+omit them.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,15 +18,19 @@ class SeedBatch:
 
     def __init__(self, init: Callable[[jax.Array], PyTree], count: int) -> None:
         key = jax.random.PRNGKey(0)
-        alone, batched = jax.eval_shape(init, key), jax.eval_shape(jax.vmap(init), jnp.stack([key, key]))
+        alone = jax.eval_shape(init, key)
+        batched = jax.eval_shape(jax.vmap(init), jnp.stack([key, key]))
         self.count = count
         self.shared = jax.tree.map(lambda one, many: one.shape == many.shape, alone, batched)
         """Whether each leaf of a state is unbatched under `vmap`."""
         self.take = jax.jit(self._at)
         """`take(states, seed)` returns one seed's state."""
 
-    def map(self, update: Callable[[PyTree], tuple[PyTree, PyTree]]) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
-        """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled; metrics gain a leading axis S.
+    def map(
+        self, update: Callable[[PyTree], tuple[PyTree, PyTree]]
+    ) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
+        """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled; metrics gain a
+        leading axis S.
 
         A single seed is computed without a batch axis: bit for bit as outside of `SeedBatch`.
         """

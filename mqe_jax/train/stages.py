@@ -23,24 +23,37 @@ _ADAPTATION = 1.5
 
 
 class Stages:
-    """The stages of PPO, pure functions; a subclass that overrides some of them is another algorithm."""
+    """The stages of PPO, pure functions; a subclass that overrides some of them is another
+    algorithm.
+    """
 
     def __init__(self, network: Network, config: TrainConfig) -> None:
-        self.network, self.config = network, config
-        self.optimizer = adam(eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm)
+        self.network = network
+        self.config = config
+        self.optimizer = adam(
+            eps=config.optimizer.eps, max_grad_norm=config.optimizer.max_grad_norm
+        )
 
     def value_mask(self, learners: jax.Array) -> jax.Array:
-        """Returns which values (..., V) count; `learners` (..., A) says from which agents the policy learns."""
-        return jnp.any(learners, axis=-1, keepdims=True) if self.config.ppo.value == "joint" else learners
+        """Returns which values (..., V) count; `learners` (..., A) says from which agents the
+        policy learns.
+        """
+        return (
+            jnp.any(learners, axis=-1, keepdims=True)
+            if self.config.ppo.value == "joint"
+            else learners
+        )
 
     def advantages(
         self, now: Scheduled, transitions: Transition, value: jax.Array, next_value: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Returns the advantages and the value targets of a rollout (T, N, V), in units of reward.
 
-        `value` are those of the observations and `next_value` those of the states that the steps reached (T, N, V).
+        `value` are those of the observations and `next_value` those of the states that the steps
+        reached (T, N, V).
         """
-        config, active = self.config, transitions.active
+        config = self.config
+        active = transitions.active
         reward = jnp.where(active, transitions.reward, jnp.zeros_like(transitions.reward))
         counted = self.value_mask(transitions.learners)
         if config.ppo.value == "joint":
@@ -60,22 +73,37 @@ class Stages:
         return advantage, target
 
     def loss(self, params: Params, batch: Batch, now: Scheduled) -> tuple[jax.Array, Metrics]:
-        """Returns the PPO loss () of a minibatch and its parts, means over the agents that learn."""
-        network, config, ppo, learners = self.network, self.config, self.config.ppo, batch.learners
+        """Returns the PPO loss () of a minibatch and its parts, means over the agents that
+        learn.
+        """
+        network = self.network
+        config = self.config
+        ppo = self.config.ppo
+        learners = batch.learners
         seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
-        evaluate = lambda action: network.evaluate(params, *seen, action, batch.active)  # noqa: E731
+
+        def evaluate(action):
+            return network.evaluate(params, *seen, action, batch.active)
+
         if config.imitation.teacher is None:
-            new, teacher_log_prob = evaluate(batch.action), None
+            new = evaluate(batch.action)
+            teacher_log_prob = None
         else:  # what depends on no action is computed once
             size = batch.teacher_action.shape[-1]
             label = batch.action.at[..., :size].set(batch.teacher_action)
             both = jax.vmap(evaluate)(jnp.stack([batch.action, label]))
-            new, teacher_log_prob = jax.tree.map(lambda x: x[0], both), both.log_prob[1, ..., :size]
-        old, now_taken = (jnp.where(learners[..., None], x, 0.0) for x in (batch.log_prob, new.log_prob))
+            new = jax.tree.map(lambda x: x[0], both)
+            teacher_log_prob = both.log_prob[1, ..., :size]
+        old = jnp.where(learners[..., None], batch.log_prob, 0.0)
+        now_taken = jnp.where(learners[..., None], new.log_prob, 0.0)
         log_ratio = RATIOS[ppo.ratio](now_taken, old)
-        surrogate = clipped_surrogate(log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip)
+        surrogate = clipped_surrogate(
+            log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip
+        )
         policy_loss = _mean(jnp.sum(surrogate, axis=-1), learners)
-        error = value_loss(new.value, batch.old_value, batch.target, ppo.value_clip, ppo.huber_delta)
+        error = value_loss(
+            new.value, batch.old_value, batch.target, ppo.value_clip, ppo.huber_delta
+        )
         critic_loss = _mean(error, learners)
         mean_entropy = _mean(new.entropy, learners)
         per_agent = RATIOS["agent"](now_taken, old)[..., 0]
@@ -84,7 +112,9 @@ class Stages:
             "loss/value": critic_loss,
             "entropy": mean_entropy,
             "approx_kl": _mean(jnp.exp(per_agent) - 1.0 - per_agent, learners),
-            "clip_fraction": _mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32), learners),
+            "clip_fraction": _mean(
+                (jnp.abs(jnp.exp(log_ratio) - 1.0) > ppo.clip).astype(jnp.float32), learners
+            ),
         }
         metrics |= {f"loss/{name}": value for name, value in new.losses.items()}
         actor_loss = policy_loss - now.entropy_coef * mean_entropy + sum(new.losses.values())
@@ -93,8 +123,12 @@ class Stages:
             actor_loss += now.imitation * metrics["loss/imitation"]
         return now.actor_coef * actor_loss + ppo.value_coef * critic_loss, metrics
 
-    def update(self, carry: Carry, batch: Batch, now: Scheduled, key: jax.Array) -> tuple[Carry, Metrics]:
-        """Runs the epochs of gradient steps over a rollout's batch; returns their result and mean metrics."""
+    def update(
+        self, carry: Carry, batch: Batch, now: Scheduled, key: jax.Array
+    ) -> tuple[Carry, Metrics]:
+        """Runs the epochs of gradient steps over a rollout's batch; returns their result and mean
+        metrics.
+        """
         config = self.config
         parts = config.rollout_steps // batch.is_first.shape[0]
 
@@ -123,7 +157,8 @@ class Stages:
 
 
 def _mean(x: jax.Array, learners: jax.Array) -> jax.Array:
-    """Returns the mean over learners of values (L, C, A, ...); of a team's, (L, C, 1, ...), over teams with any.
+    """Returns the mean over learners of values (L, C, A, ...); of a team's, (L, C, 1, ...), over
+    teams with any.
 
     The count is a mean over processes, over which the gradient is averaged.
     """
@@ -134,6 +169,10 @@ def _mean(x: jax.Array, learners: jax.Array) -> jax.Array:
 
 
 def _adapt(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
-    """Returns a smaller learning rate if the KL divergence exceeds the target, a larger one if it is below."""
-    factor = jnp.where(kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0))
+    """Returns a smaller learning rate if the KL divergence exceeds the target, a larger one if it
+    is below.
+    """
+    factor = jnp.where(
+        kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0)
+    )
     return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)

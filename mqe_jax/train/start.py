@@ -1,4 +1,6 @@
-"""The state from which a training run starts: sampled, or restored from a checkpoint of the same settings."""
+"""The state from which a training run starts: sampled, or restored from a checkpoint of the same
+settings.
+"""
 
 import contextlib
 import dataclasses
@@ -23,7 +25,14 @@ from mqe_jax.train.seeds import with_shared, without_shared
 from mqe_jax.train.stages import Stages
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
-MAY_DIFFER = ("critic_input", "chunk_length", "action_gain", "log_std_init", "log_std_min", "log_std_max")
+MAY_DIFFER = (
+    "critic_input",
+    "chunk_length",
+    "action_gain",
+    "log_std_init",
+    "log_std_min",
+    "log_std_max",
+)
 """Settings of the network in which the policy to start from may differ."""
 
 
@@ -39,15 +48,23 @@ def own_learner(
     teacher: Any = None,
     stages: type[Stages] = Stages,
 ) -> tuple[Learner, Processes]:
-    """Returns the learner of this process, which has its share of the environments, and all processes."""
+    """Returns the learner of this process, which has its share of the environments, and all
+    processes.
+    """
     count = jax.process_count()
     whole = own = make_learner(env, config, league=league, teacher=teacher, stages=stages)
     if count > 1:
         share: Any = getattr(env, "share", None)
         if share is None:
-            raise InputError(f"env: {env.name} cannot be split over {count} processes: it has no `share`")
-        own = make_learner(share(count), config, league=league, teacher=teacher, processes=count, stages=stages)
-    return own, Processes(*(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole)))
+            raise InputError(
+                f"env: {env.name} cannot be split over {count} processes: it has no `share`"
+            )
+        own = make_learner(
+            share(count), config, league=league, teacher=teacher, processes=count, stages=stages
+        )
+    return own, Processes(
+        *(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole))
+    )
 
 
 def first_state(
@@ -61,7 +78,9 @@ def first_state(
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
     stages: type[Stages] = Stages,
 ) -> tuple[TrainState, float]:
-    """Returns this process's initial or restored state and the seconds already spent; `shared` as in `SeedBatch`."""
+    """Returns this process's initial or restored state and the seconds already spent; `shared` as
+    in `SeedBatch`.
+    """
     start = processes.compile(learner.init, start=True)
 
     def init(key: jax.Array) -> TrainState:
@@ -69,30 +88,44 @@ def first_state(
             return processes.own(start(key))
 
     if checkpoint is None:
-        policy = None if config.start is None else policy_to_start(env, processes.whole.params, config)
+        policy = (
+            None if config.start is None else policy_to_start(env, processes.whole.params, config)
+        )
         state = init(initial_key(config))
         if policy is not None:
             normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
-            state = dataclasses.replace(state, params={**state.params, **policy.params}, obs_normalizer=normalizer)
+            state = dataclasses.replace(
+                state, params={**state.params, **policy.params}, obs_normalizer=normalizer
+            )
             if league is not None:
                 state = league.seat(dataclasses.replace(state, extra=league.begin(state)))
         return state, 0.0
-    metadata, run = read_metadata(checkpoint, kind="checkpoint"), checkpoint.parent.parent
+    metadata = read_metadata(checkpoint, kind="checkpoint")
+    run = checkpoint.parent.parent
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
     if (theirs := metadata.get("generator", generator())) != generator():
         fail("jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {run}")
     if (algorithm := metadata.get("stages", Stages.__name__)) != stages.__name__:
         fail("stages", stages.__name__, f"{algorithm!r}, the algorithm of the run in {run}")
-    before, seconds = metadata.get("config", {}), metadata.get("seconds", 0.0)
-    if not isinstance(before, dict) or not isinstance(seconds, int | float) or not 0 <= seconds < math.inf:
+    before = metadata.get("config", {})
+    seconds = metadata.get("seconds", 0.0)
+    if (
+        not isinstance(before, dict)
+        or not isinstance(seconds, int | float)
+        or not 0 <= seconds < math.inf
+    ):
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
     check_same(run, before, config)
     if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
         fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
     whole = metadata.get("environments", True)
     template = processes.whole
-    saved = jax.eval_shape(lambda t: without_shared(t, shared), template) if whole else without_environments(template)
+    saved = (
+        jax.eval_shape(lambda t: without_shared(t, shared), template)
+        if whole
+        else without_environments(template)
+    )
     tree = load_tree(checkpoint, saved, kind="checkpoint").tree
     updates = int(tree.updates if whole else tree["updates"])
     if updates * config.steps_per_update != steps:
@@ -109,10 +142,16 @@ def first_state(
 
 
 def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> TrainedPolicy:
-    """Returns the policy that `config.start` names; InputError unless it fits environment, parameters and settings."""
+    """Returns the policy that `config.start` names; InputError unless it fits environment,
+    parameters and settings.
+    """
     start = str(config.start)
     if start not in NAMED and not Path(start).exists():
-        shipped = f"one of {', '.join(NAMED)}" if NAMED else "a shipped one's task, after `import mqe_jax.policies.zoo`"
+        shipped = (
+            f"one of {', '.join(NAMED)}"
+            if NAMED
+            else "a shipped one's task, after `import mqe_jax.policies.zoo`"
+        )
         fail("start", start, f"a run folder, a policy file, or {shipped}")
     policy = (NAMED[start]() if start in NAMED else read_policy(start)).at_size(env)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
@@ -123,7 +162,10 @@ def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> Trai
     for name, value in leaves(to_mapping(config)):
         acts = name in ("action_scale", "normalization.observations") or name.startswith("network.")
         if acts and name.split(".")[-1] not in MAY_DIFFER and theirs.get(name) != value:
-            raise InputError(f"{name}: {value!r} differs from that of the policy in {start}, {theirs.get(name)!r}")
+            raise InputError(
+                f"{name}: {value!r} differs from that of the policy in {start}, "
+                f"{theirs.get(name)!r}"
+            )
     return policy
 
 
@@ -133,9 +175,15 @@ def without_environments(state: TrainState) -> dict[str, Any]:
 
 
 def learned_state(state: TrainState) -> dict[str, Any]:
-    """Returns the learned state: parameters, optimiser and statistics, without environment states."""
+    """Returns the learned state: parameters, optimiser and statistics, without environment
+    states.
+    """
     omitted = ("rollout", "key", "updates")
-    return {field.name: getattr(state, field.name) for field in dataclasses.fields(state) if field.name not in omitted}
+    return {
+        field.name: getattr(state, field.name)
+        for field in dataclasses.fields(state)
+        if field.name not in omitted
+    }
 
 
 def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
@@ -147,19 +195,31 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
         if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
             raise InputError(
                 f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
-                f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in {path / CONFIG_FILE}"
+                f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in "
+                f"{path / CONFIG_FILE}"
             )
 
 
 def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[str, Any]) -> None:
-    """Raises an InputError naming the first parameter of a task that differs in the settings, if they name any."""
+    """Raises an InputError naming the first parameter of a task that differs in the settings, if
+    they name any.
+    """
     task: Any = getattr(env, "env", None)
     if not is_settings(getattr(task, "params", None)) or not (config.task or config.training_env):
         return
     overrides = dict(parameters)
     control = overrides.pop("control", "command")
     found = dict(leaves({"control": task.control, **to_mapping(task.params)}))
-    for name, value in leaves({"control": control, **to_mapping(override(type(task.params)(), overrides))}):
+    for name, value in leaves(
+        {"control": control, **to_mapping(override(type(task.params)(), overrides))}
+    ):
         if found.get(name) != value:
-            field = "train_env" if parameters != config.env and name in dict(leaves(config.train_env)) else "env"
-            raise InputError(f"{field}.{name}: {value!r} differs from the environments, which have {found.get(name)!r}")
+            field = (
+                "train_env"
+                if parameters != config.env and name in dict(leaves(config.train_env))
+                else "env"
+            )
+            raise InputError(
+                f"{field}.{name}: {value!r} differs from the environments, which have "
+                f"{found.get(name)!r}"
+            )

@@ -1,4 +1,6 @@
-"""What can be chosen in the page: a task, its policy and opponent from the package and from run folders."""
+"""What can be chosen in the page: a task, its policy and opponent from the package and from run
+folders.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -30,7 +32,8 @@ class Entry:
 class Menu:
     """The choices, and how one becomes a session."""
 
-    open: Callable[[Entry], Session]  # creates the session of a choice; raises an InputError if that is not possible
+    # creates the session of a choice; raises an InputError if that is not possible
+    open: Callable[[Entry], Session]
     shown: Entry  # the choice on the page
     runs: dict[str, str] = field(default_factory=dict)  # task of each run folder
 
@@ -54,7 +57,9 @@ class Menu:
 
 
 def find_runs(folders: Sequence[Path]) -> dict[str, str]:
-    """Returns the task of each run folder with a policy directly below the folders, in order; others are left out."""
+    """Returns the task of each run folder with a policy directly below the folders, in order;
+    others are left out.
+    """
     found = {}
     for folder in folders:
         for path in sorted(folder.glob(f"*/{POLICY_FILE}")):

@@ -1,4 +1,6 @@
-"""What the scene can show over the robots: contact points with forces, collision shapes, and what a robot senses."""
+"""What the scene can show over the robots: contact points with forces, collision shapes, and what a
+robot senses.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -11,19 +13,26 @@ from mqe_jax.sensors.marks import Marks
 from mqe_jax.viz.geometry import COLLISION_GROUP, pose
 from mqe_jax.viz.recording import Episode
 
-_METRES_PER_NEWTON, _LONGEST = 0.004, 1.0  # of an arrow, m
-_FORCE, _SHAPE = (224, 60, 40), (224, 138, 44)
-_BACKGROUND = np.array([0.7, 0.7, 0.65])  # towards which lines and points fade, as viser draws them opaque
+# of an arrow, m
+_METRES_PER_NEWTON = 0.004
+_LONGEST = 1.0
+_FORCE = (224, 60, 40)
+_SHAPE = (224, 138, 44)
+# towards which lines and points fade, as viser draws them opaque
+_BACKGROUND = np.array([0.7, 0.7, 0.65])
 _AREA = 0.3  # opacity of an area
 
 
 class Overlay:
-    """Contacts and a robot's marks of one environment, and collision shapes of all, below the movable root frame of a
-    `Stage`."""
+    """Contacts and a robot's marks of one environment, and collision shapes of all, below the
+    movable root frame of a `Stage`."""
 
     def __init__(self, server: Any, model: mujoco.MjModel, offset: np.ndarray) -> None:
         """Draws nothing yet; `offset` (N, 3) is the place of each environment, m."""
-        self._server, self._model, self._data, self._offset = server, model, mujoco.MjData(model), offset
+        self._server = server
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._offset = offset
         self.contacts = False  # whether they are drawn
         self._arrows: Any = None
         self._sensed: list[Any] = []
@@ -33,12 +42,17 @@ class Overlay:
         """Adds or removes the collision shapes of robots and objects, as wire frames."""
         for _, handle in self._shapes:
             handle.remove()
-        self._shapes = [(body, self._add(body, geoms)) for body, geoms in self._bodies().items()] if shown else []
+        self._shapes = (
+            [(body, self._add(body, geoms)) for body, geoms in self._bodies().items()]
+            if shown
+            else []
+        )
 
     def draw(self, frame: Episode, index: int, qvel: np.ndarray, ctrl: np.ndarray) -> None:
         """Places the shapes of all environments, and draws the contacts of environment `index`."""
         if self._shapes:
-            positions, turns = [], []
+            positions = []
+            turns = []
             for i in range(len(frame)):
                 pose(self._model, self._data, frame, i)
                 positions.append(self._data.xpos + self._offset[i])
@@ -50,7 +64,9 @@ class Overlay:
             self._arrows.remove()
             self._arrows = None
         if self.contacts:
-            arrows = contact_arrows(self._model, self._data, frame.cut(slice(index, index + 1)), qvel, ctrl)
+            arrows = contact_arrows(
+                self._model, self._data, frame.cut(slice(index, index + 1)), qvel, ctrl
+            )
             if len(arrows):
                 self._arrows = self._server.scene.add_arrows(
                     "/world/contacts",
@@ -66,23 +82,35 @@ class Overlay:
         with self._server.atomic():
             for handle in self._sensed:
                 handle.remove()
-            self._sensed = [handle for mark in marks for handle in self._add_marks(mark, index, agent)]
+            self._sensed = [
+                handle for mark in marks for handle in self._add_marks(mark, index, agent)
+            ]
 
     def _add_marks(self, mark: Marks, index: int, agent: int) -> Iterator[Any]:
         """Yields the handles of what it draws: lines, points, an area."""
-        scene, name, offset = self._server.scene, f"/world/sensed/{mark.label}", self._offset[index]
+        scene = self._server.scene
+        name = f"/world/sensed/{mark.label}"
+        offset = self._offset[index]
         ends, colors = _shown(mark, mark.lines[index, agent], mark.line_opacity[index, agent])
         if len(ends):
             thick: Any = {"thickness": 4.0 if mark.bold else 1.5, "thickness_units": "screen"}
             colors = np.repeat(colors[:, None], 2, axis=1)
-            yield scene.add_line_segments(f"{name}/lines", (ends + offset).astype(np.float32), colors, **thick)
+            yield scene.add_line_segments(
+                f"{name}/lines", (ends + offset).astype(np.float32), colors, **thick
+            )
         spots, colors = _shown(mark, mark.points[index, agent], mark.point_opacity[index, agent])
         if len(spots):
             look: Any = {"point_size": 0.05, "precision": "float32"}
-            yield scene.add_point_cloud(f"{name}/points", (spots + offset).astype(np.float32), colors, **look)
+            yield scene.add_point_cloud(
+                f"{name}/points", (spots + offset).astype(np.float32), colors, **look
+            )
         if corners := mark.area.shape[2]:
             faces = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
-            look = {"color": tuple(int(255 * part) for part in mark.color), "opacity": _AREA, "side": "double"}
+            look = {
+                "color": tuple(int(255 * part) for part in mark.color),
+                "opacity": _AREA,
+                "side": "double",
+            }
             area = (mark.area[index, agent] + offset).astype(np.float32)
             yield scene.add_mesh_simple(f"{name}/area", area, faces, **look)
 
@@ -95,7 +123,8 @@ class Overlay:
         return found
 
     def _add(self, body: int, geoms: list[int]) -> Any:
-        mesh, count = merge_geoms(self._model, geoms), len(self._offset)
+        mesh = merge_geoms(self._model, geoms)
+        count = len(self._offset)
         return self._server.scene.add_batched_meshes_simple(
             f"/world/shapes/{body}",
             np.asarray(mesh.vertices),
@@ -109,29 +138,39 @@ class Overlay:
 
 
 def _shown(mark: Marks, places: Any, opacity: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the places of lines or points that are not hidden, and their colours (n, 3), 0 to 255."""
+    """Returns the places of lines or points that are not hidden, and their colours (n, 3), 0 to
+    255.
+    """
     part = opacity[opacity > 0, None]
-    return places[opacity > 0], (255 * (part * np.array(mark.color) + (1 - part) * _BACKGROUND)).astype(np.uint8)
+    return places[opacity > 0], (
+        255 * (part * np.array(mark.color) + (1 - part) * _BACKGROUND)
+    ).astype(np.uint8)
 
 
 def contact_arrows(
     model: mujoco.MjModel, data: mujoco.MjData, frame: Episode, qvel: np.ndarray, ctrl: np.ndarray
 ) -> np.ndarray:
-    """Returns the start and end (C, 2, 3), m, of an arrow per contact: its point, and its force as MuJoCo computes it.
+    """Returns the start and end (C, 2, 3), m, of an arrow per contact: its point, and its force as
+    MuJoCo computes it.
 
-    250 N are one metre; arrows are not longer. The model has the physics' actuators; `data` is a workspace, `frame` one
-    pose, with velocities (nv,) and actuator targets (nu,).
+    250 N are one metre; arrows are not longer. The model has the physics' actuators; `data` is a
+    workspace, `frame` one pose, with velocities (nv,) and actuator targets (nu,).
     """
     pose(model, data, frame, 0)
-    data.qvel[:], data.ctrl[:] = qvel, ctrl
+    data.qvel[:] = qvel
+    data.ctrl[:] = ctrl
     mujoco.mj_forward(model, data)
-    arrows, force = np.zeros((data.ncon, 2, 3)), np.zeros(6)
+    arrows = np.zeros((data.ncon, 2, 3))
+    force = np.zeros(6)
     for i in range(data.ncon):
         contact = data.contact[i]
         mujoco.mj_contactForce(model, data, i, force)
         turn = contact.frame.reshape(3, 3).T
-        second = model.geom_bodyid[contact.geom2] != 0  # the force acts on the second geom; the first may be the robot
+        # the force acts on the second geom; the first may be the robot
+        second = model.geom_bodyid[contact.geom2] != 0
         arrow = _METRES_PER_NEWTON * (turn @ force[:3]) * (1.0 if second else -1.0)
         arrows[i, 0] = contact.pos
-        arrows[i, 1] = contact.pos + arrow * min(1.0, _LONGEST / max(float(np.linalg.norm(arrow)), 1e-9))
+        arrows[i, 1] = contact.pos + arrow * min(
+            1.0, _LONGEST / max(float(np.linalg.norm(arrow)), 1e-9)
+        )
     return arrows

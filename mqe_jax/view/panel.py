@@ -12,8 +12,8 @@ from mqe_jax.view.menu import DEFAULT, Entry, Menu
 from mqe_jax.view.session import DRIVEN, Session
 from mqe_jax.viz.geometry import robot_bases, robot_color
 
-# Label, direction in fractions of the maximum command (vx, vy, yaw rate), key that increments the command.
-# W, A, S, D, Q, E and the arrow keys are bound to the browser's camera.
+# Label, direction in fractions of the maximum command (vx, vy, yaw rate), key that increments the
+# command. W, A, S, D, Q, E and the arrow keys are bound to the browser's camera.
 DIRECTIONS = (
     ("Forward", (1.0, 0.0, 0.0), "I"),
     ("Backward", (-1.0, 0.0, 0.0), "K"),
@@ -27,8 +27,20 @@ KEY_STEP = 0.25
 HOLD_RATE = 10.0
 """Messages of a held button per second."""
 _MOST_STEPS = 25  # single steps waiting
-ACTION, FREE, NONE = "action", "free", "none"
-_COLORS = ("#2f7fd6", "#3fae49", "#d64545", "#e08a2c", "#7d5bbe", "#3aa7a3", "#8a8f99", "#c2549d", "#23252b")
+ACTION = "action"
+FREE = "free"
+NONE = "none"
+_COLORS = (
+    "#2f7fd6",
+    "#3fae49",
+    "#d64545",
+    "#e08a2c",
+    "#7d5bbe",
+    "#3aa7a3",
+    "#8a8f99",
+    "#c2549d",
+    "#23252b",
+)
 _POINTS = 200
 
 
@@ -44,17 +56,25 @@ class Panel:
         robots: Sequence[str] = (),
         menu: Menu | None = None,
     ) -> None:
-        """Adds the controls to a page: `bodies` are labels of those that the camera can follow, `robots` of agents.
+        """Adds the controls to a page: `bodies` are labels of those that the camera can follow,
+        `robots` of agents.
 
-        `on_camera` is called when another body is chosen. Without a menu no tasks and policies are offered.
+        `on_camera` is called when another body is chosen. Without a menu no tasks and policies are
+        offered.
         """
-        self._session, self._gui = session, server.gui
+        self._session = session
+        self._gui = server.gui
         self._on_camera = on_camera
-        self._robots = tuple(robots) or tuple(f"robot {i + 1}" for i in range(session.env.num_agents))
-        self._wanted_steps, self._wants_reset = 0, False
+        self._robots = tuple(robots) or tuple(
+            f"robot {i + 1}" for i in range(session.env.num_agents)
+        )
+        self._wanted_steps = 0
+        self._wants_reset = False
         self._wanted: Entry | None = None
         self.camera = ACTION if session.num_envs == 1 else FREE  # or the label of the followed body
-        self.env, self.back = 0, 0  # the selected environment, and the steps by which the shown one lies back
+        # the selected environment, and the steps by which the shown one lies back
+        self.env = 0
+        self.back = 0
         self.contacts = self.shapes = False  # what is shown of them
         self.sensors = session.senses  # whether it is shown what a robot senses
         self._state = self._gui.add_html("")
@@ -66,23 +86,28 @@ class Panel:
             self._add_drive()
         with self._gui.add_folder("Reward terms in this step"):
             self._bars = self._gui.add_html("")
-        with self._gui.add_folder("Observation of the driven robot (default: robot 1)", expand_by_default=False):
+        with self._gui.add_folder(
+            "Observation of the driven robot (default: robot 1)", expand_by_default=False
+        ):
             self._observation = self._gui.add_html("")
         self._add_plots()
 
     def take_steps(self) -> int:
         """Returns the number of single steps requested since the last call."""
-        steps, self._wanted_steps = self._wanted_steps, 0
+        steps = self._wanted_steps
+        self._wanted_steps = 0
         return steps
 
     def take_reset(self) -> bool:
         """Returns whether a reset was requested since the last call."""
-        wanted, self._wants_reset = self._wants_reset, False
+        wanted = self._wants_reset
+        self._wants_reset = False
         return wanted
 
     def take_choice(self) -> Entry | None:
         """Returns the choice made since the last call, or None."""
-        wanted, self._wanted = self._wanted, None
+        wanted = self._wanted
+        self._wanted = None
         return wanted
 
     def say(self, text: str, strong: str = "") -> None:
@@ -90,30 +115,45 @@ class Panel:
         self._state.content = paragraph(text, strong)
 
     def show(self, positions: np.ndarray, real_time: float) -> None:
-        """Shows the robots' positions (A, 3), m, in the selected environment, and the real-time factor."""
+        """Shows the robots' positions (A, 3), m, in the selected environment, and the real-time
+        factor.
+        """
         session = self._session
         index = session.at(self.back) if session.moments else 0
-        commands = session.commands[index][self.env] if session.commands else np.zeros((len(positions), 3))
+        commands = (
+            session.commands[index][self.env] if session.commands else np.zeros((len(positions), 3))
+        )
         rows = []
         for agent, (x, y, z) in enumerate(positions):
             vx, vy, turn = commands[agent]
-            chosen = session.drivable and (session.drive.env, session.drive.robot) == (self.env, agent)
+            chosen = session.drivable and (session.drive.env, session.drive.robot) == (
+                self.env,
+                agent,
+            )
             name = self._robots[agent].removeprefix("robot ") + (" (driven)" if chosen else "")
-            rows.append((name, *(f"{v:.2f}" for v in (x, y, z)), *(f"{v:+.2f}" for v in (vx, vy, turn))))
+            rows.append(
+                (name, *(f"{v:.2f}" for v in (x, y, z)), *(f"{v:+.2f}" for v in (vx, vy, turn)))
+            )
         pace = "paused" if session.paused else f"{real_time:.2f} x real time"
-        head = paragraph(f"at {(session.steps - self.back) * session.env.dt:.2f} s, {pace}", session.env.name)
+        head = paragraph(
+            f"at {(session.steps - self.back) * session.env.dt:.2f} s, {pace}", session.env.name
+        )
         head += self._score(float(session.rewards[index][self.env, -1]) if session.rewards else 0.0)
         self._state.content = head + table(("robot", "x", "y", "z", "vx", "vy", "turn"), rows)
         if session.rewards:
             terms = [name.removeprefix("reward/") for name in (*session.terms[:-1], "sum")]
             self._bars.content = bars(terms, session.rewards[index][self.env].tolist())
         obs = session.moment(self.back).obs[self.env, session.drive.robot or 0]
-        self._observation.content = observation_table(getattr(session.env, "observation_layout", None), obs)
+        self._observation.content = observation_table(
+            getattr(session.env, "observation_layout", None), obs
+        )
 
     def _score(self, reward: float) -> str:
         session = self._session
         text = f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step"
-        counts = ", ".join(f"{name} {count}" for name, count in zip(session.outcomes, session.counts, strict=True))
+        counts = ", ".join(
+            f"{name} {count}" for name, count in zip(session.outcomes, session.counts, strict=True)
+        )
         team = f"{self._robots[0]}'s team" if len(session.outcomes) > 1 else "episodes"
         last = f"; last: {session.last[self.env]}" if session.last[self.env] else ""
         return paragraph(text) + paragraph(f"{team}: {counts} of {session.episodes.sum()}{last}")
@@ -132,13 +172,18 @@ class Panel:
             self._command_plot.data = (times, *commands.T.astype(float))
 
     def _add_menu(self, menu: Menu) -> None:
-        gui, shown = self._gui, menu.shown
+        gui = self._gui
+        shown = menu.shown
         with gui.add_folder("Task and policies"):
             task = gui.add_dropdown("Task", menu.tasks, initial_value=shown.task)
             names = menu.policies(shown.task)
             policy = gui.add_dropdown("Policy", names, initial_value=shown.policy)
             opponent = gui.add_dropdown(
-                "Opponent", names, initial_value=shown.opponent, visible=menu.is_match(shown.task), hint="Of team 1"
+                "Opponent",
+                names,
+                initial_value=shown.opponent,
+                visible=menu.is_match(shown.task),
+                hint="Of team 1",
             )
             load = gui.add_button("Load", hint="Starts with the chosen task and policies")
 
@@ -155,15 +200,20 @@ class Panel:
         load.on_click(choose)
 
     def _add_run(self) -> None:
-        gui, session = self._gui, self._session
+        gui = self._gui
+        session = self._session
         with gui.add_folder("Run"):
             pause = gui.add_button("Pause")
             step = gui.add_button("One step")
             reset = gui.add_button("Reset")
-            speed = gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Real-time factor")
+            speed = gui.add_slider(
+                "Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0, hint="Real-time factor"
+            )
             dt = session.env.dt
             length = (session.moments.maxlen or 1) * dt
-            back = gui.add_slider("Back", min=0.0, max=length, step=dt, initial_value=0.0, hint="Pauses; s before now")
+            back = gui.add_slider(
+                "Back", min=0.0, max=length, step=dt, initial_value=0.0, hint="Pauses; s before now"
+            )
 
         def set_paused(paused: bool) -> None:
             session.paused = paused
@@ -172,7 +222,8 @@ class Panel:
         def toggle(_: Any) -> None:
             set_paused(not session.paused)
             if not session.paused:
-                back.value, self.back = 0.0, 0
+                back.value = 0.0
+                self.back = 0
 
         def scrub(_: Any) -> None:
             self.back = round(float(back.value) / dt)
@@ -200,13 +251,20 @@ class Panel:
             button.hint = f"Key {key}"
 
     def _add_view(self, bodies: Sequence[str]) -> None:
-        gui, session = self._gui, self._session
+        gui = self._gui
+        session = self._session
         with gui.add_folder("View"):
             hint = "What the camera follows: robots and objects (action), or one of them"
-            camera = gui.add_dropdown("Camera", (ACTION, FREE, *bodies), initial_value=self.camera, hint=hint)
+            camera = gui.add_dropdown(
+                "Camera", (ACTION, FREE, *bodies), initial_value=self.camera, hint=hint
+            )
             numbers = tuple(str(i + 1) for i in range(session.num_envs))
-            env = gui.add_dropdown("Environment", numbers, initial_value="1", visible=session.num_envs > 1)
-            contacts = gui.add_checkbox("Contacts", False, hint="Contact points and forces in this environment")
+            env = gui.add_dropdown(
+                "Environment", numbers, initial_value="1", visible=session.num_envs > 1
+            )
+            contacts = gui.add_checkbox(
+                "Contacts", False, hint="Contact points and forces in this environment"
+            )
             shapes = gui.add_checkbox("Collision shapes", False)
             hint = "Of the driven robot (default: robot 1) in this environment"
             sensors = gui.add_checkbox("Sensors", self.sensors, hint=hint, visible=self.sensors)
@@ -221,7 +279,8 @@ class Panel:
             self.env = session.drive.env = int(env.value) - 1
 
         def overlay(_: Any) -> None:
-            self.contacts, self.shapes = bool(contacts.value), bool(shapes.value)
+            self.contacts = bool(contacts.value)
+            self.shapes = bool(shapes.value)
             self.sensors = bool(sensors.value)
 
         camera.on_update(follow)
@@ -231,14 +290,22 @@ class Panel:
         sensors.on_update(overlay)
 
     def _add_drive(self) -> None:
-        gui, drive = self._gui, self._session.drive
+        gui = self._gui
+        drive = self._session.drive
         names = self._robots
         with gui.add_folder("Drive"):
-            robot = gui.add_dropdown("Driven", (NONE, *names), initial_value=NONE, hint="Teleoperated robot")
+            robot = gui.add_dropdown(
+                "Driven", (NONE, *names), initial_value=NONE, hint="Teleoperated robot"
+            )
             keys = " ".join(key for _, _, key in DIRECTIONS)
-            hint = f"Hold a button to drive; each press of {keys} changes the command by a quarter, X stops."
+            hint = (
+                f"Hold a button to drive; each press of {keys} changes the command by a "
+                "quarter, X stops."
+            )
             gui.add_html(paragraph(hint))
-            buttons = [gui.add_button(label, hint=f"Hold, or key {key}") for label, _, key in DIRECTIONS]
+            buttons = [
+                gui.add_button(label, hint=f"Hold, or key {key}") for label, _, key in DIRECTIONS
+            ]
             stop = gui.add_button("Stop", hint="Key X")
 
         def choose(_: Any) -> None:
@@ -268,8 +335,13 @@ class Panel:
                 self._command_plot = self._uplot(DRIVEN)
 
     def _uplot(self, names: Sequence[str]) -> Any:
-        lines = [{"label": name, "stroke": _COLORS[i % len(_COLORS)], "width": 1.5} for i, name in enumerate(names)]
-        empty = tuple(np.array([0.0, 1.0]) if i == 0 else np.zeros(2) for i in range(len(names) + 1))
+        lines = [
+            {"label": name, "stroke": _COLORS[i % len(_COLORS)], "width": 1.5}
+            for i, name in enumerate(names)
+        ]
+        empty = tuple(
+            np.array([0.0, 1.0]) if i == 0 else np.zeros(2) for i in range(len(names) + 1)
+        )
         return self._gui.add_uplot(
             empty,
             ({"label": "s"}, *lines),
@@ -281,9 +353,16 @@ class Panel:
 
 
 def robot_labels(model: mujoco.MjModel) -> list[str]:
-    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, without colours if they bear numbers."""
+    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, without colours if they
+    bear numbers.
+    """
     shown = np.array([robot_color(model, trunk) for trunk in robot_bases(model)])
     if len(shown) > UNNUMBERED:
         return [f"robot {i + 1}" for i in range(len(shown))]
-    apart = np.linalg.norm(shown[:, None] - np.array(ROBOT_COLORS[: len(ROBOT_COLOR_NAMES)]), axis=-1)
-    return [f"robot {i + 1} ({ROBOT_COLOR_NAMES[nearest]})" for i, nearest in enumerate(apart.argmin(axis=1))]
+    apart = np.linalg.norm(
+        shown[:, None] - np.array(ROBOT_COLORS[: len(ROBOT_COLOR_NAMES)]), axis=-1
+    )
+    return [
+        f"robot {i + 1} ({ROBOT_COLOR_NAMES[nearest]})"
+        for i, nearest in enumerate(apart.argmin(axis=1))
+    ]

@@ -1,11 +1,14 @@
-"""viser's web server, restricted to requests to its own address, from its own page or from no page at all.
+"""viser's web server, restricted to requests to its own address, from its own page or from no page
+at all.
 
-Browsers let every page open a websocket to every address, and name the page's origin in the header `Origin`, which a
-page cannot change. A page whose name resolves to this machine (DNS rebinding) is of the same origin, with its own name
-in the header `Host`. Programs other than browsers send no `Origin`; they are accepted, since they could send any.
+Browsers let every page open a websocket to every address, and name the page's origin in the header
+`Origin`, which a page cannot change. A page whose name resolves to this machine (DNS rebinding) is
+of the same origin, with its own name in the header `Host`. Programs other than browsers send no
+`Origin`; they are accepted, since they could send any.
 
-viser has no setting for this. Written for viser 1.1.1, which starts its server by `websockets.asyncio.server.serve`.
-While viser starts, that name is replaced by a function that adds the documented argument `process_request`.
+viser has no setting for this. Written for viser 1.1.1, which starts its server by
+`websockets.asyncio.server.serve`. While viser starts, that name is replaced by a function that adds
+the documented argument `process_request`.
 """
 
 import contextlib
@@ -34,10 +37,16 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     serving = False
 
     def answer(page: Any, connection: ServerConnection, request: Request) -> Response | None:
-        """Returns the response to a request, or None if it opens a websocket; `page` serves the files of the page."""
+        """Returns the response to a request, or None if it opens a websocket; `page` serves the
+        files of the page.
+        """
         address, local_port = connection.local_address[:2]
         headers = request.headers
-        reason = refusal(headers.get_all("Host"), headers.get_all("Origin"), authorities(host, address, local_port))
+        reason = refusal(
+            headers.get_all("Host"),
+            headers.get_all("Origin"),
+            authorities(host, address, local_port),
+        )
         if reason is not None:
             echo(f"mqe: view: rejected a connection: {brief(reason)}")
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"mqe view: {reason}\n")
@@ -49,7 +58,9 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         nonlocal serving
         serving = True
-        return original(*arguments, process_request=functools.partial(answer, process_request), **options)
+        return original(
+            *arguments, process_request=functools.partial(answer, process_request), **options
+        )
 
     websockets_server.serve = serve  # type: ignore[misc]
     try:
@@ -59,14 +70,18 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
         websockets_server.serve = original  # type: ignore[misc]
     if not serving:
         server.stop()
-        raise InputError(f"view: viser {viser.__version__} cannot be restricted (pip install 'viser==1.1.1' can)")
+        raise InputError(
+            f"view: viser {viser.__version__} cannot be restricted (pip install 'viser==1.1.1' can)"
+        )
     return server
 
 
 def authorities(host: str, address: str, port: int) -> frozenset[str]:
-    """Returns the values of the header `Host` that name this server, in lower case, on loopback localhost too.
+    """Returns the values of the header `Host` that name this server, in lower case, on loopback
+    localhost too.
 
-    `host` is the host to listen on, `address` the local IP address of the connection, `port` its port.
+    `host` is the host to listen on, `address` the local IP address of the connection, `port` its
+    port.
     """
     names = {host.lower(), address}
     if ipaddress.ip_address(address.partition("%")[0]).is_loopback:
@@ -76,7 +91,9 @@ def authorities(host: str, address: str, port: int) -> frozenset[str]:
 
 
 def refusal(hosts: Sequence[str], origins: Sequence[str], allowed: frozenset[str]) -> str | None:
-    """Returns why a request is rejected, or None; `hosts` and `origins` are all values of the two headers."""
+    """Returns why a request is rejected, or None; `hosts` and `origins` are all values of the two
+    headers.
+    """
     if len(hosts) != 1 or hosts[0].lower() not in allowed:
         return f"Host is {' and '.join(hosts) or 'missing'}, allowed: {', '.join(sorted(allowed))}"
     if origins and [origin.lower() for origin in origins] != [f"http://{hosts[0].lower()}"]:

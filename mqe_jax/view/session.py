@@ -1,4 +1,7 @@
-"""The simulation behind the viewer: environments, a policy, and a teleoperated robot. Independent of the browser."""
+"""The simulation behind the viewer: environments, a policy, and a teleoperated robot.
+
+Independent of the browser.
+"""
 
 import time
 from collections import deque
@@ -20,7 +23,8 @@ from mqe_jax.viz.recording import Episode
 DRIVEN = ("vx", "vy", "yaw_rate")
 """Teleoperation commands: m/s, m/s, rad/s."""
 HOLD_TIME = 0.35
-"""Time after a button's last hold message at which it counts as released, s; the browser sends ten per second."""
+"""Time after a button's last hold message at which it counts as released, s; the browser sends ten
+per second."""
 
 
 class Scene(NamedTuple):
@@ -72,13 +76,24 @@ class Session:
     """N environments stepped under a policy, with a history of recent steps."""
 
     def __init__(
-        self, env: QuadrupedEnv, vector_env: VectorEnv, policy: Policy, seed: int = 0, history: float = 20.0
+        self,
+        env: QuadrupedEnv,
+        vector_env: VectorEnv,
+        policy: Policy,
+        seed: int = 0,
+        history: float = 20.0,
     ) -> None:
-        """Creates the environments; `policy` acts for all agents, `history` is the length of the history, s."""
-        self.env, self.num_envs = env, vector_env.num_envs
-        self.paused, self.speed = False, 1.0  # a real-time factor
+        """Creates the environments; `policy` acts for all agents, `history` is the length of the
+        history, s.
+        """
+        self.env = env
+        self.num_envs = vector_env.num_envs
+        # a real-time factor
+        self.paused = False
+        self.speed = 1.0
         self.drive = Drive(np.zeros(3), np.zeros(3))
-        self._vector_env, self._policy = vector_env, policy
+        self._vector_env = vector_env
+        self._policy = policy
         self._first_memory = policy.initial_memory(self.num_envs)
         self._key = jax.random.PRNGKey(seed)
         self._reset = jax.jit(vector_env.reset)
@@ -86,7 +101,9 @@ class Session:
         self.senses = ONBOARD in getattr(vector_env, "groups", ())
         """Whether there are sensors' readings to draw."""
         self._marks = jax.jit(jax.vmap(env.marks)) if self.senses else lambda _: ()
-        self.drivable = getattr(env, "control", "") == "command" and set(DRIVEN) <= set(env.params.commands)
+        self.drivable = getattr(env, "control", "") == "command" and set(DRIVEN) <= set(
+            env.params.commands
+        )
         self._moving = env.controller.action_size if self.drivable else env.action_size
         if self.drivable:
             self._columns = np.array([env.params.commands.index(name) for name in DRIVEN])
@@ -119,7 +136,9 @@ class Session:
         if self.drivable and self.drive.robot is not None:
             mask[self.drive.env, self.drive.robot] = True
             driven[self._columns] = self.drive.now()
-        self.state, self.memory, done, ended, rewards, commands = self._step(self.state, self.memory, key, mask, driven)
+        self.state, self.memory, done, ended, rewards, commands = self._step(
+            self.state, self.memory, key, mask, driven
+        )
         self.steps += 1
         self.episodes += np.asarray(done)
         self._count(np.asarray(done), np.asarray(ended))
@@ -129,13 +148,17 @@ class Session:
         self.moments.append(self.moment())
 
     def moment(self, back: int = 0) -> Scene:
-        """Returns the current step, or that of `back` steps ago, at most the oldest of the history."""
+        """Returns the current step, or that of `back` steps ago, at most the oldest of the
+        history.
+        """
         if back and self.moments:
             return self.moments[self.at(back)]
         data = self.state.data
         poses = map(np.asarray, (data.qpos, data.mocap_pos, data.mocap_quat))
         arrays = map(np.asarray, (data.qvel, data.ctrl, self.state.obs))
-        return Scene(Episode(*poses, dt=self.env.dt), *arrays, marks=jax.device_get(self._marks(self.state)))
+        return Scene(
+            Episode(*poses, dt=self.env.dt), *arrays, marks=jax.device_get(self._marks(self.state))
+        )
 
     def at(self, back: int) -> int:
         """Returns the index into the history of the step `back` steps ago, at most its oldest."""
@@ -148,22 +171,31 @@ class Session:
             names = [name for name, is_it in zip(self.outcomes, ended[index], strict=True) if is_it]
             self.last[index] = names[0] if names else "no success"
 
-    def _advance(self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array) -> Any:
+    def _advance(
+        self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array
+    ) -> Any:
         env = self.env
         action, memory = self._policy.act(observations(state).to(self._policy), memory, key)
         commands = jnp.zeros((*mask.shape, len(DRIVEN)))
         if self.drivable:
-            # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step` unmirrors them.
+            # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step`
+            # unmirrors them.
             driven = env.controller.action_of(driven)
             own = env.unmirror_action(jnp.broadcast_to(driven, (env.num_agents, len(driven))))
             moving = jnp.where(mask[..., None], own, action[..., : len(driven)])
             action = action.at[..., : len(driven)].set(moving)
-            applied = jax.vmap(lambda a: env.controller.skill_commands(env.unmirror_action(jnp.clip(a, -1.0, 1.0))))
+            applied = jax.vmap(
+                lambda a: env.controller.skill_commands(env.unmirror_action(jnp.clip(a, -1.0, 1.0)))
+            )
             commands = applied(moving)[..., env.controller.skill.index(DRIVEN)]
         state = self._vector_env.step(state, action)
         done = state.terminated | state.truncated
         memory = where_rows(done, self._first_memory, memory)
         names = [name for name in state.metrics if name.startswith("reward/")]
-        rewards = jnp.stack([state.metrics[name] for name in (*names, "average_step_reward")], axis=-1)
-        ended = jnp.stack([getattr(state.outcome, name)[:, 0] > 0 for name in self.outcomes], axis=-1)
+        rewards = jnp.stack(
+            [state.metrics[name] for name in (*names, "average_step_reward")], axis=-1
+        )
+        ended = jnp.stack(
+            [getattr(state.outcome, name)[:, 0] > 0 for name in self.outcomes], axis=-1
+        )
         return state, memory, done, ended, rewards, commands

@@ -15,7 +15,9 @@ from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, pose_frames, ren
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
-_SKY, _SUN = 2.4, 2.7  # intensities of the light
+# intensities of the light
+_SKY = 2.4
+_SUN = 2.7
 _OPAQUE = 0.5  # opacity below which geoms are left out: meshes of several colours have none
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
@@ -29,19 +31,24 @@ class _Batch:
 
 
 class Stage:
-    """Renders N environments under one movable root frame, which keeps a followed body at the origin."""
+    """Renders N environments under one movable root frame, which keeps a followed body at the
+    origin.
+    """
 
     span = 0.0  # diagonal of the box about the followed bodies, m
 
     def __init__(self, server: Any, model: mujoco.MjModel, frame: Episode) -> None:
-        self._server, self._model = server, model
+        self._server = server
+        self._model = model
         self._data = mujoco.MjData(self._model)
         self._count = len(frame)
         first = frame.cut(slice(1))
         low, high = extent(rendering_model(self._model, first), first)
-        self.centre, self.size = (low + high) / 2, high - low
+        self.centre = (low + high) / 2
+        self.size = high - low
         shift = (high[1] - low[1] + _GAP) * (np.arange(self._count) - (self._count - 1) / 2)
-        self.offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)  # (N, 3)
+        # (N, 3)
+        self.offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)
         self._mocap: np.ndarray | None = None
         self.bodies = followable(self._model)
         self._root = server.scene.add_frame("/world", show_axes=False)
@@ -51,12 +58,15 @@ class Stage:
         still = [self._add_batch(f"fixed/{body}", geoms, [body]) for body, geoms in fixed.items()]
         self._place(still, *self._poses(frame))
         groups = self._group(moving)
-        self._batches = [self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in groups]
+        self._batches = [
+            self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in groups
+        ]
         self._wall_handles = [self._add_wall(geom) for geom in self._walls]
         self.draw(frame)
 
     def draw(self, frame: Episode, followed: tuple[int, list[int]] | None = None) -> None:
-        """Renders the environments' poses; the middle of `followed` (environment, bodies) is kept at the origin.
+        """Renders the environments' poses; the middle of `followed` (environment, bodies) is kept
+        at the origin.
 
         Robots that take no part in the episode are not followed.
         """
@@ -77,12 +87,15 @@ class Stage:
         turns = np.zeros((self._count, self._model.nbody, 4))
         for i in range(self._count):
             pose(self._model, self._data, frame, i)
-            positions[i], turns[i] = self._data.xpos + self.offset[i], self._data.xquat
+            positions[i] = self._data.xpos + self.offset[i]
+            turns[i] = self._data.xquat
         return positions, turns
 
     def _place(self, batches: list[_Batch], positions: np.ndarray, turns: np.ndarray) -> None:
         for batch in batches:
-            batch.handle.batched_positions = positions[:, batch.bodies].reshape(-1, 3).astype(np.float32)
+            batch.handle.batched_positions = (
+                positions[:, batch.bodies].reshape(-1, 3).astype(np.float32)
+            )
             batch.handle.batched_wxyzs = turns[:, batch.bodies].reshape(-1, 4).astype(np.float32)
 
     def overview(self) -> tuple[np.ndarray, np.ndarray]:
@@ -94,35 +107,60 @@ class Stage:
         self._root.position = (0.0, 0.0, 0.0)
 
     def _draw_walls(self, frame: Episode) -> None:
-        """Renders the moving walls after a change of their poses, clipped at the side walls of the track."""
-        if not self._walls or (self._mocap is not None and np.array_equal(self._mocap, frame.mocap_pos)):
+        """Renders the moving walls after a change of their poses, clipped at the side walls of the
+        track.
+        """
+        if not self._walls or (
+            self._mocap is not None and np.array_equal(self._mocap, frame.mocap_pos)
+        ):
             return
         self._mocap = frame.mocap_pos.copy()
-        boxes = [_wall_boxes(self._model, frame.cut(slice(i, i + 1)), self._walls) for i in range(self._count)]
+        boxes = [
+            _wall_boxes(self._model, frame.cut(slice(i, i + 1)), self._walls)
+            for i in range(self._count)
+        ]
         for index, handle in enumerate(self._wall_handles):
-            centre, turn, size = (np.stack([box[k][index] for box in boxes]).astype(np.float32) for k in range(3))
+            centre, turn, size = (
+                np.stack([box[k][index] for box in boxes]).astype(np.float32) for k in range(3)
+            )
             handle.batched_positions = centre + self.offset.astype(np.float32)
-            handle.batched_wxyzs, handle.batched_scales = turn, size
+            handle.batched_wxyzs = turn
+            handle.batched_scales = size
 
     def _add_light(self) -> None:
-        """Lights the scene about as clips are lit: viser's own lights and surroundings wash colours out."""
+        """Lights the scene about as clips are lit: viser's own lights and surroundings wash colours
+        out.
+        """
         scene = self._server.scene
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
         scene.add_light_hemisphere("/sky", ground_color=(150, 150, 140), intensity=_SKY)
-        scene.add_light_directional("/sun", position=(-3.0, -4.0, 9.0), intensity=_SUN, cast_shadow=False)
+        scene.add_light_directional(
+            "/sun", position=(-3.0, -4.0, 9.0), intensity=_SUN, cast_shadow=False
+        )
 
     def _add_floor(self, low: np.ndarray, high: np.ndarray) -> None:
-        side = [float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 2 * float(self.offset[-1, 1]) + 4.0]
+        side = [
+            float(high[0] - low[0]) + 4.0,
+            float(high[1] - low[1]) + 2 * float(self.offset[-1, 1]) + 4.0,
+        ]
         middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
-        floor = np.flatnonzero((self._model.geom_type == _PLANE) & (self._model.geom_group == GROUND_GROUP))[0]
+        floor = np.flatnonzero(
+            (self._model.geom_type == _PLANE) & (self._model.geom_group == GROUND_GROUP)
+        )[0]
         colour = tuple(round(255 * float(c)) for c in self._model.geom_rgba[floor, :3])
         self._server.scene.add_box(
-            "/world/floor", color=colour, dimensions=(*side, 0.02), position=(*middle, -0.012), cast_shadow=False
+            "/world/floor",
+            color=colour,
+            dimensions=(*side, 0.02),
+            position=(*middle, -0.012),
+            cast_shadow=False,
         )
 
     def _group(self, moving: dict[int, list[int]]) -> list[list[int]]:
-        """Returns the moving bodies, grouped by their geoms: bodies with the same ones share a mesh."""
+        """Returns the moving bodies, grouped by their geoms: bodies with the same ones share a
+        mesh.
+        """
         names = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
         fields = [np.round(getattr(self._model, f"geom_{name}"), 5) + 0.0 for name in names]
         groups: dict[bytes, list[int]] = {}
@@ -162,13 +200,18 @@ def chase(look_at: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def start_frame(env: QuadrupedEnv, num_envs: int) -> Episode:
-    """Returns the robots at their start, in `num_envs` frames: the mean of the initial states, without compilation."""
-    index, data = env.index, mujoco.MjData(env.compiled.model)
+    """Returns the robots at their start, in `num_envs` frames: the mean of the initial states,
+    without compilation.
+    """
+    index = env.index
+    data = mujoco.MjData(env.compiled.model)
     qpos = data.qpos.copy()
     qpos[index.joint_qpos] = env.robot.default_joints
     for row, (x, y, yaw) in zip(index.base_qpos, env.spawn_poses(), strict=True):
         qpos[row] = (x, y, env.params.spawn_height, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
-    return Episode(*(np.stack([x] * num_envs) for x in (qpos, data.mocap_pos, data.mocap_quat)), dt=env.dt)
+    return Episode(
+        *(np.stack([x] * num_envs) for x in (qpos, data.mocap_pos, data.mocap_quat)), dt=env.dt
+    )
 
 
 def followable(model: mujoco.MjModel) -> dict[str, int]:
@@ -178,12 +221,18 @@ def followable(model: mujoco.MjModel) -> dict[str, int]:
         body = int(model.jnt_bodyid[joint])
         if int(model.body_rootid[body]) == body:
             kind, _, name = model.body(body).name.partition("/")
-            labels[f"robot {int(kind[5:]) + 1}" if kind.startswith("robot") else name or kind] = body
+            labels[f"robot {int(kind[5:]) + 1}" if kind.startswith("robot") else name or kind] = (
+                body
+            )
     return labels
 
 
-def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, list[int]], list[int]]:
-    """Returns the visible geoms of fixed and of moving bodies, by body, and the boxes of mocap bodies."""
+def _sort_geoms(
+    model: mujoco.MjModel,
+) -> tuple[dict[int, list[int]], dict[int, list[int]], list[int]]:
+    """Returns the visible geoms of fixed and of moving bodies, by body, and the boxes of mocap
+    bodies.
+    """
     fixed: dict[int, list[int]] = {}
     moving: dict[int, list[int]] = {}
     walls = []
@@ -193,7 +242,9 @@ def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, 
             continue
         if model.geom_rgba[geom, 3] < _OPAQUE:
             continue
-        if model.body_mocapid[body] >= 0 and int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_BOX):
+        if model.body_mocapid[body] >= 0 and int(model.geom_type[geom]) == int(
+            mujoco.mjtGeom.mjGEOM_BOX
+        ):
             walls.append(geom)
         elif is_fixed_body(model, body):
             fixed.setdefault(body, []).append(geom)
@@ -202,8 +253,12 @@ def _sort_geoms(model: mujoco.MjModel) -> tuple[dict[int, list[int]], dict[int, 
     return fixed, moving, walls
 
 
-def _wall_boxes(model: mujoco.MjModel, episode: Episode, geoms: list[int]) -> tuple[np.ndarray, ...]:
-    """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, clipped at the side walls."""
+def _wall_boxes(
+    model: mujoco.MjModel, episode: Episode, geoms: list[int]
+) -> tuple[np.ndarray, ...]:
+    """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, clipped at the
+    side walls.
+    """
     clipped = rendering_model(model, episode)
     data = next(pose_frames(clipped, episode, [0]))
     turns = np.zeros((len(geoms), 4))

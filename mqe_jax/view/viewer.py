@@ -37,7 +37,9 @@ class Viewer:
         self._announced = False
 
     def announce(self, env: QuadrupedEnv, num_envs: int) -> None:
-        """Shows a task with its robots at their start, before the session that `run` opens: that compiles."""
+        """Shows a task with its robots at their start, before the session that `run` opens: that
+        compiles.
+        """
         self._build(env.mj_model, start_frame(env, num_envs))
         self.server.gui.add_html(paragraph("is being compiled", env.name))
         self._announced = True
@@ -51,11 +53,15 @@ class Viewer:
 
     def _clear(self) -> None:
         self.server.gui.reset()
-        self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.server.gui.configure_theme(
+            control_width="large", show_logo=False, show_share_button=False
+        )
         self.server.gui.main_panel.dock_right()
 
     def show(self, session: Session) -> None:
-        """Builds scene and panel of a session, in place of the last ones; the scene of `announce` stays."""
+        """Builds scene and panel of a session, in place of the last ones; the scene of `announce`
+        stays.
+        """
         self.session = session
         model = session.env.mj_model
         if self._announced:
@@ -63,16 +69,21 @@ class Viewer:
         else:
             self._build(model, session.moment().frame)
         self._announced = False
-        self._overlay, self._shapes = Overlay(self.server, model, self._stage.offset), False
+        self._overlay = Overlay(self.server, model, self._stage.offset)
+        self._shapes = False
         robots = robot_labels(model)
         named = {f"robot {i + 1}": label for i, label in enumerate(robots)}
         self._bodies = {named.get(label, label): body for label, body in self._stage.bodies.items()}
         agents = robots[: session.env.num_agents]
-        self._panel = Panel(self.server, session, tuple(self._bodies), self._aim, agents, self._menu)
+        self._panel = Panel(
+            self.server, session, tuple(self._bodies), self._aim, agents, self._menu
+        )
         self._aim()
 
     def run(self, open_session: Callable[[], Session]) -> None:
-        """Opens a session, steps and renders it at its speed until an exception; then stops the server."""
+        """Opens a session, steps and renders it at its speed until an exception; then stops the
+        server.
+        """
         try:
             self.show(open_session())
             self._panel.say("is being compiled", self.session.env.name)
@@ -81,7 +92,8 @@ class Viewer:
             counted = self.session.steps
             while True:
                 if self._open_chosen():
-                    due, counted = time.monotonic(), self.session.steps
+                    due = time.monotonic()
+                    counted = self.session.steps
                 dt = self.session.env.dt
                 now = time.monotonic()
                 stepped = self._step_if_due(now, due)
@@ -95,7 +107,8 @@ class Viewer:
                     self._draw()
                 if now - shown >= 1 / PANEL_RATE:
                     real_time = (self.session.steps - counted) * dt / (now - shown)
-                    shown, counted = now, self.session.steps
+                    shown = now
+                    counted = self.session.steps
                     agents = self.session.env.index.base_qpos[: self.session.env.num_agents, :3]
                     frame = self.session.moment(self._panel.back).frame
                     self._panel.show(frame.qpos[self._panel.env, agents], real_time)
@@ -106,7 +119,9 @@ class Viewer:
             self.server.stop()
 
     def _open_chosen(self) -> bool:
-        """Opens the session that was chosen on the page, if any; keeps the current one if that is not possible."""
+        """Opens the session that was chosen on the page, if any; keeps the current one if that is
+        not possible.
+        """
         choice = self._panel.take_choice()
         if choice is None or self._menu is None:
             return False
@@ -123,17 +138,22 @@ class Viewer:
         return True
 
     def _draw(self) -> None:
-        moment, panel = self.session.moment(self._panel.back), self._panel
+        moment = self.session.moment(self._panel.back)
+        panel = self._panel
         self._stage.draw(moment.frame, self._target())
         if panel.shapes != self._shapes:
             self._shapes = panel.shapes
             self._overlay.show_shapes(self._shapes)
         self._overlay.contacts = panel.contacts
         self._overlay.draw(moment.frame, panel.env, moment.qvel[panel.env], moment.ctrl[panel.env])
-        self._overlay.draw_marks(moment.marks if panel.sensors else (), panel.env, self.session.drive.robot or 0)
+        self._overlay.draw_marks(
+            moment.marks if panel.sensors else (), panel.env, self.session.drive.robot or 0
+        )
 
     def _step_if_due(self, now: float, due: float) -> bool:
-        """Handles reset and single-step requests, advances if the next step is due; returns whether it was due."""
+        """Handles reset and single-step requests, advances if the next step is due; returns whether
+        it was due.
+        """
         if self._panel.take_reset():
             self.session.reset()
         for _ in range(self._panel.take_steps()):
@@ -147,13 +167,17 @@ class Viewer:
         camera = self._panel.camera
         if camera == FREE:
             return None
-        return self._panel.env, list(self._bodies.values()) if camera == ACTION else [self._bodies[camera]]
+        return self._panel.env, list(self._bodies.values()) if camera == ACTION else [
+            self._bodies[camera]
+        ]
 
     def _aim(self) -> None:
         self._point(self.session.moment(self._panel.back).frame, self._target())
 
     def _point(self, frame: Episode, followed: tuple[int, list[int]] | None) -> None:
-        """Points the cameras of all clients, also of later ones, at the followed bodies or the whole scene."""
+        """Points the cameras of all clients, also of later ones, at the followed bodies or the
+        whole scene.
+        """
         if followed is None:
             self._stage.release()
             position, look_at = self._stage.overview()
@@ -162,4 +186,5 @@ class Viewer:
             position, look_at = chase(np.array([0.0, 0.0, 0.2]), 3.0 + self._stage.span)
         cameras = [client.camera for client in self.server.get_clients().values()]
         for camera in (self.server.initial_camera, *cameras):
-            camera.position, camera.look_at = position, look_at
+            camera.position = position
+            camera.look_at = look_at

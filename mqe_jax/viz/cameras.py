@@ -1,4 +1,6 @@
-"""Cameras: fixed views of the whole scene or of all trajectories, and views that track robots and objects."""
+"""Cameras: fixed views of the whole scene or of all trajectories, and views that track robots and
+objects.
+"""
 
 from dataclasses import replace
 
@@ -11,8 +13,9 @@ from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, pose_frames, sh
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
-"""Names of the views. follow: tracks robots, objects and the goal from the direction in which they are seen best. near:
-the same, fixed. scene: fixed, whole scene. side: tracks the first robot from its side."""
+"""Names of the views. follow: tracks robots, objects and the goal from the direction in which they
+are seen best. near: the same, fixed. scene: fixed, whole scene. side: tracks the first robot from
+its side."""
 
 _MARGIN = np.array([0.4, 0.4, 0.25])  # around a robot's trunk, m
 _SMOOTHING = 0.6  # duration over which a following camera is averaged, s
@@ -20,25 +23,38 @@ _SAMPLES = 24  # frames of an episode by which directions are compared
 _DISTANCES = (2.0, 16.0)  # of a camera that follows up to `_FEW` robots, m; further away from more
 _FEW = 8
 _ELEVATIONS = (-30.0, -38.0, -48.0, -60.0)
-_DIRECTIONS = [(azimuth, elevation) for azimuth in (90.0, 60.0, 30.0, 0.0, -30.0, 120.0) for elevation in _ELEVATIONS]
+_DIRECTIONS = [
+    (azimuth, elevation)
+    for azimuth in (90.0, 60.0, 30.0, 0.0, -30.0, 120.0)
+    for elevation in _ELEVATIONS
+]
 _BEHIND = 2.0  # m of distance that a camera may add to see the robots beside each other
 _HIDDEN = 12.0  # m of distance that a camera may add to see the targets all the time
 
 
 def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 / 9) -> Camera:
-    """Returns a three-quarter view from behind and above that contains the track and all robot trajectories."""
+    """Returns a three-quarter view from behind and above that contains the track and all robot
+    trajectories.
+    """
     low, high = extent(model, episode)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])])
+    corners = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])]
+    )
     return fit(model, corners, Camera((0.0, 0.0, 0.0), 1.0), aspect, (1.5, 60.0))
 
 
-def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 16 / 9) -> list[Camera]:
-    """Returns the camera of every frame of an episode, for a view of `VIEWS`; InputError for an unknown view."""
+def cameras(
+    model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 16 / 9
+) -> list[Camera]:
+    """Returns the camera of every frame of an episode, for a view of `VIEWS`; InputError for an
+    unknown view.
+    """
     if known_name("view: unknown name", view, VIEWS) == "scene":
         return [default_camera(model, episode, aspect)] * len(episode)
     if view == "side":
         return _beside(model, episode)
-    points, goals = _points(model, episode), goal_points(model, episode)
+    points = _points(model, episode)
+    goals = goal_points(model, episode)
     fixed = len(episode) if view == "near" else 0
     direction = _direction(model, episode, points, goals, aspect, fixed)
     width = max(1, min(round(_SMOOTHING / episode.dt), len(episode) // 5))
@@ -48,8 +64,10 @@ def cameras(model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 
 
 def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
     """Returns the corners (8 x targets, 3) of boxes about the targets of each frame, m."""
-    bodies, robots = targets(model, episode), len(shown_bases(model))
-    local, frames = body_boxes(model, bodies), []
+    bodies = targets(model, episode)
+    robots = len(shown_bases(model))
+    local = body_boxes(model, bodies)
+    frames = []
     margins = _MARGIN * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for data in pose_frames(model, episode, range(len(episode))):
         boxes = pose_boxes(data, bodies, local)
@@ -59,39 +77,66 @@ def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
 
 
 def _direction(
-    model: mujoco.MjModel, episode: Episode, points: list[np.ndarray], goals: np.ndarray, aspect: float, width: int
+    model: mujoco.MjModel,
+    episode: Episode,
+    points: list[np.ndarray],
+    goals: np.ndarray,
+    aspect: float,
+    width: int,
 ) -> Camera:
-    """Returns a camera of the direction in which the targets are hidden least and never far away."""
+    """Returns a camera of the direction in which the targets are hidden least and never far
+    away.
+    """
     sample = np.unique(np.linspace(0, len(episode) - 1, _SAMPLES).astype(int))
-    part = Episode(*(x[sample] for x in (episode.qpos, episode.mocap_pos, episode.mocap_quat)), dt=episode.dt)
-    best, least = Camera((0.0, 0.0, 0.0), 1.0), np.inf
+    part = Episode(
+        *(x[sample] for x in (episode.qpos, episode.mocap_pos, episode.mocap_quat)), dt=episode.dt
+    )
+    best = Camera((0.0, 0.0, 0.0), 1.0)
+    least = np.inf
     for azimuth, elevation in _DIRECTIONS:
         camera = replace(best, azimuth=azimuth, elevation=elevation)
         few = [points[i] for i in sample]
         views = _following(model, few, goals, camera, aspect, width)
-        away = [np.linalg.norm(box - view.position, axis=-1).mean() for box, view in zip(few, views, strict=True)]
+        away = [
+            np.linalg.norm(box - view.position, axis=-1).mean()
+            for box, view in zip(few, views, strict=True)
+        ]
         unseen = hidden(model, part, views).mean(axis=0).max()
         cost = max(away) + _BEHIND * _alignment(model, part, camera.axes[1]) + _HIDDEN * unseen
         if cost < least:
-            best, least = camera, cost
+            best = camera
+            least = cost
     return best
 
 
 def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> float:
-    """Returns how much robots are behind each other in the view of a camera, 0 to 1; `right` (3,) is its direction."""
-    robots, values = shown_bases(model), []
+    """Returns how much robots are behind each other in the view of a camera, 0 to 1; `right` (3,)
+    is its direction.
+    """
+    robots = shown_bases(model)
+    values = []
     for data in pose_frames(model, episode, range(len(episode))):
-        apart = (data.xpos[robots][:, None] - data.xpos[robots])[np.triu_indices(len(robots), 1)][:, :2]
+        apart = (data.xpos[robots][:, None] - data.xpos[robots])[np.triu_indices(len(robots), 1)][
+            :, :2
+        ]
         across = np.abs(apart @ right[:2]) / np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         values.append(1.0 - across.mean() if len(across) else 0.0)
     return float(np.mean(values))
 
 
 def _following(
-    model: mujoco.MjModel, points: list[np.ndarray], goals: np.ndarray, direction: Camera, aspect: float, width: int
+    model: mujoco.MjModel,
+    points: list[np.ndarray],
+    goals: np.ndarray,
+    direction: Camera,
+    aspect: float,
+    width: int,
 ) -> list[Camera]:
-    """Returns a camera for each frame that contains the targets of all frames at most `width` away, and the goal."""
-    views, (near, far) = [], _DISTANCES
+    """Returns a camera for each frame that contains the targets of all frames at most `width` away,
+    and the goal.
+    """
+    views = []
+    (near, far) = _DISTANCES
     far *= max(1.0, float(np.sqrt(len(shown_bases(model)) / _FEW)))
     for index in range(len(points)):
         around = points[max(0, index - width) : index + width + 1]
@@ -101,7 +146,8 @@ def _following(
 
 
 def _beside(model: mujoco.MjModel, episode: Episode) -> list[Camera]:
-    robot, views = shown_bases(model)[0], []
+    robot = shown_bases(model)[0]
+    views = []
     for data in pose_frames(model, episode, range(len(episode))):
         x, y, _ = data.xpos[robot]
         views.append(Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0))

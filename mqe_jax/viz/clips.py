@@ -19,12 +19,16 @@ from mqe_jax.core.settings import PathText, check_arguments, fail
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
 
-def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at: float | None = None) -> Path:
+def check_output(
+    path: Path, *, fps: float | None = None, speed: float = 1.0, at: float | None = None
+) -> Path:
     """Returns the path if it can be written, with options of `render_episode`; else InputError."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
-    unused = {"fps": fps, "speed": None if speed == 1.0 else speed} if suffix == ".png" else {"at": at}
+    unused = (
+        {"fps": fps, "speed": None if speed == 1.0 else speed} if suffix == ".png" else {"at": at}
+    )
     for name, value in unused.items():
         if value is not None:
             fail(name, value, f"left out for a {suffix} file")
@@ -43,7 +47,8 @@ def check_output(path: Path, *, fps: float | None = None, speed: float = 1.0, at
 @check_arguments(path=PathText, frames=Iterable, fps=Positive)
 def write_clip(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
-    file, checked = check_output(Path(path)), _check_frames(frames)
+    file = check_output(Path(path))
+    checked = _check_frames(frames)
     suffix = file.suffix.lower()
     with replacing(file) as temporary:
         if suffix == ".mp4":
@@ -56,11 +61,14 @@ def _check_frames(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     """Yields at least one frame, each (H, W, 3) uint8, as the first."""
     first = None
     for index, frame in enumerate(frames):
-        shape, dtype = getattr(frame, "shape", ()), getattr(frame, "dtype", type(frame).__name__)
+        shape = getattr(frame, "shape", ())
+        dtype = getattr(frame, "dtype", type(frame).__name__)
         first = first or shape
         if dtype != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape or shape != first:
             expected = "(H, W, 3)" if shape == first else str(first)
-            raise InputError(f"frames: frame {index} is {dtype} {shape}; it must be uint8 {expected}")
+            raise InputError(
+                f"frames: frame {index} is {dtype} {shape}; it must be uint8 {expected}"
+            )
         yield np.asarray(frame)
     if first is None:
         raise InputError("frames: there are none")
@@ -72,7 +80,18 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     program = import_module("imageio_ffmpeg").get_ffmpeg_exe()
     first = next(frames)
     height, width = (n // 2 * 2 for n in first.shape[:2])
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    source = [
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{width}x{height}",
+        "-r",
+        f"{fps:g}",
+        "-i",
+        "-",
+    ]
     encoding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     command = [program, "-loglevel", "error", "-y", *source, *encoding, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
@@ -99,8 +118,12 @@ def _write_images(path: Path, images: list[Image.Image], suffix: str, fps: float
     # The slowest method, 6, takes twenty times as long for a file that is no smaller.
     options: dict[str, Any] = {"quality": 30, "method": 4, "minimize_size": True}
     if suffix == ".gif":
-        sample = np.concatenate([np.asarray(image) for image in images[:: max(1, len(images) // 6)][:8]])
+        sample = np.concatenate(
+            [np.asarray(image) for image in images[:: max(1, len(images) // 6)][:8]]
+        )
         palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
         images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
         options = {"optimize": True}
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, **options)
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, **options
+    )

@@ -1,4 +1,6 @@
-"""Drawings by matplotlib: curves of a training, and a top view for machines without a GL library."""
+"""Drawings by matplotlib: curves of a training, and a top view for machines without a GL
+library.
+"""
 
 import io
 import math
@@ -15,18 +17,29 @@ from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.sensors.marks import Marks
-from mqe_jax.viz.geometry import box_corners, extent, pose_frames, robot_color, scenery_geoms, shown_bases
+from mqe_jax.viz.geometry import (
+    box_corners,
+    extent,
+    pose_frames,
+    robot_color,
+    scenery_geoms,
+    shown_bases,
+)
 from mqe_jax.viz.recording import Episode
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _REWARDS = ("average_step_reward", "episode_return")
-_INK, _RUN, _SECOND = "#23252b", "#2f7fd6", "#3fae49"
+_INK = "#23252b"
+_RUN = "#2f7fd6"
+_SECOND = "#3fae49"
 
 
 def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
-    """Returns the running mean over a window of `fraction` of the rows; non-finite values are skipped."""
+    """Returns the running mean over a window of `fraction` of the rows; non-finite values are
+    skipped.
+    """
     values = np.asarray(values, np.float64)
     width = max(1, round(len(values) * fraction))
     windows = [values[max(0, end - width) : end] for end in range(1, len(values) + 1)]
@@ -58,9 +71,16 @@ def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> "Figu
         return figure
     name = next((name for name in _REWARDS if name in tables[0]), "updates")
     for table in tables:
-        steps, reward = table["env_steps"] / 1e6, table[name]
+        steps = table["env_steps"] / 1e6
+        reward = table[name]
         axes.plot(steps, reward, color=_RUN, lw=0.6, alpha=0.3)
-        axes.plot(steps, smooth(reward), color=_RUN, lw=1.8, label="mqe_jax" if table is tables[0] else None)
+        axes.plot(
+            steps,
+            smooth(reward),
+            color=_RUN,
+            lw=1.8,
+            label="mqe_jax" if table is tables[0] else None,
+        )
     last = max(table["env_steps"][-1] for table in tables) / 1e6
     axes.set(xlabel="environment steps (millions)", ylabel=name.replace("_", " "), xlim=(0, last))
     if any(math.isfinite(v) for t in tables for v in t.get("success", [])):
@@ -81,8 +101,12 @@ def save_figure(figure: "Figure", path: Path) -> None:
         figure.savefig(temporary)
 
 
-def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots, and what the first one senses."""
+def draw_top(
+    model: mujoco.MjModel, episode: Episode, size: tuple[int, int]
+) -> Iterator[np.ndarray]:
+    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots, and what the
+    first one senses.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon
@@ -95,7 +119,9 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
     axes.axis("off")
-    bases, scenery, robots = shown_bases(model), [], []
+    bases = shown_bases(model)
+    scenery = []
+    robots = []
     for geom in scenery_geoms(model):
         moves = model.body_dofnum[model.body_rootid[model.geom_bodyid[geom]]] > 0
         face = "#c9ced6" if moves else "#3a3d45"
@@ -104,7 +130,9 @@ def draw_top(model: mujoco.MjModel, episode: Episode, size: tuple[int, int]) -> 
     body_shape = np.array([[-0.25, -0.13], [0.2, -0.13], [0.33, 0.0], [0.2, 0.13], [-0.25, 0.13]])
     for body in bases:
         colour = robot_color(model, body)
-        patch = axes.add_patch(Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4))
+        patch = axes.add_patch(
+            Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4)
+        )
         robots.append((body, patch))
     for index, data in enumerate(pose_frames(model, episode, range(len(episode)))):
         marks = [artist for mark in episode.marks for artist in _sensed(axes, mark, index)]
@@ -126,10 +154,17 @@ def _sensed(axes: Any, mark: Marks, index: int) -> list[Any]:
     """Draws the first agent's marks in a frame."""
     from matplotlib.collections import LineCollection
 
-    colors = ([(*mark.color, alpha) for alpha in each[index][0]] for each in (mark.line_opacity, mark.point_opacity))
-    (line, point), spots = colors, mark.points[index][0]
+    colors = (
+        [(*mark.color, alpha) for alpha in each[index][0]]
+        for each in (mark.line_opacity, mark.point_opacity)
+    )
+    (line, point) = colors
+    spots = mark.points[index][0]
     lines = LineCollection(
-        [*np.asarray(mark.lines[index][0, ..., :2])], colors=line, lw=2 if mark.bold else 0.8, zorder=3
+        [*np.asarray(mark.lines[index][0, ..., :2])],
+        colors=line,
+        lw=2 if mark.bold else 0.8,
+        zorder=3,
     )
     area = axes.fill(*mark.area[index][0].T[:2], color=mark.color, alpha=0.3, lw=0, zorder=1)
     return [axes.add_collection(lines), axes.scatter(*spots.T[:2], s=6, c=point, zorder=3), *area]

@@ -8,36 +8,53 @@ import numpy as np
 
 from mqe_jax.sensors.marks import Marks
 
-_LINE, _POINT = 1 / 450, 1 / 220  # width of a line, of the image's height; radius of a point, of the camera's distance
-_AREA, _SHADE = 0.3, 0.55  # opacity of an area; of a line's colour, as MuJoCo lights lines more than surfaces
+# width of a line, of the image's height; radius of a point, of the camera's distance
+_LINE = 1 / 450
+_POINT = 1 / 220
+# opacity of an area; of a line's colour, as MuJoCo lights lines more than surfaces
+_AREA = 0.3
+_SHADE = 0.55
 _TYPE = mujoco.mjtGeom
 
 
-def add_marks(scene: mujoco.MjvScene, marks: Sequence[Marks], frame: int, height: int, distance: float) -> None:
-    """Adds the first agent's marks in a frame to a scene of an image `height` pixels high, seen from `distance`, m."""
+def add_marks(
+    scene: mujoco.MjvScene, marks: Sequence[Marks], frame: int, height: int, distance: float
+) -> None:
+    """Adds the first agent's marks in a frame to a scene of an image `height` pixels high, seen
+    from `distance`, m.
+    """
     for mark in marks:
-        lines, opacity = np.asarray(mark.lines[frame][0], float), np.asarray(mark.line_opacity[frame][0])
+        lines = np.asarray(mark.lines[frame][0], float)
+        opacity = np.asarray(mark.line_opacity[frame][0])
         width = max(1.0, (2 if mark.bold else 1) * _LINE * height)
         for ends, alpha in zip(lines[opacity > 0], opacity[opacity > 0], strict=True):
-            mujoco.mjv_connector(_add(scene, _TYPE.mjGEOM_LINE, mark, alpha), _TYPE.mjGEOM_LINE, width, *ends)
-        points, opacity = np.asarray(mark.points[frame][0], float), np.asarray(mark.point_opacity[frame][0])
+            mujoco.mjv_connector(
+                _add(scene, _TYPE.mjGEOM_LINE, mark, alpha), _TYPE.mjGEOM_LINE, width, *ends
+            )
+        points = np.asarray(mark.points[frame][0], float)
+        opacity = np.asarray(mark.point_opacity[frame][0])
         for point, alpha in zip(points[opacity > 0], opacity[opacity > 0], strict=True):
             geom = _add(scene, _TYPE.mjGEOM_SPHERE, mark, alpha)
-            geom.size[:], geom.pos[:] = _POINT * distance, point
+            geom.size[:] = _POINT * distance
+            geom.pos[:] = point
         area = np.asarray(mark.area[frame][0], float)
         for one, other in itertools.pairwise(area[1:]):
             # A triangle's corners are its origin and the ends of the first two axes.
             geom = _add(scene, _TYPE.mjGEOM_TRIANGLE, mark, _AREA)
-            geom.size[:], geom.pos[:] = 1.0, area[0]
+            geom.size[:] = 1.0
+            geom.pos[:] = area[0]
             geom.mat[:] = np.stack([one - area[0], other - area[0], (0.0, 0.0, 1.0)], axis=1)
 
 
-def _add(scene: mujoco.MjvScene, kind: mujoco.mjtGeom, mark: Marks, opacity: float) -> mujoco.MjvGeom:
+def _add(
+    scene: mujoco.MjvScene, kind: mujoco.mjtGeom, mark: Marks, opacity: float
+) -> mujoco.MjvGeom:
     """Adds a geom of a kind that casts no shadow and does not shine."""
     geom = scene.geoms[scene.ngeom]
     shade = _SHADE if kind == _TYPE.mjGEOM_LINE else 1.0
     color = np.array([*(shade * part for part in mark.color), opacity], np.float32)
     mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
-    geom.specular, geom.category = 0.0, mujoco.mjtCatBit.mjCAT_DECOR
+    geom.specular = 0.0
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     scene.ngeom += 1
     return geom

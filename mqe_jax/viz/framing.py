@@ -37,7 +37,8 @@ class Camera:
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Directions forward, right and up (3,)."""
-        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        azimuth = np.radians(self.azimuth)
+        elevation = np.radians(self.elevation)
         level = np.cos(elevation)
         forward = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
         right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
@@ -50,41 +51,71 @@ class Camera:
 
 
 def fit(
-    model: mujoco.MjModel, corners: np.ndarray, camera: Camera, aspect: float, distances: tuple[float, float]
+    model: mujoco.MjModel,
+    corners: np.ndarray,
+    camera: Camera,
+    aspect: float,
+    distances: tuple[float, float],
 ) -> Camera:
-    """Returns a camera of the same direction whose image contains and centres the points `corners` (P, 3)."""
+    """Returns a camera of the same direction whose image contains and centres the points `corners`
+    (P, 3).
+    """
     forward, right, up = camera.axes
-    tangent = float(np.tan(np.radians(model.vis.global_.fovy) / 2))  # of half the vertical field of view
-    lookat, distance = (corners.min(axis=0) + corners.max(axis=0)) / 2, 1.0
+    # of half the vertical field of view
+    tangent = float(np.tan(np.radians(model.vis.global_.fovy) / 2))
+    lookat = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    distance = 1.0
     for _ in range(25):  # centre the projection, then adjust the distance
         offset = corners - lookat
-        # A corner is in the image where |offset right| <= depth tan aspect and |offset up| <= depth tan.
-        need = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent - offset @ forward
+        # A corner is in the image where |offset right| <= depth tan aspect and |offset up| <= depth
+        # tan.
+        need = (
+            np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent
+            - offset @ forward
+        )
         distance = need.max()
         depth = distance + offset @ forward
-        across, along = offset @ right / depth, offset @ up / depth
-        shift = distance * ((across.max() + across.min()) * right + (along.max() + along.min()) * up) / 4
+        across = offset @ right / depth
+        along = offset @ up / depth
+        shift = (
+            distance
+            * ((across.max() + across.min()) * right + (along.max() + along.min()) * up)
+            / 4
+        )
         lookat = lookat + shift
-    return replace(camera, lookat=tuple(lookat.tolist()), distance=float(np.clip(_ROOM * distance, *distances)))
+    return replace(
+        camera, lookat=tuple(lookat.tolist()), distance=float(np.clip(_ROOM * distance, *distances))
+    )
 
 
 def smooth(views: Sequence[Camera], width: int) -> list[Camera]:
     """Returns cameras smoothed by a triangular window of `2 width + 1` frames."""
     values = np.array([[*camera.lookat, camera.distance] for camera in views])
-    padded = np.concatenate([np.repeat(values[:1], width, 0), values, np.repeat(values[-1:], width, 0)])
-    weights = np.minimum(np.arange(1, 2 * width + 2), np.arange(2 * width + 1, 0, -1)) / (width + 1) ** 2
+    padded = np.concatenate(
+        [np.repeat(values[:1], width, 0), values, np.repeat(values[-1:], width, 0)]
+    )
+    weights = (
+        np.minimum(np.arange(1, 2 * width + 2), np.arange(2 * width + 1, 0, -1)) / (width + 1) ** 2
+    )
     means = np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
     rows = zip(views, means.tolist(), strict=True)
-    return [replace(camera, lookat=(x, y, z), distance=distance) for camera, (x, y, z, distance) in rows]
+    return [
+        replace(camera, lookat=(x, y, z), distance=distance) for camera, (x, y, z, distance) in rows
+    ]
 
 
-_INK, _PAPER = (28, 32, 40), (246, 246, 242)
+_INK = (28, 32, 40)
+_PAPER = (246, 246, 242)
 
 
 def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
-    """Returns labels and the different colours, 0 to 255, of their robots: teams as in `env.teams`, then others."""
+    """Returns labels and the different colours, 0 to 255, of their robots: teams as in `env.teams`,
+    then others.
+    """
     bases = robot_bases(env.mj_model)
-    colors = [tuple(round(255 * part) for part in robot_color(env.mj_model, body)[:3]) for body in bases]
+    colors = [
+        tuple(round(255 * part) for part in robot_color(env.mj_model, body)[:3]) for body in bases
+    ]
     names = ("team",) if len(env.teams) == 1 else ("team 0", "team 1")
     rows = [
         (name, list(dict.fromkeys(colors[agent] for agent in team)))
@@ -94,29 +125,39 @@ def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
     return [*rows, ("scripted", scripted)] if scripted else rows
 
 
-def legend(env: QuadrupedEnv, size: tuple[int, int], marks: Sequence[Marks] = ()) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3) uint8.
+def legend(
+    env: QuadrupedEnv, size: tuple[int, int], marks: Sequence[Marks] = ()
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3)
+    uint8.
 
     It names teams and `marks`; a single robot without marks has none.
     """
-    labels = entries(env) + [(mark.label, [tuple(round(255 * part) for part in mark.color)]) for mark in marks]
+    labels = entries(env) + [
+        (mark.label, [tuple(round(255 * part) for part in mark.color)]) for mark in marks
+    ]
     if sum(len(dots) for _, dots in labels) < 2:
         return lambda frame: frame
     unit = max(size[1] / 360, 0.6)
     font = ImageFont.load_default(13 * unit)
     width = sum(font.getlength(label) + unit * (14 * len(dots) + 16) for label, dots in labels)
     plate = Image.new("RGB", (round(width + 4 * unit), round(22 * unit)), _PAPER)
-    draw, x, middle = ImageDraw.Draw(plate), 8 * unit, 11 * unit
+    draw = ImageDraw.Draw(plate)
+    x = 8 * unit
+    middle = 11 * unit
     for label, dots in labels:
         for color in dots:
             draw.ellipse((x, middle - 5 * unit, x + 10 * unit, middle + 5 * unit), fill=color)
             x += 14 * unit
         draw.text((x, middle), label, fill=_INK, font=font, anchor="lm")
         x += font.getlength(label) + 16 * unit
-    picture, gap = np.asarray(plate), round(8 * unit)
+    picture = np.asarray(plate)
+    gap = round(8 * unit)
 
     def draw_legend(frame: np.ndarray) -> np.ndarray:
-        height, width = (min(a, b - gap) for a, b in zip(picture.shape[:2], frame.shape[:2], strict=True))
+        height, width = (
+            min(a, b - gap) for a, b in zip(picture.shape[:2], frame.shape[:2], strict=True)
+        )
         frame = frame.copy()
         frame[-gap - height : len(frame) - gap, gap : gap + width] = picture[:height, :width]
         return frame
@@ -124,7 +165,8 @@ def legend(env: QuadrupedEnv, size: tuple[int, int], marks: Sequence[Marks] = ()
     return draw_legend
 
 
-_SPAN = 0.18  # distance from a trunk's centre of the points that are looked for in front and behind, m
+# distance from a trunk's centre of the points that are looked for in front and behind, m
+_SPAN = 0.18
 _NEAR_GOAL = 3.0  # distance from the goal that the objects reach within which sites belong to it, m
 _CLEAR = 0.5  # opacity below which a geom hides nothing
 
@@ -135,10 +177,15 @@ def targets(model: mujoco.MjModel, episode: Episode) -> list[int]:
 
 
 def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
-    """Returns the goals' points (P, 3), m; of several goals those of the one next to the objects at the end."""
+    """Returns the goals' points (P, 3), m; of several goals those of the one next to the objects at
+    the end.
+    """
     data = next(pose_frames(model, episode, [len(episode) - 1]))
-    sites = [site for site in range(model.nsite) if model.site(site).name.startswith(f"{GOAL_SITE}/")]
-    points, objects = data.site_xpos[sites].reshape(-1, 3), moving_bodies(model, episode)
+    sites = [
+        site for site in range(model.nsite) if model.site(site).name.startswith(f"{GOAL_SITE}/")
+    ]
+    points = data.site_xpos[sites].reshape(-1, 3)
+    objects = moving_bodies(model, episode)
     if not len(points) or not objects:
         return points
     place = data.xpos[objects].mean(axis=0)
@@ -147,13 +194,16 @@ def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
 
 
 def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> np.ndarray:
-    """Returns the part of each target that walls and objects hide from the camera of each frame (T, targets).
+    """Returns the part of each target that walls and objects hide from the camera of each frame (T,
+    targets).
 
-    Three points are looked for: along a robot's trunk, and one above the other in an object. Robots hide nothing.
+    Three points are looked for: along a robot's trunk, and one above the other in an object. Robots
+    hide nothing.
     """
     model = copy.deepcopy(model)
     model.geom_group[model.geom_rgba[:, 3] < _CLEAR] = HIDDEN_GROUP
-    bodies, trunks = targets(model, episode), len(shown_bases(model))
+    bodies = targets(model, episode)
+    trunks = len(shown_bases(model))
     local = body_boxes(model, bodies)
     groups = np.array([group != HIDDEN_GROUP for group in range(mujoco.mjNGROUP)], np.uint8)
     rows = []
@@ -170,12 +220,19 @@ def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> 
 
 
 def _struck(
-    model: mujoco.MjModel, data: mujoco.MjData, eye: np.ndarray, points: np.ndarray, groups: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    eye: np.ndarray,
+    points: np.ndarray,
+    groups: np.ndarray,
 ) -> np.ndarray:
     """Returns the first geom on each way from `eye` (3,) to `points` (P, 3); -1 without a hit."""
     ways = points - eye
     lengths = np.linalg.norm(ways, axis=1)
-    geoms, distances = np.full(len(points), -1, np.int32), np.zeros(len(points))
+    geoms = np.full(len(points), -1, np.int32)
+    distances = np.zeros(len(points))
     units = (ways / lengths[:, None]).ravel()
-    mujoco.mj_multiRay(model, data, eye, units, groups, 1, -1, geoms, distances, None, len(points), mujoco.mjMAXVAL)
+    mujoco.mj_multiRay(
+        model, data, eye, units, groups, 1, -1, geoms, distances, None, len(points), mujoco.mjMAXVAL
+    )
     return np.where(distances < lengths, geoms, -1)

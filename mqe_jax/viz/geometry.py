@@ -15,7 +15,9 @@ _SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of
 
 
 def robot_bases(model: mujoco.MjModel) -> list[int]:
-    """Returns the ids of the robots' trunks: bodies with a free joint and at least twelve hinges below it."""
+    """Returns the ids of the robots' trunks: bodies with a free joint and at least twelve hinges
+    below it.
+    """
     bases = []
     hinges = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
     for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
@@ -27,7 +29,9 @@ def robot_bases(model: mujoco.MjModel) -> list[int]:
 
 
 def shown_bases(model: mujoco.MjModel) -> list[int]:
-    """Returns the ids of the trunks of visible robots; in a rendering model, of those that take part."""
+    """Returns the ids of the trunks of visible robots; in a rendering model, of those that take
+    part.
+    """
     return [body for body in robot_bases(model) if _drawn(model, body)]
 
 
@@ -44,20 +48,31 @@ def _hide(model: mujoco.MjModel, bodies: Sequence[int]) -> None:
 
 
 def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
-    """Returns the ids of visible objects and NPCs that move in the episode: free, sliding or mocap, no robots."""
+    """Returns the ids of visible objects and NPCs that move in the episode: free, sliding or mocap,
+    no robots.
+    """
     moved = np.ptp(episode.mocap_pos, axis=0).max(-1) > 0.05 if model.nmocap else np.zeros(0, bool)
-    bodies = [body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and moved[model.body_mocapid[body]]]
+    bodies = [
+        body
+        for body in range(model.nbody)
+        if model.body_mocapid[body] >= 0 and moved[model.body_mocapid[body]]
+    ]
     robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
     translations = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
-        if int(model.jnt_type[joint]) in translations and int(model.body_rootid[body]) not in robots:
+        if (
+            int(model.jnt_type[joint]) in translations
+            and int(model.body_rootid[body]) not in robots
+        ):
             bodies.append(body)
     return sorted(body for body in set(bodies) if _drawn(model, body))
 
 
 def robot_color(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
-    """Returns the colour (red, green, blue, alpha) of a robot: that of the first visible geom of its trunk."""
+    """Returns the colour (red, green, blue, alpha) of a robot: that of the first visible geom of
+    its trunk.
+    """
     geoms = model.body_geomadr[trunk] + np.arange(model.body_geomnum[trunk])
     seen = [geom for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
     return tuple(map(float, model.geom_rgba[seen[0]]))
@@ -72,7 +87,9 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, episode: Episode, index: in
     mujoco.mj_kinematics(model, data)
 
 
-def pose_frames(model: mujoco.MjModel, episode: Episode, frames: Iterable[int]) -> Iterator[mujoco.MjData]:
+def pose_frames(
+    model: mujoco.MjModel, episode: Episode, frames: Iterable[int]
+) -> Iterator[mujoco.MjData]:
     """Yields one workspace, set to each of some frames of an episode by `pose`."""
     data = mujoco.MjData(model)
     for index in frames:
@@ -82,13 +99,17 @@ def pose_frames(model: mujoco.MjModel, episode: Episode, frames: Iterable[int]) 
 
 def box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
     """Returns the corners (8, 3) of a geom's bounding box, world frame, m."""
-    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    centre = model.geom_aabb[geom, :3]
+    half = model.geom_aabb[geom, 3:]
     return data.geom_xpos[geom] + (centre + _SIGNS * half) @ data.geom_xmat[geom].reshape(3, 3).T
 
 
 def body_boxes(model: mujoco.MjModel, bodies: Sequence[int]) -> np.ndarray:
-    """Returns the corners (B, 8, 3) of the boxes about the bodies' visible geoms, each in its body's frame, m."""
-    boxes, rotation = [], np.zeros(9)
+    """Returns the corners (B, 8, 3) of the boxes about the bodies' visible geoms, each in its
+    body's frame, m.
+    """
+    boxes = []
+    rotation = np.zeros(9)
     for body in bodies:
         points = [np.zeros((1, 3))]
         for geom in model.body_geomadr[body] + np.arange(model.body_geomnum[body]):
@@ -98,19 +119,24 @@ def body_boxes(model: mujoco.MjModel, bodies: Sequence[int]) -> np.ndarray:
             corners = model.geom_aabb[geom, :3] + _SIGNS * model.geom_aabb[geom, 3:]
             points.append(model.geom_pos[geom] + corners @ rotation.reshape(3, 3).T)
         shown = np.concatenate(points[1:] or points)
-        low, high = shown.min(axis=0), shown.max(axis=0)
+        low = shown.min(axis=0)
+        high = shown.max(axis=0)
         boxes.append((low + high) / 2 + _SIGNS * (high - low) / 2)
     return np.array(boxes).reshape(-1, 8, 3)
 
 
 def pose_boxes(data: mujoco.MjData, bodies: Sequence[int], boxes: np.ndarray) -> np.ndarray:
-    """Returns the corners (B, 8, 3) of boxes given in the frames of the bodies in the world frame, m."""
+    """Returns the corners (B, 8, 3) of boxes given in the frames of the bodies in the world frame,
+    m.
+    """
     rotation = data.xmat[list(bodies)].reshape(-1, 3, 3)
     return data.xpos[list(bodies), None] + boxes @ rotation.transpose(0, 2, 1)
 
 
 def scenery_geoms(model: mujoco.MjModel) -> list[int]:
-    """Returns the ids of the visible geoms that are neither ground, with what is painted on it, nor part of a robot."""
+    """Returns the ids of the visible geoms that are neither ground, with what is painted on it, nor
+    part of a robot.
+    """
     robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
     return [
         geom
@@ -138,8 +164,8 @@ def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndar
 def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
     """Returns a rendering copy of the model, in which mocap walls end at the track's side walls.
 
-    A gate's walls are long enough for every sampled gap position; the overhang beyond the side walls is hidden. So are
-    the robots and sliding objects that take no part in the episode.
+    A gate's walls are long enough for every sampled gap position; the overhang beyond the side
+    walls is hidden. So are the robots and sliding objects that take no part in the episode.
     """
     model = copy.deepcopy(model)
     data = next(pose_frames(model, episode, [0]))
@@ -151,13 +177,16 @@ def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
         return model
     corners = np.concatenate([box_corners(model, data, geom) for geom in fixed])
     sliding = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE)]
-    _hide(model, [body for body in sliding if data.xpos[body, 0] > corners[:, 0].max() + OUTSIDE / 2])
+    _hide(
+        model, [body for body in sliding if data.xpos[body, 0] > corners[:, 0].max() + OUTSIDE / 2]
+    )
     sides = corners[:, 1]
     for geom in shown:
         if model.body_mocapid[model.geom_bodyid[geom]] < 0:
             continue
         wall = box_corners(model, data, geom)[:, 1]
-        low, high = max(wall.min(), sides.min() + 0.005), min(wall.max(), sides.max() - 0.005)
+        low = max(wall.min(), sides.min() + 0.005)
+        high = min(wall.max(), sides.max() - 0.005)
         if low < high and (low, high) != (wall.min(), wall.max()):
             model.geom_pos[geom, 1] += (low + high) / 2 - data.geom_xpos[geom, 1]
             model.geom_sameframe[geom] = 0  # otherwise MuJoCo reuses the body's pose

@@ -49,21 +49,33 @@ class Episode:
         bodies = (*shapes[0][:1], *shapes[1][1:2])
         if len(shapes[0]) != 2 or shapes[1:] != [(*bodies, 3), (*bodies, 4)]:
             allowed = "(T, nq), (T, M, 3) and (T, M, 4)"
-            raise InputError(f"Episode: qpos, mocap_pos and mocap_quat have the shapes {shapes}; expected {allowed}")
+            raise InputError(
+                f"Episode: qpos, mocap_pos and mocap_quat have the shapes {shapes}; expected "
+                f"{allowed}"
+            )
         check("dt", self.dt, Positive)
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def cut(self, frames: slice) -> "Episode":
-        """Returns the episode with a part of its frames, such as every n-th; `settled` stays that of the whole."""
+        """Returns the episode with a part of its frames, such as every n-th; `settled` stays that
+        of the whole.
+        """
         poses = {name: getattr(self, name)[frames] for name in ("qpos", "mocap_pos", "mocap_quat")}
         marks = jax.tree.map(lambda x: x[frames], self.marks)
         return dataclasses.replace(self, **poses, marks=marks, dt=self.dt * (frames.step or 1))
 
 
 @single
-@check_arguments("sensors", env=AnySingle, policy=PolicyOrAct, key=RandomKey, episodes=Candidates, seconds=ClipLength)
+@check_arguments(
+    "sensors",
+    env=AnySingle,
+    policy=PolicyOrAct,
+    key=RandomKey,
+    episodes=Candidates,
+    seconds=ClipLength,
+)
 def record_episodes(
     env: QuadrupedEnv,
     policy: Policy | Act,
@@ -75,8 +87,8 @@ def record_episodes(
 ) -> list[Episode]:
     """Records one episode in each of several environments, until it ends or for `seconds`.
 
-    `policy` is that of all agents, or a function like its `act` without recurrent state; batched over episodes.
-    `sensors` also records what shows the readings of the task's sensors.
+    `policy` is that of all agents, or a function like its `act` without recurrent state; batched
+    over episodes. `sensors` also records what shows the readings of the task's sensors.
 
     Example:
         ```python
@@ -95,7 +107,11 @@ def record_episodes(
     size = env.mj_model.nq + 7 * env.mj_model.nmocap + (_DRAWN * env.num_agents if sensors else 0)
     numbers = episodes * round(seconds / env.dt) * size
     if 4 * numbers > CLIP_BYTES:
-        fail("episodes", episodes, f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB")
+        fail(
+            "episodes",
+            episodes,
+            f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB",
+        )
     length = 50
     act, memory = make_act(policy, env, episodes)
 
@@ -104,7 +120,11 @@ def record_episodes(
 
     def one_step(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
         state, memory = carry
-        seen = jax.vmap(functools.partial(env.with_observations, groups=groups))(state) if groups else state
+        seen = (
+            jax.vmap(functools.partial(env.with_observations, groups=groups))(state)
+            if groups
+            else state
+        )
         action, memory = act(observations(seen), memory, key)
         state = jax.vmap(env.step)(dataclasses.replace(seen, groups=state.groups), action)
         done = state.terminated | state.truncated
@@ -119,7 +139,9 @@ def record_episodes(
         return jax.vmap(env.reset)(jax.random.split(jax.random.split(key)[0], episodes))
 
     @jax.jit
-    def chunk(carry: tuple[Any, Any], key: jax.Array, index: jax.Array) -> tuple[tuple[Any, Any], Any]:
+    def chunk(
+        carry: tuple[Any, Any], key: jax.Array, index: jax.Array
+    ) -> tuple[tuple[Any, Any], Any]:
         keys = jax.random.split(jax.random.fold_in(jax.random.split(key)[1], index), length)
         return jax.lax.scan(one_step, carry, keys)
 
@@ -159,7 +181,9 @@ def best(episodes: list[Episode]) -> Episode:
 
 @check_arguments(episodes=Annotated[list[Episode], MinLen(1)])
 def typical(episodes: list[Episode]) -> Episode:
-    """Returns the median of the successful episodes, by success, then by average step reward; of all if none is."""
+    """Returns the median of the successful episodes, by success, then by average step reward; of
+    all if none is.
+    """
     successful = [episode for episode in episodes if episode.success > 0] or episodes
     ranked = sorted(successful, key=lambda episode: (episode.success, episode.reward))
     return ranked[len(ranked) // 2]

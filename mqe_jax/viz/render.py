@@ -1,4 +1,6 @@
-"""Frames, clips and images of an episode: by `mujoco.Renderer` (EGL, then OSMesa), or from above by matplotlib."""
+"""Frames, clips and images of an episode: by `mujoco.Renderer` (EGL, then OSMesa), or from above by
+matplotlib.
+"""
 
 import contextlib
 import os
@@ -44,7 +46,9 @@ _probing = threading.Lock()
 
 
 def gl_backend() -> str | None:
-    """Returns the name of a working GL library (`egl` or `osmesa`), or None; found once, in any thread."""
+    """Returns the name of a working GL library (`egl` or `osmesa`), or None; found once, in any
+    thread.
+    """
     with _probing:
         return _working_backend()
 
@@ -53,25 +57,35 @@ def gl_backend() -> str | None:
 def _working_backend() -> str | None:
     """Tries the GL libraries, that of `MUJOCO_GL` first; none if it is `disable` or the like.
 
-    Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's import or crashes.
+    Each candidate is tried in a subprocess, since a missing or broken library fails during MuJoCo's
+    import or crashes.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
     if chosen in ("disable", "disabled", "off", "false", "0"):
         return None
     for name in sorted(("egl", "osmesa"), key=lambda name: name != chosen):
-        environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": name}
+        environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {
+            "MUJOCO_GL": name
+        }
         quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            done = subprocess.run([sys.executable, "-c", _PROBE], env=environment, timeout=60, check=False, **quiet)
+            done = subprocess.run(
+                [sys.executable, "-c", _PROBE], env=environment, timeout=60, check=False, **quiet
+            )
             if done.returncode == 0:
                 if chosen not in ("", name):
-                    print(f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead", file=sys.stderr)
+                    print(
+                        f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead",
+                        file=sys.stderr,
+                    )
                 return name
     return None
 
 
 def _gl_context(backend: str) -> Any:
-    """Returns MuJoCo's class of contexts of a GL library, whatever MUJOCO_GL was at the import of MuJoCo."""
+    """Returns MuJoCo's class of contexts of a GL library, whatever MUJOCO_GL was at the import of
+    MuJoCo.
+    """
     os.environ["MUJOCO_GL"] = backend
     if os.environ.get("PYOPENGL_PLATFORM", backend) != backend:
         del os.environ["PYOPENGL_PLATFORM"]
@@ -79,14 +93,22 @@ def _gl_context(backend: str) -> Any:
 
 
 def _draw_gl(
-    model: mujoco.MjModel, episode: Episode, cameras: Sequence[Camera], size: tuple[int, int], backend: str
+    model: mujoco.MjModel,
+    episode: Episode,
+    cameras: Sequence[Camera],
+    size: tuple[int, int],
+    backend: str,
 ) -> Iterator[np.ndarray]:
-    """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer` with a camera for each."""
+    """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer` with a camera
+    for each.
+    """
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight = size
-    vis.quality.shadowsize = 2048 if size[0] > 640 else 1024  # a fifth of a software renderer's time
+    # a fifth of a software renderer's time
+    vis.quality.shadowsize = 2048 if size[0] > 640 else 1024
     vis.quality.offsamples = 4
-    vis.quality.numslices, vis.quality.numstacks = 18, 8
+    vis.quality.numslices = 18
+    vis.quality.numstacks = 8
     # The ground's texture, if the model has one.
     material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, GROUND_MATERIAL)
     model.geom_matid[model.geom_group == GROUND_GROUP] = material
@@ -96,10 +118,13 @@ def _draw_gl(
     vis.headlight.specular[:] = 0.0
     low, high = extent(model, episode)
     model.stat.extent = float(np.linalg.norm(high - low) / 2)
-    # MuJoCo casts shadows around the light's position, up to `shadowclip` extents: over what the cameras see.
+    # MuJoCo casts shadows around the light's position, up to `shadowclip` extents: over what the
+    # cameras see.
     reach = min(model.stat.extent, 0.75 * max(camera.distance for camera in cameras))
     vis.map.shadowclip = reach / model.stat.extent
-    vis.map.znear, vis.map.zfar = 0.1, 10.0  # extents; a wider range causes z-fighting
+    # extents; a wider range causes z-fighting
+    vis.map.znear = 0.1
+    vis.map.zfar = 10.0
     if model.nlight:
         # Tilted along one axis only: otherwise the software renderer draws stripes on the floor.
         model.light_dir[0] = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
@@ -116,10 +141,14 @@ def _draw_gl(
     with mujoco.Renderer(model, size[1], size[0]) as renderer:
         for index, camera in enumerate(cameras):
             view.lookat[:] = camera.lookat
-            view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
+            view.distance = camera.distance
+            view.azimuth = camera.azimuth
+            view.elevation = camera.elevation
             pose(model, data, episode, index)
             if model.nlight:
-                model.light_pos[0] = np.array(camera.lookat) - 2 * model.stat.extent * model.light_dir[0]
+                model.light_pos[0] = (
+                    np.array(camera.lookat) - 2 * model.stat.extent * model.light_dir[0]
+                )
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, view, option)
             add_marks(renderer.scene, episode.marks, index, size[1], camera.distance)
@@ -140,28 +169,37 @@ def render_frames(
 ) -> Iterator[np.ndarray]:
     """Yields the episode's frames (H, W, 3) uint8; `size` is (width, height) in pixels.
 
-    `views` holds a camera for each frame, by default those of the view `scene`. `backend` is `auto` (from
-    `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
+    `views` holds a camera for each frame, by default those of the view `scene`. `backend` is `auto`
+    (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
     _check_fits(env, episode)
     model = rendering_model(env.mj_model, episode)
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
         return draw_top(model, episode, size)
-    return _draw_gl(model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend)
+    return _draw_gl(
+        model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend
+    )
 
 
 def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
-    """Raises an InputError for an episode without frames, of another task, or with numbers that are not finite."""
-    sizes, found = (env.mj_model.nq, env.mj_model.nmocap), (episode.qpos.shape[1:], episode.mocap_pos.shape[1:2])
+    """Raises an InputError for an episode without frames, of another task, or with numbers that are
+    not finite.
+    """
+    sizes = (env.mj_model.nq, env.mj_model.nmocap)
+    found = (episode.qpos.shape[1:], episode.mocap_pos.shape[1:2])
     if not len(episode) or found != (sizes[:1], sizes[1:]):
         shape = f"{episode.qpos.shape} coordinates, {episode.mocap_pos.shape} of walls"
-        raise InputError(f"episode: {shape}; {env.name} needs (frames, {sizes[0]}) and (frames, {sizes[1]}, 3)")
+        raise InputError(
+            f"episode: {shape}; {env.name} needs (frames, {sizes[0]}) and (frames, {sizes[1]}, 3)"
+        )
     if not all(np.isfinite(x).all() for x in (episode.qpos, episode.mocap_pos, episode.mocap_quat)):
         raise InputError("episode: its coordinates hold NaN or infinite numbers")
 
 
-@check_arguments("episode", "view", "size", "fps", "speed", "at", env=AnySingle, path=PathText, backend=_BACKEND)
+@check_arguments(
+    "episode", "view", "size", "fps", "speed", "at", env=AnySingle, path=PathText, backend=_BACKEND
+)
 def render_episode(
     env: QuadrupedEnv,
     episode: Episode,
@@ -174,12 +212,13 @@ def render_episode(
     at: Time | None = None,
     backend: str | None = "auto",
 ) -> str:
-    """Renders an episode to a file (format by suffix) and returns the renderer used (`egl`, `osmesa`, `matplotlib`).
+    """Renders an episode to a file (format by suffix) and returns the renderer used (`egl`,
+    `osmesa`, `matplotlib`).
 
-    Defaults: .mp4 960 x 540 at 25 frames/s, .gif and .webp 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow`
-    for a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the time of an image, s (default: the
-    middle). A legend names the teams' colours. Without GL, the packages required for 3-D rendering are printed to
-    standard error.
+    Defaults: .mp4 960 x 540 at 25 frames/s, .gif and .webp 480 x 270 at 12.5 frames/s, .png 1280 x
+    720; view `follow` for a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the
+    time of an image, s (default: the middle). A legend names the teams' colours. Without GL, the
+    packages required for 3-D rendering are printed to standard error.
 
     Example:
         ```python
@@ -189,7 +228,8 @@ def render_episode(
         from mqe_jax.viz.render import render_episode
 
         env = mqe_jax.make("go1gate")
-        (episode,) = record_episodes(env, mqe_jax.load_policy("go1gate", env), jax.random.PRNGKey(0), seconds=3)
+        policy = mqe_jax.load_policy("go1gate", env)
+        (episode,) = record_episodes(env, policy, jax.random.PRNGKey(0), seconds=3)
         render_episode(env, episode, Path("gate.png"), at=2.0)
         ```
     """
@@ -200,11 +240,18 @@ def render_episode(
     fps = fps or (25.0 if suffix == ".mp4" else 12.5)
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
-        text = f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}"
+        text = (
+            f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}"
+        )
         print(text, file=sys.stderr)
     aspect = size[0] / size[1]
     if suffix == ".png":
-        views = cameras(rendering_model(env.mj_model, episode), episode, "scene" if view is None else view, aspect)
+        views = cameras(
+            rendering_model(env.mj_model, episode),
+            episode,
+            "scene" if view is None else view,
+            aspect,
+        )
         shown = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
         if backend is not None:
             views = views[shown : shown + 1]
@@ -213,8 +260,21 @@ def render_episode(
         episode = episode.cut(slice(None, None, max(1, round(speed / (fps * episode.dt)))))
         fps = speed / episode.dt
         if suffix != ".mp4" and 3 * len(episode) * size[0] * size[1] > CLIP_BYTES:
-            text = f"{len(episode)} frames of {size[0]} x {size[1]} pixels are too many for {suffix}"
-            raise InputError(f"output: {text}; give a smaller width, fewer frames per second, or .mp4")
-        views = cameras(rendering_model(env.mj_model, episode), episode, "follow" if view is None else view, aspect)
-    write_clip(path, map(legend(env, size, episode.marks), render_frames(env, episode, views, size, backend)), fps)
+            text = (
+                f"{len(episode)} frames of {size[0]} x {size[1]} pixels are too many for {suffix}"
+            )
+            raise InputError(
+                f"output: {text}; give a smaller width, fewer frames per second, or .mp4"
+            )
+        views = cameras(
+            rendering_model(env.mj_model, episode),
+            episode,
+            "follow" if view is None else view,
+            aspect,
+        )
+    write_clip(
+        path,
+        map(legend(env, size, episode.marks), render_frames(env, episode, views, size, backend)),
+        fps,
+    )
     return backend or "matplotlib"

@@ -1,1 +1,3 @@
-"""Training and evaluation of the walk policy: environment, rewards, PPO, scenarios, conversion of weights."""
+"""Training and evaluation of the walk policy: environment, rewards, PPO, scenarios, conversion of
+weights.
+"""

@@ -1,7 +1,8 @@
 """Training and evaluation environment of skills that walk: one robot that tracks commands.
 
-Slopes are rotations of gravity, so each environment has its own without its own geometry. All positions and velocities
-here are in the slope's frame. Randomisation and rewards follow walk-these-ways (arXiv 2212.03238).
+Slopes are rotations of gravity, so each environment has its own without its own geometry. All
+positions and velocities here are in the slope's frame. Randomisation and rewards follow
+walk-these-ways (arXiv 2212.03238).
 """
 
 import dataclasses
@@ -24,7 +25,14 @@ from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import Plane, Track
 from mqe_jax.walk import trainees
 from mqe_jax.walk.rewards import POSITIVE_TERMS, reward_terms
-from mqe_jax.walk.task import RANDOMIZATION, EpisodeSpec, WalkParams, WalkState, WalkTask, sample_spec
+from mqe_jax.walk.task import (
+    RANDOMIZATION,
+    EpisodeSpec,
+    WalkParams,
+    WalkState,
+    WalkTask,
+    sample_spec,
+)
 from mqe_jax.walk_policy import WalkMemory
 
 if TYPE_CHECKING:
@@ -32,7 +40,8 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP
-SHOVED = np.array([0.25, 0.08, 0.06])  # half-lengths of the box in the trunk's frame on which shoves act, m
+# half-lengths of the box in the trunk's frame on which shoves act, m
+SHOVED = np.array([0.25, 0.08, 0.06])
 _UP = np.array([0.0, 0.0, 1.0], np.float32)
 _NOISE = 7919  # folded into a state's key for the noise of its observations
 
@@ -60,7 +69,8 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
     ) -> None:
         self.task = task = task or WalkTask()
         self.trainee = trainees.make(skill, robot)
-        self.name, self.skill = skill, self.trainee.skill  # pyright: ignore[reportAttributeAccessIssue]: of the class
+        self.name = skill  # pyright: ignore[reportAttributeAccessIssue]
+        self.skill = self.trainee.skill
         lagged = dataclasses.replace(RANDOMIZATION, action_lag=task.action_lag)
         params = WalkParams(
             robot=robot.name,
@@ -76,13 +86,17 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
     def with_num_envs(self, num_envs: int) -> "WalkEnv":
         if self.physics.holds(num_envs):
             return self
-        return WalkEnv(self.robot, self.task, skill=self.skill.name, impl=self.impl, num_envs=num_envs)
+        return WalkEnv(
+            self.robot, self.task, skill=self.skill.name, impl=self.impl, num_envs=num_envs
+        )
 
     def scene(self) -> Scene:
         return Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1)
 
     def spawn(self, key: jax.Array) -> jax.Array:
-        """Samples the pose; fixed specs (evaluation) start along +x, so that the slope's direction is the heading's."""
+        """Samples the pose; fixed specs (evaluation) start along +x, so that the slope's direction
+        is the heading's.
+        """
         yaw_key, height_key = jax.random.split(key)
         turn = jnp.pi if self.task.command_period > 0 else 0.0
         yaw = jax.random.uniform(yaw_key, (), minval=-turn, maxval=turn)
@@ -110,7 +124,8 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
 
     def advance(self, state: State[WalkState], action: jax.Array) -> State[WalkState]:
         """Changes slope, force, push and shove, then advances the environment."""
-        task, walk = self.task, state.task
+        task = self.task
+        walk = state.task
         _, direction_key, time_key, size_key, _, _ = jax.random.split(state.key, 6)
         if task.command_period > 0:
             pushed = jax.random.bernoulli(time_key, DT / task.push_period)
@@ -136,28 +151,41 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return super().advance(dataclasses.replace(state, data=data, task=walk), action)
 
     def _shove(self, state: State[WalkState], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Returns force and torque of the shove in this step (6,), and the steps until it ends ()."""
+        """Returns force and torque of the shove in this step (6,), and the steps until it ends
+        ().
+        """
         walk = state.task
         if not self.task.shove:
             return walk.shove, walk.shove_steps
         when_key, angle_key, up_key, size_key, length_key, point_key = jax.random.split(key, 6)
-        begins = (walk.shove_steps == 0) & jax.random.bernoulli(when_key, DT / self.task.shove_period)
+        begins = (walk.shove_steps == 0) & jax.random.bernoulli(
+            when_key, DT / self.task.shove_period
+        )
         angle = jax.random.uniform(angle_key, (), maxval=2 * jnp.pi)
         up = jax.random.uniform(up_key, (), minval=-0.3, maxval=0.3)
         size = walk.spec.shove * jax.random.uniform(size_key, ())
         force = size * jnp.stack([jnp.cos(angle), jnp.sin(angle), up])
         point = jnp.asarray(SHOVED) * jax.random.uniform(point_key, (3,), jnp.float32, -1.0, 1.0)
         arm = rotate(state.data.qpos[self.index.base_qpos[0, 3:]], point)
-        length = jax.random.uniform(length_key, (), minval=self.task.shove_length[0], maxval=self.task.shove_length[1])
+        length = jax.random.uniform(
+            length_key, (), minval=self.task.shove_length[0], maxval=self.task.shove_length[1]
+        )
         current = jnp.where(walk.shove_steps > 0, walk.shove, 0.0)
         shove = jnp.where(begins, jnp.concatenate([force, jnp.cross(arm, force)]), current)
         steps = jnp.where(begins, jnp.round(length / DT).astype(jnp.int32), walk.shove_steps)
         return shove, jnp.maximum(steps - 1, 0)
 
     def external_forces(self, state: State[WalkState]) -> jax.Array:
-        """Returns the slope's change of gravity on all bodies, and force and shove on the trunk (nbody, 6)."""
-        trunk, walk = int(self.index.trunk_body[0]), state.task
-        mass = jnp.asarray(self.compiled.model.body_mass, jnp.float32).at[trunk].add(state.randomized.payload[0])
+        """Returns the slope's change of gravity on all bodies, and force and shove on the trunk
+        (nbody, 6).
+        """
+        trunk = int(self.index.trunk_body[0])
+        walk = state.task
+        mass = (
+            jnp.asarray(self.compiled.model.body_mass, jnp.float32)
+            .at[trunk]
+            .add(state.randomized.payload[0])
+        )
         turn = gravity_w(walk.slope) - jnp.array([0.0, 0.0, -GRAVITY])
         yaw = quaternion_to_euler(state.data.qpos[self.index.base_qpos[0, 3:]])[2]
         along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
@@ -167,25 +195,38 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return forces.at[trunk].add(walk.shove) if self.task.shove else forces
 
     def step_task(self, before: Moment[WalkState], after: Moment[WalkState]) -> WalkState:
-        task, (_, mean_error) = self.task, self._errors(before, after)
+        task = self.task
+        (_, mean_error) = self._errors(before, after)
         if not task.command_period:
             return dataclasses.replace(after.state.task, mean_error=mean_error)
         renewed = after.state.step % round(task.command_period / DT) == 0
-        fresh = sample_spec(jax.random.split(before.state.key, 6)[4], task, self.trainee, after.state.assistance)
-        spec = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, after.state.task.spec)
-        return dataclasses.replace(after.state.task, spec=spec, mean_error=jnp.where(renewed, 0.0, mean_error))
+        fresh = sample_spec(
+            jax.random.split(before.state.key, 6)[4], task, self.trainee, after.state.assistance
+        )
+        spec = jax.tree.map(
+            lambda new, old: jnp.where(renewed, new, old), fresh, after.state.task.spec
+        )
+        return dataclasses.replace(
+            after.state.task, spec=spec, mean_error=jnp.where(renewed, 0.0, mean_error)
+        )
 
-    def _errors(self, before: Moment[WalkState], after: Moment[WalkState]) -> tuple[jax.Array, jax.Array]:
+    def _errors(
+        self, before: Moment[WalkState], after: Moment[WalkState]
+    ) -> tuple[jax.Array, jax.Array]:
         """Returns the velocity error of a step, and the mean error after it (3,)."""
-        (velocity, rate), walk = heading_velocity(after.robots), before.state.task
+        (velocity, rate) = heading_velocity(after.robots)
+        walk = before.state.task
         error = jnp.append(velocity, rate) - walk.spec.commands[:3]
         return error, walk.mean_error + 0.04 * (error - walk.mean_error)
 
     def score(
         self, before: Moment[WalkState], after: Moment[WalkState], collision: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Returns (sum of positive terms) x exp(sum of negative ones), times the step, and what is logged."""
-        walk, random = before.state.task, after.state.randomized
+        """Returns (sum of positive terms) x exp(sum of negative ones), times the step, and what is
+        logged.
+        """
+        walk = before.state.task
+        random = after.state.randomized
         error, mean_error = self._errors(before, after)
         targets = self.robot.joint_targets(walk.actions)
         terms = reward_terms(
@@ -212,20 +253,26 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         tilted = rotate_inverse(robot_state.quaternion, jnp.asarray(_UP))[:, 2] < 0.5
         return tilted | (robot_state.position_w[:, 2] < self.robot.walk.min_trunk_height)
 
-    def outcome(self, state: State, robot_state: RobotState, failed: jax.Array) -> dict[str, jax.Array]:
+    def outcome(
+        self, state: State, robot_state: RobotState, failed: jax.Array
+    ) -> dict[str, jax.Array]:
         """Success: the robot has not fallen."""
         return {"success": 1.0 - jnp.asarray(failed, jnp.float32)}
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout((Block("skill", self.trainee.observation_size, "the skill's own, of one step"),))
+        return ObservationLayout(
+            (Block("skill", self.trainee.observation_size, "the skill's own, of one step"),)
+        )
 
     def observe(self, state: State[WalkState], robot_state: RobotState) -> dict[str, jax.Array]:
         sensed = self._sense(state, robot_state)
         if self.task.randomize:
             keys = jax.random.split(jax.random.fold_in(state.key, _NOISE), 3)
             parts = zip(sensed, (0.02, 0.005, 0.5), keys, strict=True)
-            sensed = Proprioception(*(x + size * jax.random.normal(key, x.shape) for x, size, key in parts))
+            sensed = Proprioception(
+                *(x + size * jax.random.normal(key, x.shape) for x, size, key in parts)
+            )
         return {"skill": self._skill_observation(state.task, sensed)[None]}
 
     def _sense(self, state: State[WalkState], robot_state: RobotState) -> Proprioception:
@@ -233,7 +280,12 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return Proprioception(gravity, robot_state.joint_position[0], robot_state.joint_velocity[0])
 
     def _skill_observation(self, walk: WalkState, sensed: Proprioception) -> jax.Array:
-        memory = WalkMemory(jnp.zeros((0, walk_policy.OBSERVATION_SIZE)), walk.actions[0], walk.actions[1], walk.gait)
+        memory = WalkMemory(
+            jnp.zeros((0, walk_policy.OBSERVATION_SIZE)),
+            walk.actions[0],
+            walk.actions[1],
+            walk.gait,
+        )
         return self.trainee.observe(memory, walk.spec.commands, sensed)
 
     @property
@@ -249,12 +301,24 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return jnp.concatenate(list(self._privileged(state, robot_state).values()))
 
     def _privileged(self, state: State[WalkState], robot_state: RobotState) -> dict[str, jax.Array]:
-        """Returns the scaled blocks of the critic's observation; the last two are `LATENT_TARGET`."""
-        walk, random, task = state.task, state.randomized, self.task
-        quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2:]
-        feet = rotate(jnp.broadcast_to(quaternion, (4, 4)), foot_positions(self.robot, robot_state.joint_position[0]))
+        """Returns the scaled blocks of the critic's observation; the last two are
+        `LATENT_TARGET`.
+        """
+        walk = state.task
+        random = state.randomized
+        task = self.task
+        quaternion = robot_state.quaternion[0]
+        height = robot_state.position_w[0, 2:]
+        feet = rotate(
+            jnp.broadcast_to(quaternion, (4, 4)),
+            foot_positions(self.robot, robot_state.joint_position[0]),
+        )
         phases = self.trainee.foot_phases(walk.gait, walk.spec.commands)
-        shove = {"shove": walk.shove * jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])} if task.shove else {}
+        shove = (
+            {"shove": walk.shove * jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])}
+            if task.shove
+            else {}
+        )
         lag = {"action_lag": random.action_lag[None].astype(jnp.float32)} if task.action_lag else {}
         return {
             "skill": self._skill_observation(walk, self._sense(state, robot_state)),
@@ -283,9 +347,12 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
 
     def power(self, state: State[WalkState]) -> jax.Array:
         """Returns the mechanical power of the joints (), W, each joint's as a magnitude."""
-        robot, robot_state = self.robot, self.read(state.data)
+        robot = self.robot
+        robot_state = self.read(state.data)
         velocity = robot_state.joint_velocity[0]
-        torque = robot.kp * (robot.joint_targets(state.task.actions[0]) - robot_state.joint_position[0])
+        torque = robot.kp * (
+            robot.joint_targets(state.task.actions[0]) - robot_state.joint_position[0]
+        )
         torque = jnp.clip(torque - robot.kd * velocity, -robot.torque_limit, robot.torque_limit)
         return jnp.sum(jnp.abs(torque * velocity))
 
@@ -295,13 +362,17 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
 
 
 def gravity_w(slope: jax.Array) -> jax.Array:
-    """Returns gravity (3,), m/s^2, in the frame of ground inclined by `slope` (2,), rad, along x and y."""
+    """Returns gravity (3,), m/s^2, in the frame of ground inclined by `slope` (2,), rad, along x
+    and y.
+    """
     angle = jnp.linalg.norm(slope + 1e-12)
     along = slope / jnp.maximum(angle, 1e-9)
     return GRAVITY * jnp.concatenate([-jnp.sin(angle) * along, -jnp.cos(angle)[None]])
 
 
 def heading_velocity(robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
-    """Returns the first robot's velocity along its heading and to its left (2,), m/s, and yaw rate (), rad/s."""
+    """Returns the first robot's velocity along its heading and to its left (2,), m/s, and yaw rate
+    (), rad/s.
+    """
     velocity = rotate_inverse(robot_state.quaternion[0], robot_state.linear_velocity_w[0])
     return velocity[:2], robot_state.angular_velocity_b[0, 2]

@@ -1,4 +1,6 @@
-"""Evaluation of a skill: tracking, falls, pushes, shoves, slopes, forces, standing, gait frequency."""
+"""Evaluation of a skill: tracking, falls, pushes, shoves, slopes, forces, standing, gait
+frequency.
+"""
 
 import dataclasses
 import functools
@@ -34,12 +36,14 @@ class Scenario:
 
     duration: float = 20.0  # duration of an episode, s
     velocity: tuple[float, float, float] | None = None
-    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from `Trainee.evaluation_range`."""
+    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from
+    `Trainee.evaluation_range`."""
     period: float = 0.0  # interval at which commands are sampled anew, s; 0 keeps them
     gait: str = "trot"  # name of the gait
     frequency: float = 3.0  # commanded gait frequency, Hz
     slope: float = 0.0  # inclination of the ground along x, rad
-    force: tuple[float, float] = (0.0, 0.0)  # sustained force along and to the left of the heading, N
+    # sustained force along and to the left of the heading, N
+    force: tuple[float, float] = (0.0, 0.0)
     push: float = 0.0  # instantaneous change of velocity every 5 s, m/s
     shove: float = 0.0  # maximum force of shoves, N, of 0.2 to 1 s every 5 s on average
     skills: tuple[str, ...] = ("walk", "agile")  # skills that it fits
@@ -68,12 +72,18 @@ SCENARIOS = {
 
 
 def make_env(skill: str, robot: Robot, impl: str, episodes: int) -> WalkEnv:
-    """Returns the evaluation environment: no randomisation; commands and disturbances are those of a scenario."""
-    task = WalkTask(randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6, shove=1.0)
+    """Returns the evaluation environment: no randomisation; commands and disturbances are those of
+    a scenario.
+    """
+    task = WalkTask(
+        randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6, shove=1.0
+    )
     return WalkEnv(robot, task, skill=skill, impl=impl, num_envs=episodes)
 
 
-def sample_velocities(trainee: trainees.Trainee, scenario: Scenario, key: jax.Array, episodes: int) -> jax.Array:
+def sample_velocities(
+    trainee: trainees.Trainee, scenario: Scenario, key: jax.Array, episodes: int
+) -> jax.Array:
     """Samples commanded velocities (episodes, 3); those beyond the skill's `turn` again."""
     if scenario.velocity is not None:
         return jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
@@ -88,17 +98,28 @@ def sample_velocities(trainee: trainees.Trainee, scenario: Scenario, key: jax.Ar
     return velocity
 
 
-def sample_specs(env: WalkEnv, scenario: Scenario, key: jax.Array, episodes: int) -> tuple[EpisodeSpec, jax.Array]:
-    """Samples the specs of all episodes, leading axis N, and the commands after each change (K, N, 15)."""
+def sample_specs(
+    env: WalkEnv, scenario: Scenario, key: jax.Array, episodes: int
+) -> tuple[EpisodeSpec, jax.Array]:
+    """Samples the specs of all episodes, leading axis N, and the commands after each change (K, N,
+    15).
+    """
     count = math.ceil(scenario.duration / scenario.period) if scenario.period else 1
     keys = [key, *jax.random.split(key, count)[1:]]
-    velocities = jnp.stack([sample_velocities(env.trainee, scenario, each, episodes) for each in keys])
+    velocities = jnp.stack(
+        [sample_velocities(env.trainee, scenario, each, episodes) for each in keys]
+    )
     if isinstance(env.trainee, trainees.Agile):
         commands = jax.vmap(jax.vmap(env.trainee.commands))(velocities)
     else:
         rest = env.skill.default_commands(scenario.gait, gait_frequency=scenario.frequency)[3:]
-        commands = jnp.concatenate([velocities, jnp.broadcast_to(rest, (count, episodes, len(rest)))], axis=-1)
-    full = lambda values: jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))  # noqa: E731
+        commands = jnp.concatenate(
+            [velocities, jnp.broadcast_to(rest, (count, episodes, len(rest)))], axis=-1
+        )
+
+    def full(values):
+        return jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))
+
     spec = EpisodeSpec(
         commands=commands[0],
         slope=full((scenario.slope, 0.0)),
@@ -110,7 +131,9 @@ def sample_specs(env: WalkEnv, scenario: Scenario, key: jax.Array, episodes: int
 
 
 @single
-def measure(env: WalkEnv, params: Params, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, float]:
+def measure(
+    env: WalkEnv, params: Params, scenario: Scenario, episodes: int, seed: int = 0
+) -> dict[str, float]:
     """Runs one scenario and returns its metrics.
 
     Returns:
@@ -119,14 +142,15 @@ def measure(env: WalkEnv, params: Params, scenario: Scenario, episodes: int, see
         | name | meaning |
         |---|---|
         | rms_vx, rms_vy (m/s), rms_yaw (rad/s) | root mean square errors |
-        | cycle_vx, cycle_vy, cycle_yaw | root mean square of errors averaged over the gait cycle that follows |
+        | cycle_vx, cycle_vy, cycle_yaw | root mean square errors of means over gait cycles |
         | bias_vx, bias_vy, bias_yaw | mean errors |
         | fall_rate | fraction of episodes with a fall |
         | drift | mean distance covered in the 10 s after the first, m |
-        | step_frequency | median over episodes and feet of the strongest frequency of the foot's height, Hz |
-        | cost_of_transport | mean mechanical power of the joints over weight x mean horizontal speed |
+        | step_frequency | median of the strongest frequency of a foot's height, Hz |
+        | cost_of_transport | mean mechanical power / (weight x mean horizontal speed) |
     """
-    steps, warm = round(scenario.duration / walk_policy.STEP), round(WARM_UP / walk_policy.STEP)
+    steps = round(scenario.duration / walk_policy.STEP)
+    warm = round(WARM_UP / walk_policy.STEP)
     change = round((scenario.period or scenario.duration) / walk_policy.STEP)
     reset_key, spec_key = jax.random.split(jax.random.PRNGKey(seed))
     specs, commands = sample_specs(env, scenario, spec_key, episodes)
@@ -136,20 +160,30 @@ def measure(env: WalkEnv, params: Params, scenario: Scenario, episodes: int, see
     alive = ~np.logical_or.accumulate(fallen, axis=0)
     counted = alive.copy()
     counted[np.arange(steps) % change < warm] = False
-    mean = lambda x: float((x * counted).sum(dtype=float) / max(counted.sum(), 1))  # noqa: E731
+
+    def mean(x):
+        return float((x * counted).sum(dtype=float) / max(counted.sum(), 1))
+
     axes = dict(zip(("vx", "vy", "yaw"), np.moveaxis(errors, -1, 0), strict=True))
     upright = alive[-1]
     figures = {
         **{f"rms_{name}": mean(np.square(error)) ** 0.5 for name, error in axes.items()},
         **{f"bias_{name}": mean(error) for name, error in axes.items()},
-        **{f"cycle_{name}": value for name, value in _cycles(errors, alive, np.asarray(commands), change).items()},
+        **{
+            f"cycle_{name}": value
+            for name, value in _cycles(errors, alive, np.asarray(commands), change).items()
+        },
         "fall_rate": float(1.0 - upright.mean()),
     }
-    pace = np.linalg.norm(np.diff(position, axis=0, prepend=position[:1]), axis=-1) / walk_policy.STEP
+    pace = (
+        np.linalg.norm(np.diff(position, axis=0, prepend=position[:1]), axis=-1) / walk_policy.STEP
+    )
     if mean(pace) > 0.05:
         figures["cost_of_transport"] = mean(power) / (env.weight * mean(pace))
     if upright.any():
-        travelled = np.linalg.norm(position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1)[upright]
+        travelled = np.linalg.norm(
+            position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1
+        )[upright]
         figures["drift"] = float(travelled.mean())
         if isinstance(env.trainee, trainees.Walk):
             figures["step_frequency"] = _frequency(height[warm:][:, upright])
@@ -158,41 +192,60 @@ def measure(env: WalkEnv, params: Params, scenario: Scenario, episodes: int, see
 
 @functools.partial(jax.jit, static_argnums=0)
 def _run(
-    env: WalkEnv, params: Params, keys: jax.Array, specs: EpisodeSpec, commands: jax.Array, numbers: jax.Array
+    env: WalkEnv,
+    params: Params,
+    keys: jax.Array,
+    specs: EpisodeSpec,
+    commands: jax.Array,
+    numbers: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    """Returns what `measure` needs of each step; `numbers` are those of the commands in each step."""
+    """Returns what `measure` needs of each step; `numbers` are those of the commands in each
+    step.
+    """
     width = len(env.skill.commands)
 
     def one(state: Any, memory: Any, commands: jax.Array) -> Any:
         spec = dataclasses.replace(state.task.spec, commands=commands)
         state = dataclasses.replace(state, task=dataclasses.replace(state.task, spec=spec))
         robot_state = env.read(state.data)
-        sensed = Proprioception(state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0])
+        sensed = Proprioception(
+            state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0]
+        )
         _, memory = env.skill.targets(params, memory, commands[:width], sensed)
         state = env.with_observations(env.advance(state, memory.action[None]))
         robot_state = env.read(state.data)
         quaternion = robot_state.quaternion[0]
         feet = foot_positions(env.robot, robot_state.joint_position[0])
-        height = rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
+        height = (
+            rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
+        )
         velocity, yaw_rate = heading_velocity(robot_state)
         errors = jnp.append(velocity[:2], yaw_rate) - commands[:3]
-        return state, memory, (errors, robot_state.position_w[0, :2], height, state.terminated, env.power(state))
+        return (
+            state,
+            memory,
+            (errors, robot_state.position_w[0, :2], height, state.terminated, env.power(state)),
+        )
 
     def advance(carry: Any, number: jax.Array) -> Any:
         state, memory = carry
         state, memory, record = jax.vmap(one)(state, memory, commands[number])
         return (state, memory), record
 
-    state = jax.vmap(lambda key, spec: env.with_observations(env.with_spec(env.begin(key), spec)))(keys, specs)
+    state = jax.vmap(lambda key, spec: env.with_observations(env.with_spec(env.begin(key), spec)))(
+        keys, specs
+    )
     memory = jax.vmap(lambda _: env.skill.init_memory())(keys)
     return jax.lax.scan(advance, (state, memory), numbers)[1]
 
 
-def _cycles(errors: np.ndarray, alive: np.ndarray, commands: np.ndarray, change: int) -> dict[str, float]:
+def _cycles(
+    errors: np.ndarray, alive: np.ndarray, commands: np.ndarray, change: int
+) -> dict[str, float]:
     """Returns the root mean squares of the errors (T, N, 3) averaged over a gait cycle.
 
-    Cycles begin at least `WARM_UP` after a change of the commands (K, N, 15), which is every `change` steps, and end
-    before the next one and before a fall.
+    Cycles begin at least `WARM_UP` after a change of the commands (K, N, 15), which is every
+    `change` steps, and end before the next one and before a fall.
     """
     steps, episodes, _ = errors.shape
     sums = np.concatenate([np.zeros((1, episodes, 3)), np.cumsum(errors, axis=0, dtype=float)])
@@ -220,7 +273,9 @@ def _frequency(height: np.ndarray) -> float:
     return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
 
 
-@check_arguments("skill", "robot", "impl", "scenarios", weights=PathText | None, episodes=Environments, seed=Seed)
+@check_arguments(
+    "skill", "robot", "impl", "scenarios", weights=PathText | None, episodes=Environments, seed=Seed
+)
 def evaluate_skill(
     skill: str,
     weights: str | Path | None = None,
@@ -250,7 +305,8 @@ def evaluate_skill(
         report: receives the name and the metrics of each scenario.
 
     Returns:
-        rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, and all metrics of each scenario under `scenarios`.
+        rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, and all metrics of each scenario under
+        `scenarios`.
     """
     body = robots.get(robot)
     params = trainees.make(skill, body).skill.load_params(weights)

@@ -1,15 +1,17 @@
-"""The walking skills as networks of the trainer: a history of observations, and a critic of the privileged one.
+"""The walking skills as networks of the trainer: a history of observations, and a critic of the
+privileged one.
 
-The memory is the newest rows of the history but the last one. The trainer stores it at the first step of each chunk
-only, and `evaluate` builds the histories of the chunk's steps.
+The memory is the newest rows of the history but the last one. The trainer stores it at the first
+step of each chunk only, and `evaluate` builds the histories of the chunk's steps.
 
-The walk policy's history is 30 observations; its body receives the adaptation network's output without gradient, and
-that network is trained by regression on `LATENT_TARGET`. The agile skill's is 9 frames, of which its network sees five,
-beside the newest commands and clock.
+The walk policy's history is 30 observations; its body receives the adaptation network's output
+without gradient, and that network is trained by regression on `LATENT_TARGET`. The agile skill's is
+9 frames, of which its network sees five, beside the newest commands and clock.
 
-The left-right symmetry of a quadruped is a loss: a mirrored observation deserves the mirrored action. Mirroring
-exchanges left and right legs and reverses y, roll, yaw and the hip joints. The parameters of the four gaits stay:
-exchanging a gait's left and right feet shifts its phase, which the clock shows.
+The left-right symmetry of a quadruped is a loss: a mirrored observation deserves the mirrored
+action. Mirroring exchanges left and right legs and reverses y, roll, yaw and the hip joints. The
+parameters of the four gaits stay: exchanging a gait's left and right feet shifts its phase, which
+the clock shows.
 
 Source: walk-these-ways, Margolis and Agrawal, arXiv 2212.03238.
 """
@@ -38,7 +40,8 @@ from mqe_jax.walk.task import LATENT_TARGET
 from mqe_jax.walk_policy import HISTORY, OBSERVATION_SIZE
 
 _CRITIC = (512, 256, 128)
-_PRECISION = "tensorfloat32"  # full float32 products over 2100 numbers would take most of an update on a GPU
+# full float32 products over 2100 numbers would take most of an update on a GPU
+_PRECISION = "tensorfloat32"
 
 Reflect = tuple[np.ndarray, np.ndarray]
 """Source and sign of each number of a mirrored vector."""
@@ -47,7 +50,9 @@ Reflect = tuple[np.ndarray, np.ndarray]
 def _mirror(*blocks: Reflect) -> Reflect:
     """Joins the mirrors of consecutive blocks."""
     starts = np.cumsum([0, *(len(source) for source, _ in blocks)])
-    source = np.concatenate([source + start for (source, _), start in zip(blocks, starts[:-1], strict=True)])
+    source = np.concatenate(
+        [source + start for (source, _), start in zip(blocks, starts[:-1], strict=True)]
+    )
     return source, np.concatenate([sign for _, sign in blocks])
 
 
@@ -55,7 +60,8 @@ def _signs(*signs: float) -> Reflect:
     return np.arange(len(signs)), np.array(signs, np.float32)
 
 
-_GRAVITY, _JOINTS = _signs(1.0, -1.0, 1.0), (MIRRORED_JOINTS, MIRRORED_SIGNS)
+_GRAVITY = _signs(1.0, -1.0, 1.0)
+_JOINTS = (MIRRORED_JOINTS, MIRRORED_SIGNS)
 _FEET = np.array([1, 0, 3, 2]), np.ones(4, np.float32)
 _COMMANDS = _signs(*(command.mirror for command in walk_policy.COMMANDS))
 
@@ -65,10 +71,13 @@ class Form:
     """What is specific to the network of a skill."""
 
     networks: Networks  # its networks and their files
-    rows: np.ndarray  # rows of the history that it sees, from the oldest on; the last one is the newest
-    row_size: int  # numbers of an observation that a row has; the others are only of the newest observation
+    # rows of the history that it sees, from the oldest on; the last one is the newest
+    rows: np.ndarray
+    # numbers of an observation that a row has; the others are only of the newest observation
+    row_size: int
     infer: Callable[..., tuple[jax.Array, Any]]
-    """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an adaptation network."""
+    """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an
+    adaptation network."""
     mirror: Reflect  # of an input
 
     @property
@@ -77,16 +86,24 @@ class Form:
         return int(self.rows[-1])
 
     def inputs(self, history: jax.Array, obs: jax.Array) -> jax.Array:
-        """Returns inputs (..., n) of rows (..., H, row_size) that the network sees and observations (..., O)."""
+        """Returns inputs (..., n) of rows (..., H, row_size) that the network sees and observations
+        (..., O).
+        """
         flat = history.reshape(*history.shape[:-2], -1)
-        return flat if self.row_size == obs.shape[-1] else jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
+        return (
+            flat
+            if self.row_size == obs.shape[-1]
+            else jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
+        )
 
     def reflect(self, inputs: jax.Array) -> jax.Array:
         """Mirrors inputs (..., n)."""
         return inputs[..., self.mirror[0]] * self.mirror[1]
 
     def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
-        """Returns the mean square difference () of actions of mirrored inputs (B, n) from mirrored actions (B, 12)."""
+        """Returns the mean square difference () of actions of mirrored inputs (B, n) from mirrored
+        actions (B, 12).
+        """
         other, _ = self.infer(params, self.reflect(inputs), precision=_PRECISION)
         return jnp.mean(jnp.square(other - mean[..., MIRRORED_JOINTS] * MIRRORED_SIGNS))
 
@@ -130,7 +147,11 @@ class HistorySettings(GaussianSettings):
         inputs = next(iter(form.networks.widths.values()))[0]
         expected = inputs - (len(form.rows) - 1) * form.row_size
         if (dims.agents, dims.observation, dims.action) != (1, expected, NUM_JOINTS):
-            fail("network.name", self.name, "another network, except in the walking environment of that skill")
+            fail(
+                "network.name",
+                self.name,
+                "another network, except in the walking environment of that skill",
+            )
         return _build(self, form, dims)
 
 
@@ -151,9 +172,11 @@ class AgileNetwork(HistorySettings):
 
 
 def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.ndarray) -> jax.Array:
-    """Returns H rows of the histories of a chunk's steps (L, C, H, O); rows before an episode's start are zero.
+    """Returns H rows of the histories of a chunk's steps (L, C, H, O); rows before an episode's
+    start are zero.
 
-    `memory` are the rows before the chunk (C, T, O), `obs` its rows (L, C, O), `kept` the rows to return, of T + 1.
+    `memory` are the rows before the chunk (C, T, O), `obs` its rows (L, C, O), `kept` the rows to
+    return, of T + 1.
     """
     steps, count = is_first.shape
     before = jnp.moveaxis(memory, 1, 0)
@@ -190,11 +213,24 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         inputs = form.inputs(history[..., form.rows, :], obs[..., 0, :])
         mean, _ = form.infer(params["policy"], inputs, precision=_PRECISION)
         log_std = settings.bounded_log_std(params["log_std"])
-        action = mean if key is None else mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
-        return action[..., None, :], log_prob(action, mean, log_std)[..., None, :], history[..., 1:, :]
+        action = (
+            mean
+            if key is None
+            else mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
+        )
+        return (
+            action[..., None, :],
+            log_prob(action, mean, log_std)[..., None, :],
+            history[..., 1:, :],
+        )
 
     def value(
-        params: Params, memory: Memory, is_first: jax.Array, obs: jax.Array, privileged: jax.Array, active: Mask = None
+        params: Params,
+        memory: Memory,
+        is_first: jax.Array,
+        obs: jax.Array,
+        privileged: jax.Array,
+        active: Mask = None,
     ) -> tuple[jax.Array, Memory]:
         return nn.mlp(params["critic"], privileged, jax.nn.elu, precision=_PRECISION), memory
 
@@ -208,7 +244,9 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         active: Mask = None,
     ) -> ChunkResult:
         obs = obs[..., 0, :]
-        inputs = form.inputs(windows(memory.actor, is_first, obs[..., : form.row_size], form.rows), obs)
+        inputs = form.inputs(
+            windows(memory.actor, is_first, obs[..., : form.row_size], form.rows), obs
+        )
         mean, latent = form.infer(params["policy"], inputs, precision=_PRECISION)
         log_std = jnp.broadcast_to(settings.bounded_log_std(params["log_std"]), mean.shape)
         losses = {}
@@ -216,7 +254,9 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
             error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
             losses["adaptation"] = settings.adaptation_coef * error
         if settings.symmetry_coef > 0:
-            losses["symmetry"] = settings.symmetry_coef * form.symmetry_loss(params["policy"], inputs, mean)
+            losses["symmetry"] = settings.symmetry_coef * form.symmetry_loss(
+                params["policy"], inputs, mean
+            )
         return ChunkResult(
             log_prob(action, mean[..., None, :], log_std[..., None, :]),
             entropy(log_std)[..., None],

@@ -1,4 +1,6 @@
-"""Reward terms of skills that walk, after walk-these-ways (Margolis and Agrawal, arXiv 2212.03238)."""
+"""Reward terms of skills that walk, after walk-these-ways (Margolis and Agrawal, arXiv
+2212.03238).
+"""
 
 import functools
 
@@ -8,15 +10,22 @@ import jax.numpy as jnp
 from mqe_jax.core.settings import settings_class
 from mqe_jax.physics.robots.index import RobotState, foot_positions, knee_positions
 from mqe_jax.physics.robots.robot import Robot
-from mqe_jax.physics.rotation import euler_to_quaternion, quaternion_to_euler, rotate, rotate_inverse
+from mqe_jax.physics.rotation import (
+    euler_to_quaternion,
+    quaternion_to_euler,
+    rotate,
+    rotate_inverse,
+)
 
 
 @settings_class
 class WalkRewards:
-    """Weights of the reward terms; the first four are positive terms, the others go into the exponent.
+    """Weights of the reward terms; the first four are positive terms, the others go into the
+    exponent.
 
-    `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground the knee touches first, so contact
-    is inferred from the knee's height (`WalkSettings.min_knee_height`) without sensors.
+    `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground the knee
+    touches first, so contact is inferred from the knee's height (`WalkSettings.min_knee_height`)
+    without sensors.
     """
 
     track_velocity: float = 0.6
@@ -45,13 +54,20 @@ _BLUR = 0.07  # of a gait period: standard deviation of the smoothing of desired
 
 
 def desired_contact(phases: jax.Array) -> jax.Array:
-    """Returns the desired contact of each foot in [0, 1] from its phase (4,), smoothed at lift-off and touch-down."""
-    cdf = lambda x: jax.scipy.stats.norm.cdf(x, scale=_BLUR)  # noqa: E731
+    """Returns the desired contact of each foot in [0, 1] from its phase (4,), smoothed at lift-off
+    and touch-down.
+    """
+
+    def cdf(x):
+        return jax.scipy.stats.norm.cdf(x, scale=_BLUR)
+
     return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
 
 
 def _closeness(error: jax.Array, half: float) -> jax.Array:
-    """Returns 1 at no error and 1/2 at an error (D,) of length `half`: steep near 0, with a gradient far from it."""
+    """Returns 1 at no error and 1/2 at an error (D,) of length `half`: steep near 0, with a
+    gradient far from it.
+    """
     return 1.0 / (1.0 + jnp.sum(jnp.square(error / half)))
 
 
@@ -71,12 +87,15 @@ def reward_terms(
 ) -> dict[str, jax.Array]:
     """Computes all terms (), named as their weights in `WalkRewards`.
 
-    `phases` are those of the feet (4,). `targets` are the joint targets of the last three steps, newest first (3, 12),
-    and `applied` the one that the motors had. `tolerance` is that of `WalkTask`. The others are as in `WalkState`.
+    `phases` are those of the feet (4,). `targets` are the joint targets of the last three steps,
+    newest first (3, 12), and `applied` the one that the motors had. `tolerance` is that of
+    `WalkTask`. The others are as in `WalkState`.
     """
     target, previous_target, earlier_target = targets
-    quaternion, height = robot_state.quaternion[0], robot_state.position_w[0, 2]
-    joint_position, joint_velocity = robot_state.joint_position[0], robot_state.joint_velocity[0]
+    quaternion = robot_state.quaternion[0]
+    height = robot_state.position_w[0, 2]
+    joint_position = robot_state.joint_position[0]
+    joint_velocity = robot_state.joint_velocity[0]
     contact = desired_contact(phases)
     velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
     rate = robot_state.angular_velocity_b[0]
@@ -85,17 +104,24 @@ def reward_terms(
     feet, feet_velocity = jax.jvp(locate_feet, (joint_position,), (joint_velocity,))
     feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
     turn = jnp.broadcast_to(quaternion, (4, 4))
-    feet_w, feet_velocity = rotate(turn, feet), rotate(turn, feet_velocity)
+    feet_w = rotate(turn, feet)
+    feet_velocity = rotate(turn, feet_velocity)
     foot_height = feet_w[:, 2] + height
     yaw = quaternion_to_euler(quaternion)[2]
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    feet_heading = jnp.stack([cos * feet_w[:, 0] + sin * feet_w[:, 1], -sin * feet_w[:, 0] + cos * feet_w[:, 1]], -1)
+    cos = jnp.cos(yaw)
+    sin = jnp.sin(yaw)
+    feet_heading = jnp.stack(
+        [cos * feet_w[:, 0] + sin * feet_w[:, 1], -sin * feet_w[:, 0] + cos * feet_w[:, 1]], -1
+    )
 
     # Raibert heuristic: stance corners, shifted by half of the distance travelled during stance.
-    along, across = jnp.array([0.5, 0.5, -0.5, -0.5]), jnp.array([0.5, -0.5, 0.5, -0.5])
+    along = jnp.array([0.5, 0.5, -0.5, -0.5])
+    across = jnp.array([0.5, -0.5, 0.5, -0.5])
     stance = jnp.stack([along * commands[13], across * commands[12]], -1)
     shift = jnp.abs(1.0 - 2.0 * phases) - 0.5
-    speed = jnp.stack([commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1)
+    speed = jnp.stack(
+        [commands[0] - commands[2] * stance[:, 1], commands[1] + commands[2] * stance[:, 0]], -1
+    )
     place = stance + shift[:, None] * speed * 0.5 / commands[4]
     swing = 1.0 - jnp.abs(1.0 - 2.0 * jnp.clip(2.0 * phases - 1.0, 0.0, 1.0))
     wanted_height = commands[9] * swing + robot.foot_radius
@@ -122,13 +148,17 @@ def reward_terms(
         "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
         "raibert": jnp.sum(jnp.square(feet_heading - place)),
         "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
-        "foot_slip": jnp.sum(jnp.where(on_ground, jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1), 0.0)),
+        "foot_slip": jnp.sum(
+            jnp.where(on_ground, jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1), 0.0)
+        ),
         "smoothness": jnp.sum(jnp.square(target - previous_target)),
         "second_smoothness": jnp.sum(jnp.square(target - 2 * previous_target + earlier_target)),
         "torque": jnp.sum(jnp.square(torque)),
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
-        "limb_contact": jnp.sum(jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0).astype(jnp.float32),
+        "limb_contact": jnp.sum(jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0).astype(
+            jnp.float32
+        ),
         "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
         "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
     }

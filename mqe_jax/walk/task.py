@@ -7,7 +7,17 @@ import jax
 import jax.numpy as jnp
 from annotated_types import Ge, Le
 
-from mqe_jax.core.limits import Buffer, Distance, Few, Fraction, Iterations, NonNegative, Positive, Time, TimeLimit
+from mqe_jax.core.limits import (
+    Buffer,
+    Distance,
+    Few,
+    Fraction,
+    Iterations,
+    NonNegative,
+    Positive,
+    Time,
+    TimeLimit,
+)
 from mqe_jax.core.settings import Range, settings_class
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.randomization import Randomization
@@ -68,17 +78,22 @@ class EpisodeSpec:
     """Commands and disturbances sampled for one episode."""
 
     commands: jax.Array
-    """Commands of the walk policy (15,); those after the velocity describe the gait that the rewards ask for."""
+    """Commands of the walk policy (15,); those after the velocity describe the gait that the
+    rewards ask for."""
     slope: jax.Array
-    """Inclination of the ground along x and y (2,), rad; positive in x where the ground rises towards +x."""
-    force: jax.Array  # sustained force on the trunk (2,), N, along its heading and to its left, horizontal
+    """Inclination of the ground along x and y (2,), rad; positive in x where the ground rises
+    towards +x."""
+    # sustained force on the trunk (2,), N, along its heading and to its left, horizontal
+    force: jax.Array
     push: jax.Array  # instantaneous change of the trunk's velocity at each push (), m/s
     shove: jax.Array  # maximum force of a shove (), N
 
 
 @settings_class
 class WalkParams(TaskParams):
-    """Parameters of the walking environment: a `WalkTask`, and what the environment core needs to know of it."""
+    """Parameters of the walking environment: a `WalkTask`, and what the environment core needs to
+    know of it.
+    """
 
     num_agents: Few = 1
     spawn_noise: Distance = 0.0
@@ -104,21 +119,32 @@ class WalkState:
     spec: EpisodeSpec  # commands and disturbances
     slope: jax.Array  # current slope, rate-limited towards the spec's (2,), rad
     force: jax.Array  # current force, rate-limited towards the spec's (2,), N
-    shove: jax.Array  # force (3,), N, and torque (3,), N m, of the current shove on the trunk, world frame (6,)
+    # force (3,), N, and torque (3,), N m, of the current shove on the trunk, world frame (6,)
+    shove: jax.Array
     shove_steps: jax.Array  # steps until the current shove ends () int32
     actions: jax.Array  # the last three actions, newest first (3, 12)
     gait: jax.Array  # phase of the gait cycle () in [0, 1)
-    mean_error: jax.Array  # exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s
+    # exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s
+    mean_error: jax.Array
 
 
-def sample_spec(key: jax.Array, task: WalkTask, trainee: Trainee, assistance: jax.Array | float) -> EpisodeSpec:
+def sample_spec(
+    key: jax.Array, task: WalkTask, trainee: Trainee, assistance: jax.Array | float
+) -> EpisodeSpec:
     """Samples commands and disturbances."""
     keys = iter(jax.random.split(key, 24))
-    uniform = lambda low, high: jax.random.uniform(next(keys), (), minval=low, maxval=high)  # noqa: E731
-    chance = lambda p: jax.random.bernoulli(next(keys), p)  # noqa: E731
+
+    def uniform(low, high):
+        return jax.random.uniform(next(keys), (), minval=low, maxval=high)
+
+    def chance(p):
+        return jax.random.bernoulli(next(keys), p)
+
     difficulty = 1.0 - assistance
     share = task.start + (1.0 - task.start) * difficulty
-    velocity = share * jnp.stack([uniform(*bounds) for bounds in trainee.skill.trained_ranges(VELOCITY)])
+    velocity = share * jnp.stack(
+        [uniform(*bounds) for bounds in trainee.skill.trained_ranges(VELOCITY)]
+    )
     velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
     velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
     if trainee.skill.turn is not None:

@@ -1,8 +1,10 @@
-"""Official TorchScript checkpoints of walk-these-ways, read without torch and without executing code from them.
+"""Official TorchScript checkpoints of walk-these-ways, read without torch and without executing
+code from them.
 
-The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tensors refer to raw storages in
-`<name>/data/<key>`, and `<name>/code` holds the source of its classes. The unpickler below supports only tensors and
-containers; every module class becomes a plain object that keeps its attributes.
+The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tensors refer to raw
+storages in `<name>/data/<key>`, and `<name>/code` holds the source of its classes. The unpickler
+below supports only tensors and containers; every module class becomes a plain object that keeps its
+attributes.
 """
 
 import io
@@ -23,7 +25,8 @@ from mqe_jax.walk_policy import NETWORKS, Params
 
 _DTYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2"}
 _MANGLED = re.compile(r"\.___torch_mangle_\d+")
-_NUMBER = re.compile(r", (-?[\d.]+(?:e[+-]?\d+)?)(?=[,)])")  # as an argument in TorchScript's source
+# as an argument in TorchScript's source
+_NUMBER = re.compile(r", (-?[\d.]+(?:e[+-]?\d+)?)(?=[,)])")
 
 
 class _Module:
@@ -42,7 +45,8 @@ _PurePython: Any = vars(pickle)["_Unpickler"]  # the one in C allocates whatever
 class _Unpickler(_PurePython):
     def __init__(self, data: bytes, opened: zipfile.ZipFile, root: str) -> None:
         super().__init__(io.BytesIO(data))
-        self._archive, self._root = opened, root
+        self._archive = opened
+        self._root = root
         self._storages: dict[str, np.ndarray] = {}
         self._left = limits.WEIGHTS_BYTES  # of all tensors, which may share storages
 
@@ -68,20 +72,38 @@ class _Unpickler(_PurePython):
         if kind != "storage":
             raise ValueError(f"holds a {kind}")
         if key not in self._storages:
-            self._storages[key] = np.frombuffer(self._archive.read(f"{self._root}/data/{key}"), dtype)
+            self._storages[key] = np.frombuffer(
+                self._archive.read(f"{self._root}/data/{key}"), dtype
+            )
         return self._storages[key]
 
     def _rebuild_tensor(
-        self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any
+        self,
+        storage: np.ndarray,
+        offset: int,
+        size: tuple[int, ...],
+        stride: tuple[int, ...],
+        *_: Any,
     ) -> np.ndarray:
-        last = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) if all(size) else offset
-        if offset < 0 or any(s < 0 for s in stride) or any(n < 0 for n in size) or last >= len(storage):
+        last = (
+            offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True))
+            if all(size)
+            else offset
+        )
+        if (
+            offset < 0
+            or any(s < 0 for s in stride)
+            or any(n < 0 for n in size)
+            or last >= len(storage)
+        ):
             raise ValueError("a tensor reaches beyond its storage")
         self._left -= 4 * math.prod(size)
         if self._left < 0:
             raise ValueError(f"its tensors have more than {limits.WEIGHTS_BYTES} bytes")
         strides = [s * storage.itemsize for s in stride]
-        tensor = np.array(np.lib.stride_tricks.as_strided(storage[offset:], size, strides), np.float32)
+        tensor = np.array(
+            np.lib.stride_tricks.as_strided(storage[offset:], size, strides), np.float32
+        )
         if not np.isfinite(tensor).all():
             raise ValueError("a tensor holds NaN or infinite numbers")
         return tensor
@@ -89,12 +111,20 @@ class _Unpickler(_PurePython):
 
 @check_arguments(path=PathText)
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Returns the tensors of a scripted or traced `Sequential` by dotted name, float32, such as 0.weight.
+    """Returns the tensors of a scripted or traced `Sequential` by dotted name, float32, such as
+    0.weight.
 
-    InputError for another file, beyond the limits, or with anything but linear layers with an ELU between each two.
+    InputError for another file, beyond the limits, or with anything but linear layers with an ELU
+    between each two.
     """
-    with archive(Path(path), limits.WEIGHTS_BYTES, "a TorchScript Sequential of Linear and ELU layers") as opened:
-        names = [name for name in opened.namelist() if name.endswith("/data.pkl") and name.count("/") == 1]
+    with archive(
+        Path(path), limits.WEIGHTS_BYTES, "a TorchScript Sequential of Linear and ELU layers"
+    ) as opened:
+        names = [
+            name
+            for name in opened.namelist()
+            if name.endswith("/data.pkl") and name.count("/") == 1
+        ]
         if len(names) != 1:
             raise ValueError("no data.pkl in it")
         root = _Unpickler(opened.read(names[0]), opened, names[0].split("/")[0]).load()
@@ -117,11 +147,17 @@ def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def _parts(name: str, module: Any, kind: str) -> dict[str, Any]:
-    """Returns the attributes of a module of `torch.nn.modules`, such as linear.Linear, without torch's own."""
+    """Returns the attributes of a module of `torch.nn.modules`, such as linear.Linear, without
+    torch's own.
+    """
     found = getattr(module, "kind", type(module).__name__)
     if found != f"torch.nn.modules.{kind}":
         raise ValueError(f"{name} is a {found}, not a torch.nn.modules.{kind}")
-    return {key: value for key, value in vars(module).items() if key not in ("training", "_is_full_backward_hook")}
+    return {
+        key: value
+        for key, value in vars(module).items()
+        if key not in ("training", "_is_full_backward_hook")
+    }
 
 
 def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:

@@ -1,4 +1,6 @@
-"""The skills that the walking task trains: their observations, their gaits, and the goals of their rewards."""
+"""The skills that the walking task trains: their observations, their gaits, and the goals of their
+rewards.
+"""
 
 import abc
 from collections.abc import Callable
@@ -21,23 +23,30 @@ Chance = Callable[[float], jax.Array]
 
 
 class Trainee(abc.ABC):
-    """A skill as the walking environment trains it, by commands of the walk policy (15,): velocity and gait."""
+    """A skill as the walking environment trains it, by commands of the walk policy (15,): velocity
+    and gait.
+    """
 
     skill: Skill
     observation_size: int
-    """Length of the skill's own observation of one step, from which its network gathers its history."""
+    """Length of the skill's own observation of one step, from which its network gathers its
+    history."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
 
     @property
     def evaluation_range(self) -> np.ndarray:
-        """Lowest and highest velocity command in evaluations (3, 2), m/s and rad/s: those of the training."""
+        """Lowest and highest velocity command in evaluations (3, 2), m/s and rad/s: those of the
+        training.
+        """
         return self.skill.trained_ranges(VELOCITY)
 
     @abc.abstractmethod
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
-        """Returns commands (15,) with a velocity (3,); `uniform(low, high)` and `chance(p)` draw random numbers."""
+        """Returns commands (15,) with a velocity (3,); `uniform(low, high)` and `chance(p)` draw
+        random numbers.
+        """
 
     @abc.abstractmethod
     def observe(self, memory: WalkMemory, commands: jax.Array, sensed: Proprioception) -> jax.Array:
@@ -62,13 +71,18 @@ class Walk(Trainee):
         return np.array([(-1.0, 1.0), (-0.6, 0.6), (-1.0, 1.0)])
 
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
-        names, odds = ("trot", "pace", "bound", "pronk"), (0.6, 0.92, 0.96)
+        names = ("trot", "pace", "bound", "pronk")
+        odds = (0.6, 0.92, 0.96)
         gaits = np.array([list(walk_policy.GAITS[name].values()) for name in names], np.float32)
         gait = jnp.asarray(gaits)[jnp.sum(uniform(0.0, 1.0) >= jnp.array(odds))]
         varied = chance(0.5)
-        vary = lambda low, high, default: jnp.where(varied, uniform(low, high), default)  # noqa: E731
+
+        def vary(low, high, default):
+            return jnp.where(varied, uniform(low, high), default)
+
         default = self.skill.default_commands()
-        width, length = self.robot.walk.stance_width, self.robot.walk.stance_length
+        width = self.robot.walk.stance_width
+        length = self.robot.walk.stance_length
         rest = [
             vary(-0.12, 0.06, default[3]),
             vary(1.8, 4.2, default[4]),
@@ -121,5 +135,8 @@ TRAINEES: dict[str, type[Trainee]] = {"walk": Walk, "agile": Agile}
 def make(name: str, robot: Robot) -> Trainee:
     """Returns a skill of a robot to train; InputError for the name of another one."""
     if name not in TRAINEES:
-        raise InputError(f"skill: {name!r} cannot be trained{nearest(name, TRAINEES)}; allowed: {', '.join(TRAINEES)}")
+        raise InputError(
+            f"skill: {name!r} cannot be trained{nearest(name, TRAINEES)}; allowed: "
+            f"{', '.join(TRAINEES)}"
+        )
     return TRAINEES[name](robot)

@@ -1,4 +1,6 @@
-"""Training of skills by `mqe_jax.train`; settings as in walk-these-ways (arXiv 2212.03238) where known."""
+"""Training of skills by `mqe_jax.train`; settings as in walk-these-ways (arXiv 2212.03238) where
+known.
+"""
 
 from pathlib import Path
 
@@ -7,7 +9,14 @@ import jax
 from mqe_jax.core.settings import PathText, check_arguments, fail, override, to_mapping
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.physics import robots
-from mqe_jax.train.config import PPO, Checkpointing, Curriculum, Normalization, OptimizerSettings, TrainConfig
+from mqe_jax.train.config import (
+    PPO,
+    Checkpointing,
+    Curriculum,
+    Normalization,
+    OptimizerSettings,
+    TrainConfig,
+)
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.runner import train
 from mqe_jax.walk.env import WalkEnv
@@ -23,7 +32,12 @@ WALK = TrainConfig(
     seed=1,
     ppo=PPO(epochs=5, minibatches=4, huber_delta=None, value_coef=2.0),
     optimizer=OptimizerSettings(
-        learning_rate=1e-3, schedule="linear", anneal=0.3, target_kl=0.01, eps=1e-8, max_grad_norm=1.0
+        learning_rate=1e-3,
+        schedule="linear",
+        anneal=0.3,
+        target_kl=0.01,
+        eps=1e-8,
+        max_grad_norm=1.0,
     ),
     network=WalkNetwork(),
     curriculum=Curriculum(assistance=1.0, assistance_until=0.3),
@@ -31,7 +45,8 @@ WALK = TrainConfig(
     checkpoint=Checkpointing(every=100, environments=False),
     loggers=(),
 )
-"""Settings for training walk weights from scratch; the assistance is the curriculum of slopes, forces and pushes."""
+"""Settings for training walk weights from scratch; the assistance is the curriculum of slopes,
+forces and pushes."""
 
 AGILE = override(
     WALK,
@@ -43,16 +58,25 @@ AGILE = override(
         "curriculum.assistance_until": 0.5,
     },
 )
-"""Settings for training the agile skill from scratch; the assistance is the curriculum of commands and disturbances."""
+"""Settings for training the agile skill from scratch; the assistance is the curriculum of commands
+and disturbances."""
 
-AGILE_TASK = WalkTask(start=0.5, tolerance=2.0, command_period=4.0, slope=0.15, shove=100.0, action_lag=1)
-"""The walking task of the agile skill: fast commands, shoves as in contact with robots and boxes, gentle slopes."""
+AGILE_TASK = WalkTask(
+    start=0.5, tolerance=2.0, command_period=4.0, slope=0.15, shove=100.0, action_lag=1
+)
+"""The walking task of the agile skill: fast commands, shoves as in contact with robots and boxes,
+gentle slopes."""
 
-SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {"walk": (WALK, WalkTask()), "agile": (AGILE, AGILE_TASK)}
+SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {
+    "walk": (WALK, WalkTask()),
+    "agile": (AGILE, AGILE_TASK),
+}
 """Settings and task of each skill that can be trained."""
 
 
-@check_arguments("skill", "config", "task", "robot", "impl", "resume", run_dir=PathText, weights=PathText | None)
+@check_arguments(
+    "skill", "config", "task", "robot", "impl", "resume", run_dir=PathText, weights=PathText | None
+)
 def train_skill(
     skill: str,
     run_dir: str | Path,
@@ -79,7 +103,8 @@ def train_skill(
         robot: name of the robot.
         weights: weights to start from; may be those of another robot. Default: from scratch.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
-        resume: whether to continue from the newest checkpoint in the folder, with environments reset.
+        resume: whether to continue from the newest checkpoint in the folder, with environments
+            reset.
 
     Raises:
         InputError: for a skill, settings, weights or a run folder that are not allowed.
@@ -87,7 +112,9 @@ def train_skill(
     """
     if skill not in SETTINGS:
         fail("skill", skill, " or ".join(SETTINGS))
-    body, run_dir, config = robots.get(robot), Path(run_dir), config or SETTINGS[skill][0]
+    body = robots.get(robot)
+    run_dir = Path(run_dir)
+    config = config or SETTINGS[skill][0]
     if config.opponents:
         fail("opponents", list(config.opponents), "empty: walking is not a match")
     network = config.network
@@ -96,7 +123,9 @@ def train_skill(
     if weights is not None:
         network.form.networks.load(body, weights)
         config = override(config, {"network.weights": str(Path(weights).resolve())})
-    env = WalkEnv(body, task or SETTINGS[skill][1], skill=skill, impl=impl, num_envs=config.num_envs)
+    env = WalkEnv(
+        body, task or SETTINGS[skill][1], skill=skill, impl=impl, num_envs=config.num_envs
+    )
     config = override(config, {"env": {"control": env.control, **to_mapping(env.params)}})
 
     def save(state: TrainState, row: dict[str, float]) -> None:

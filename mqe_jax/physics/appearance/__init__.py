@@ -1,4 +1,6 @@
-"""What scenes look like: colours, and geoms without mass or contacts that only rendering models have; metres."""
+"""What scenes look like: colours, and geoms without mass or contacts that only rendering models
+have; metres.
+"""
 
 import colorsys
 import itertools
@@ -11,22 +13,33 @@ Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
 
 
 def _perceived(colors: np.ndarray) -> np.ndarray:
-    """Returns sRGB colours (N, 3) in Oklab (N, 3), where distances are about as large as people see them.
+    """Returns sRGB colours (N, 3) in Oklab (N, 3), where distances are about as large as people see
+    them.
 
-    Lightness counts half, for it changes with the light on a robot. Source: bottosson.github.io/posts/oklab.
+    Lightness counts half, for it changes with the light on a robot. Source:
+    bottosson.github.io/posts/oklab.
     """
     linear = np.where(colors > 0.04045, ((colors + 0.055) / 1.055) ** 2.4, colors / 12.92)
-    to_cones = np.array([[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]])
-    to_lab = np.array([[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]])
+    to_cones = np.array(
+        [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]
+    )
+    to_lab = np.array(
+        [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]
+    )
     return np.cbrt(linear @ to_cones.T) @ to_lab.T * (0.5, 1.0, 1.0)
 
 
 def _palette(first: tuple[Color, ...], count: int) -> tuple[Color, ...]:
-    """Returns `count` colours: the first ones, then always the vivid one that differs most from all before it."""
+    """Returns `count` colours: the first ones, then always the vivid one that differs most from all
+    before it.
+    """
     levels = itertools.product(np.arange(30) / 30, ((0.85, 0.95), (0.9, 0.6), (0.45, 1.0)))
     vivid = np.array([colorsys.hsv_to_rgb(hue, *level) for hue, level in levels])
-    candidates, colors = _perceived(vivid), list(first)
-    apart = np.linalg.norm(candidates[:, None] - _perceived(np.array(first)[:, :3]), axis=-1).min(axis=1)
+    candidates = _perceived(vivid)
+    colors = list(first)
+    apart = np.linalg.norm(candidates[:, None] - _perceived(np.array(first)[:, :3]), axis=-1).min(
+        axis=1
+    )
     while len(colors) < count:
         best = int(apart.argmax())
         red, green, blue = vivid[best].round(3).tolist()
@@ -35,16 +48,25 @@ def _palette(first: tuple[Color, ...], count: int) -> tuple[Color, ...]:
     return tuple(colors)
 
 
-# Robots by agent. In matches of one or two a side team 0 is blue and green, team 1 red and orange; see `team_colors`.
+# Robots by agent. In matches of one or two a side team 0 is blue and green, team 1 red and orange;
+# see `team_colors`.
 ROBOT_COLOR_NAMES = ("blue", "green", "red", "orange")
 ROBOT_COLORS: tuple[Color, ...] = _palette(
-    ((0.10, 0.47, 0.95, 1.0), (0.22, 0.72, 0.25, 1.0), (0.90, 0.20, 0.17, 1.0), (1.00, 0.58, 0.08, 1.0)), MAX_ROBOTS
+    (
+        (0.10, 0.47, 0.95, 1.0),
+        (0.22, 0.72, 0.25, 1.0),
+        (0.90, 0.20, 0.17, 1.0),
+        (1.00, 0.58, 0.08, 1.0),
+    ),
+    MAX_ROBOTS,
 )
 UNNUMBERED = 4  # robots of a scene, at most, that differ by colour and bear no numbers
 
 
 def team_colors(size: int) -> tuple[int, ...]:
-    """Returns the colours of two teams, as indices of `ROBOT_COLORS`; of larger teams, one colour each."""
+    """Returns the colours of two teams, as indices of `ROBOT_COLORS`; of larger teams, one colour
+    each.
+    """
     return {1: (0, 2), 2: (0, 1, 2, 3)}.get(size, (0,) * size + (2,) * size)
 
 
@@ -65,7 +87,8 @@ VISUAL_GROUP = 2  # of visual geoms
 GROUND_GROUP = 0  # of the floor and of what is painted on it
 HIDDEN_GROUP = 3  # of collision shapes that are not shown
 SITE_GROUP = 5  # of sites, which are not shown
-GOAL_SITE = "goal"  # first part of the names of sites that a camera keeps in view: gates, goals, finish lines
+# first part of the names of sites that a camera keeps in view: gates, goals, finish lines
+GOAL_SITE = "goal"
 
 
 def mix(first: Color, second: Color, part: float) -> Color:

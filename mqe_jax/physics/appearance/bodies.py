@@ -9,7 +9,8 @@ from mqe_jax.physics.appearance import DARK_WOOD, GLASS, INK, STEEL, WHITE, WOOD
 from mqe_jax.physics.appearance.shapes import Kind, add_box, add_rod, add_visual
 
 _PROUD = 0.004  # distance by which details stand out from the collision shape, m
-# Inked segments of each digit: three across from the top, the left upper and lower, the right upper and lower.
+# Inked segments of each digit: three across from the top, the left upper and lower, the right upper
+# and lower.
 _DIGITS = "1011111 0000011 1110110 1110011 0101011 1111001 1111101 1000011 1111111 1111011".split()
 
 
@@ -20,13 +21,18 @@ def crate(body: Any, half: np.ndarray) -> None:
         other, third = (i for i in range(3) if i != axis)
         for a in (-1, 1):
             for b in (-1, 1):
-                size, place = np.full(3, thick), np.zeros(3)
+                size = np.full(3, thick)
+                place = np.zeros(3)
                 size[axis] = half[axis] + _PROUD
-                place[[other, third]] = a * (half[other] - thick + _PROUD), b * (half[third] - thick + _PROUD)
+                place[[other, third]] = (
+                    a * (half[other] - thick + _PROUD),
+                    b * (half[third] - thick + _PROUD),
+                )
                 add_box(body, DARK_WOOD, size, place)
     for axis, sign in ((0, 1), (1, -1)):  # diagonal braces
         size = np.full(3, 0.8 * thick)
-        size[axis], size[1 - axis] = half[axis] + _PROUD / 2, np.hypot(half[1], half[2]) - 2 * thick
+        size[axis] = half[axis] + _PROUD / 2
+        size[1 - axis] = np.hypot(half[1], half[2]) - 2 * thick
         angle = np.arctan2(half[2], half[1 - axis]) / 2
         quat = np.array([np.cos(angle), 0.0, 0.0, 0.0])
         quat[1 + axis] = sign * np.sin(angle)
@@ -49,7 +55,9 @@ def drum(body: Any, radius: float, height: float) -> None:
     half = height / 2
     add_visual(body, Kind.mjGEOM_CYLINDER, WOOD, size=(radius, half, 0), pos=(0, 0, half))
     for z in (0.16 * height, 0.84 * height):
-        add_visual(body, Kind.mjGEOM_CYLINDER, STEEL, size=(radius + 0.006, 0.035, 0), pos=(0, 0, z))
+        add_visual(
+            body, Kind.mjGEOM_CYLINDER, STEEL, size=(radius + 0.006, 0.035, 0), pos=(0, 0, z)
+        )
     lid = mix(WOOD, WHITE, 0.35)
     add_visual(body, Kind.mjGEOM_CYLINDER, lid, size=(0.93 * radius, 0.003, 0), pos=(0, 0, height))
 
@@ -64,11 +72,18 @@ def door(body: Any, half: np.ndarray) -> None:
         add_box(body, YELLOW, (x, bar, z), (0, side * (y - bar), 0))
         add_box(body, INK, (1.03 * x, bar, 0.12 * z), (0, side * (y - bar), 0.45 * z))
         for height in (-1, 1):
-            add_box(body, STEEL, (0.8 * x, y / 2, bar / 1.5), (0, side * y / 2, height * (z - bar / 1.5)))
+            add_box(
+                body,
+                STEEL,
+                (0.8 * x, y / 2, bar / 1.5),
+                (0, side * y / 2, height * (z - bar / 1.5)),
+            )
 
 
 def plank(body: Any, half: np.ndarray, center: float) -> None:
-    """Adds the slats and the edges of a wooden plank of half extents (3,) whose centre is at x `center`, m."""
+    """Adds the slats and the edges of a wooden plank of half extents (3,) whose centre is at x
+    `center`, m.
+    """
     x, y, z = half
     edges = np.linspace(-x, x, 15)
     for i, (a, b) in enumerate(itertools.pairwise(edges)):
@@ -85,11 +100,19 @@ def trestle(world: Any, hinge: tuple[float, float, float], half_width: float) ->
     add_rod(world, STEEL, 0.04, (x, y - end, z), (x, y + end, z))
     for side in (-1, 1):
         for lean in (-0.3, 0.3):
-            add_rod(world, DARK_WOOD, 0.035, (x + lean, y + side * (end - 0.03), 0), (x, y + side * (end - 0.03), z))
+            add_rod(
+                world,
+                DARK_WOOD,
+                0.035,
+                (x + lean, y + side * (end - 0.03), 0),
+                (x, y + side * (end - 0.03), z),
+            )
 
 
 def column(world: Any, radius: float, top: tuple[float, float, float]) -> None:
-    """Adds a column with a foot and a head from the ground up to the middle of its `top` (3,), m, to the world."""
+    """Adds a column with a foot and a head from the ground up to the middle of its `top` (3,), m,
+    to the world.
+    """
     x, y, z = top
     add_rod(world, STEEL, radius, (x, y, 0), (x, y, z))
     add_rod(world, INK, 1.6 * radius, (x, y, 0), (x, y, 0.05))
@@ -101,17 +124,46 @@ def sheep(body: Any, radius: float, height: float) -> None:
     wool: Color = (0.97, 0.95, 0.89, 1.0)
     face: Color = (0.22, 0.19, 0.18, 1.0)
     middle = 0.62 * height
-    add_visual(body, Kind.mjGEOM_ELLIPSOID, wool, size=(radius, 0.72 * radius, 0.30 * height), pos=(0, 0, middle))
+    add_visual(
+        body,
+        Kind.mjGEOM_ELLIPSOID,
+        wool,
+        size=(radius, 0.72 * radius, 0.30 * height),
+        pos=(0, 0, middle),
+    )
     for x, count, wide in ((-0.75, 5, 0.52), (-0.25, 7, 0.72), (0.3, 7, 0.70), (0.75, 5, 0.50)):
         for angle in np.linspace(-0.35, np.pi + 0.35, count):
-            place = (x * radius, wide * radius * np.cos(angle), middle + 0.25 * height * np.sin(angle))
+            place = (
+                x * radius,
+                wide * radius * np.cos(angle),
+                middle + 0.25 * height * np.sin(angle),
+            )
             add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(0.31 * radius, 0, 0), pos=place)
     head = (1.25 * radius, 0, 0.80 * height)
-    add_visual(body, Kind.mjGEOM_ELLIPSOID, face, size=(0.40 * radius, 0.26 * radius, 0.30 * radius), pos=head)
-    add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(0.27 * radius, 0, 0), pos=(1.08 * radius, 0, 0.92 * height))
-    add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(0.2 * radius, 0, 0), pos=(-1.2 * radius, 0, 0.7 * height))
+    add_visual(
+        body,
+        Kind.mjGEOM_ELLIPSOID,
+        face,
+        size=(0.40 * radius, 0.26 * radius, 0.30 * radius),
+        pos=head,
+    )
+    add_visual(
+        body,
+        Kind.mjGEOM_SPHERE,
+        wool,
+        size=(0.27 * radius, 0, 0),
+        pos=(1.08 * radius, 0, 0.92 * height),
+    )
+    add_visual(
+        body,
+        Kind.mjGEOM_SPHERE,
+        wool,
+        size=(0.2 * radius, 0, 0),
+        pos=(-1.2 * radius, 0, 0.7 * height),
+    )
     for side in (-1, 1):
-        place, ear = (1.08 * radius, side * 0.34 * radius, 0.84 * height), np.array([0.1, 0.22, 0.08]) * radius
+        place = (1.08 * radius, side * 0.34 * radius, 0.84 * height)
+        ear = np.array([0.1, 0.22, 0.08]) * radius
         add_visual(body, Kind.mjGEOM_ELLIPSOID, face, size=ear, pos=place)
         for x in (-0.5 * radius, 0.5 * radius):
             y = side * 0.35 * radius
@@ -119,18 +171,25 @@ def sheep(body: Any, radius: float, height: float) -> None:
 
 
 def back_number(trunk: Any, number: int, top: float) -> None:
-    """Adds a robot's number to its trunk, on a white cloth whose height above the trunk's origin is `top`, m.
+    """Adds a robot's number to its trunk, on a white cloth whose height above the trunk's origin is
+    `top`, m.
 
     It reads from behind the robot.
     """
-    digits, half, thick = str(number), (0.09, 0.042), 0.014  # of a digit, along x and y; of a segment
+    # of a digit, along x and y; of a segment
+    digits = str(number)
+    half = (0.09, 0.042)
+    thick = 0.014
     pitch = 2 * half[1] + 3 * thick
     add_box(trunk, WHITE, (0.13, 0.02 + pitch * len(digits) / 2, 0.003), (0, 0, top))
-    lower, upper = -half[0] / 2, half[0] / 2
+    lower = -half[0] / 2
+    upper = half[0] / 2
     for place, digit in enumerate(digits):
         middle = ((len(digits) - 1) / 2 - place) * pitch
         across = [(x, 0.0, (thick, half[1] + thick)) for x in (half[0], 0.0, -half[0])]
-        along = [(x, side * half[1], (upper + thick, thick)) for side in (1, -1) for x in (upper, lower)]
+        along = [
+            (x, side * half[1], (upper + thick, thick)) for side in (1, -1) for x in (upper, lower)
+        ]
         for inked, (x, y, (length, width)) in zip(_DIGITS[int(digit)], across + along, strict=True):
             if inked == "1":
                 add_box(trunk, INK, (length, width, 0.003), (x, middle + y, top + 0.002))

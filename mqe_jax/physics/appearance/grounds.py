@@ -7,7 +7,18 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from mqe_jax.physics.appearance import CLAY, GRASS, INK, ROBOT_COLORS, STONE, WHITE, WOOD, YELLOW, Color, mix
+from mqe_jax.physics.appearance import (
+    CLAY,
+    GRASS,
+    INK,
+    ROBOT_COLORS,
+    STONE,
+    WHITE,
+    WOOD,
+    YELLOW,
+    Color,
+    mix,
+)
 from mqe_jax.physics.appearance.shapes import (
     Ground,
     Point,
@@ -23,7 +34,8 @@ from mqe_jax.physics.appearance.shapes import (
 )
 
 GROUND_MATERIAL = "ground"
-_HORIZON, _ZENITH = (0.86, 0.91, 0.96), (0.36, 0.58, 0.85)
+_HORIZON = (0.86, 0.91, 0.96)
+_ZENITH = (0.36, 0.58, 0.85)
 _HALL: Color = (0.42, 0.46, 0.52, 1.0)
 COURT: Color = (0.83, 0.68, 0.48, 1.0)  # parquet
 _POST = 0.035  # radius of goal posts, m
@@ -31,7 +43,8 @@ _POST = 0.035  # radius of goal posts, m
 
 def pads(poses: Sequence[Sequence[float]], colors: Sequence[int]) -> tuple[Shape, ...]:
     """Returns a frame in each robot's colour about its place at the start; poses x, y, yaw."""
-    size, marks = (0.9, 0.6), []
+    size = (0.9, 0.6)
+    marks = []
     for (x, y, yaw, *_), color in zip(poses, colors, strict=False):
         paint = mix(ROBOT_COLORS[color % len(ROBOT_COLORS)], WHITE, 0.25)
         marks += [
@@ -45,14 +58,22 @@ def finish(x: float, y: Point, squares: int = 14, z: float = 0.0) -> tuple[Shape
     """Returns a chequered line across the track at x, between two y, m."""
     side = (y[1] - y[0]) / squares
     dark = [
-        rectangle((x + row * side, x + (row + 1) * side), (y[0] + i * side, y[0] + (i + 1) * side), INK, 4, z)
+        rectangle(
+            (x + row * side, x + (row + 1) * side),
+            (y[0] + i * side, y[0] + (i + 1) * side),
+            INK,
+            4,
+            z,
+        )
         for row in range(2)
         for i in range(row, squares, 2)
     ]
     return rectangle((x, x + 2 * side), y, WHITE, 3, z), *dark
 
 
-def track(x: Point, width: float, lanes: int, shapes: Sequence[Shape] = (), color: Color = CLAY) -> Ground:
+def track(
+    x: Point, width: float, lanes: int, shapes: Sequence[Shape] = (), color: Color = CLAY
+) -> Ground:
     """Returns a running track between two x, m, with white lines between its lanes."""
     edges = np.linspace(-width / 2, width / 2, lanes + 1)[1:-1].tolist()
     lines = [line((x[0], y), (x[1], y), width=0.04, level=2) for y in edges]
@@ -65,14 +86,19 @@ def hall(x: Point, y: Point, color: Color, shapes: Sequence[Shape] = ()) -> Grou
 
 
 def halves(x: Point, y: Point) -> Ground:
-    """Returns a floor whose halves are those of the first and of the second team, with a line between them."""
-    blue, red = (mix(ROBOT_COLORS[i], STONE, 0.74) for i in (0, 2))
+    """Returns a floor whose halves are those of the first and of the second team, with a line
+    between them.
+    """
+    blue = mix(ROBOT_COLORS[0], STONE, 0.74)
+    red = mix(ROBOT_COLORS[2], STONE, 0.74)
     middle = line((x[0], 0.0), (x[1], 0.0))
     return Ground(_HALL, (rectangle(x, (y[0], 0.0), blue), rectangle(x, (0.0, y[1]), red), middle))
 
 
 def warehouse(x: Point, width: float, goal_x: float) -> Ground:
-    """Returns a concrete floor between two x, m, with yellow lines, and a painted zone beyond the gate at `goal_x`."""
+    """Returns a concrete floor between two x, m, with yellow lines, and a painted zone beyond the
+    gate at `goal_x`.
+    """
     half = width / 2 - 0.25
     zone = rectangle((goal_x, x[1]), (-width / 2, width / 2), (0.55, 0.72, 0.58, 1.0), 2)
     start = outline((x[0] + 0.25, goal_x - 0.4), (-half, half), YELLOW, 0.07)
@@ -80,7 +106,9 @@ def warehouse(x: Point, width: float, goal_x: float) -> Ground:
 
 
 def meadow(x_range: Point, width: float, goal_x: float) -> Ground:
-    """Returns grass between two x, m, with tufts and flowers, and a pen beyond the gate at `goal_x`."""
+    """Returns grass between two x, m, with tufts and flowers, and a pen beyond the gate at
+    `goal_x`.
+    """
     begin, end = x_range
     random = np.random.default_rng(4)
     pen: Color = (0.72, 0.68, 0.42, 1.0)
@@ -92,12 +120,17 @@ def meadow(x_range: Point, width: float, goal_x: float) -> Ground:
     patches: list[tuple[float, float, float]] = []
     for number in range(round(6 * (goal_x - begin))):
         radius = random.uniform(0.1, 0.35)
-        x, y = random.uniform(begin + 0.4, goal_x - 0.5), random.uniform(-0.44, 0.44) * width
-        if all(np.hypot(x - other_x, y - other_y) > radius + other for other_x, other_y, other in patches):
+        x = random.uniform(begin + 0.4, goal_x - 0.5)
+        y = random.uniform(-0.44, 0.44) * width
+        if all(
+            np.hypot(x - other_x, y - other_y) > radius + other
+            for other_x, other_y, other in patches
+        ):
             patches.append((x, y, radius))
             shapes.append(mark((x, y, 0.0), (radius,), tones[number % 2], 2))
     for number in range(round(3.0 * (end - begin))):
-        x, y = random.uniform(begin + 0.2, end - 0.2), random.choice([-1, 1]) * random.uniform(0.52, 0.85) * width
+        x = random.uniform(begin + 0.2, end - 0.2)
+        y = random.choice([-1, 1]) * random.uniform(0.52, 0.85) * width
         flower = number % 3 == 0
         half = (0.045, 0.045, 0.04) if flower else (0.16, 0.12, 0.10)
         color = ((0.98, 0.93, 0.55, 1.0), WHITE)[number % 2] if flower else tones[0]
@@ -106,14 +139,22 @@ def meadow(x_range: Point, width: float, goal_x: float) -> Ground:
 
 
 def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
-    """Returns a football pitch between two goal lines x; `goal` is the width, height and depth of both goals, m."""
-    half, (mouth, height, depth) = width / 2, goal
+    """Returns a football pitch between two goal lines x; `goal` is the width, height and depth of
+    both goals, m.
+    """
+    half = width / 2
+    (mouth, height, depth) = goal
     middle = sum(x) / 2
     stripes = itertools.pairwise(np.linspace(x[0] - depth, x[1] + depth, 13).tolist())
     tones = ((0.33, 0.57, 0.29, 1.0), (0.38, 0.63, 0.33, 1.0))
-    shapes: list[Shape] = [rectangle(stripe, (-half, half), tones[i % 2]) for i, stripe in enumerate(stripes)]
+    shapes: list[Shape] = [
+        rectangle(stripe, (-half, half), tones[i % 2]) for i, stripe in enumerate(stripes)
+    ]
     shapes += outline(x, (0.1 - half, half - 0.1), width=0.07)
-    shapes += [line((middle, 0.1 - half), (middle, half - 0.1), width=0.07), mark((middle, 0.0, 0.0), (0.12,), level=3)]
+    shapes += [
+        line((middle, 0.1 - half), (middle, half - 0.1), width=0.07),
+        mark((middle, 0.0, 0.0), (0.12,), level=3),
+    ]
     shapes += circle((middle, 0.0), 1.3, width=0.07)
     points = []
     for goal_x, away, color in ((x[0], -1, ROBOT_COLORS[0]), (x[1], 1, ROBOT_COLORS[2])):
@@ -126,35 +167,51 @@ def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
 
 def _goal(x: float, depth: float, half: float, height: float, color: Color) -> list[Shape]:
     """Returns the frame and the net of a goal, whose back is at `x + depth`."""
-    inner, back = half - _POST, x + 0.96 * depth
-    posts = [rod((x, side * inner, 0.0), (x, side * inner, height), _POST, color) for side in (-1, 1)]
+    inner = half - _POST
+    back = x + 0.96 * depth
+    posts = [
+        rod((x, side * inner, 0.0), (x, side * inner, height), _POST, color) for side in (-1, 1)
+    ]
     frame: list[Shape] = [*posts, rod((x, -inner, height), (x, inner, height), _POST, color)]
-    thread, net = 0.008, (0.93, 0.93, 0.93, 1.0)
+    thread = 0.008
+    net = (0.93, 0.93, 0.93, 1.0)
     for y in np.linspace(-inner, inner, 10).tolist():
         frame += [
             rod((back, y, 0.0), (back, y, height), thread, net),
             rod((x, y, height), (back, y, height), thread, net),
         ]
     for part in (0.25, 0.5, 0.75, 1.0):
-        z, along = part * height, x + part * (back - x)
+        z = part * height
+        along = x + part * (back - x)
         frame += [rod((back, -inner, z), (back, inner, z), thread, net)]
         frame += [rod((along, -inner, height), (along, inner, height), thread, net)]
     return frame
 
 
-def climb(length: float, width: float, top: tuple[float, float, float], size: tuple[float, float, float]) -> Ground:
-    """Returns a running track with a finish line on a platform with this centre of its top and these extents, m."""
-    (x, y, z), half = top, size[1] / 2
+def climb(
+    length: float, width: float, top: tuple[float, float, float], size: tuple[float, float, float]
+) -> Ground:
+    """Returns a running track with a finish line on a platform with this centre of its top and
+    these extents, m.
+    """
+    (x, y, z) = top
+    half = size[1] / 2
     base = rectangle((x - size[0] / 2, x + size[0] / 2), (y - half, y + half), WHITE, 1, z)
     line_ = finish(x - size[0] / 2, (y - half, y + half), 10, z)
     points = tuple((x + sign * size[0] / 2, y, z) for sign in (-1, 1))
     return dataclasses.replace(track((0.0, length), width, 4, (base, *line_)), goals=points)
 
 
-def dohyo(top: tuple[float, float, float], size: tuple[float, float, float], radius: float) -> Ground:
-    """Returns a sumo stage on a platform, given by its top's centre and its extents, with a ring of a radius, m."""
-    (x, y, z), (length, width, _) = top, size
-    sand, edge = (0.90, 0.77, 0.55, 1.0), (0.72, 0.55, 0.36, 1.0)
+def dohyo(
+    top: tuple[float, float, float], size: tuple[float, float, float], radius: float
+) -> Ground:
+    """Returns a sumo stage on a platform, given by its top's centre and its extents, with a ring of
+    a radius, m.
+    """
+    (x, y, z) = top
+    (length, width, _) = size
+    sand = (0.90, 0.77, 0.55, 1.0)
+    edge = (0.72, 0.55, 0.36, 1.0)
     shapes: list[Shape] = [
         rectangle((x - length / 2, x + length / 2), (y - width / 2, y + width / 2), edge, 1, z),
         mark((x, y, z), (radius,), sand, 2),
@@ -166,23 +223,29 @@ def dohyo(top: tuple[float, float, float], size: tuple[float, float, float], rad
         shapes += [line((x - 0.4, y + side * 0.45), (x + 0.4, y + side * 0.45), width=0.07, z=z)]
         at = y + side * (width / 2 - 0.2)
         shapes += [line((x - 0.9, at), (x + 0.9, at), mix(color, WHITE, 0.15), 0.14, z=z)]
-    points = tuple((x + a * radius, y + b * radius, z) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1)))
+    points = tuple(
+        (x + a * radius, y + b * radius, z) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))
+    )
     return Ground(_HALL, tuple(shapes), points)
 
 
 def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top: float) -> Ground:
-    """Returns a river, with planks on a bridge and stones with the teams' flags on its two platforms.
+    """Returns a river, with planks on a bridge and stones with the teams' flags on its two
+    platforms.
 
-    `platforms` are their centres' x, `ends` those of the bridge, `widths` the platforms' extents along x and y and the
-    bridge's width, `top` their height, m.
+    `platforms` are their centres' x, `ends` those of the bridge, `widths` the platforms' extents
+    along x and y and the bridge's width, `top` their height, m.
     """
     random = np.random.default_rng(2)
     blue: Color = (0.36, 0.62, 0.74, 1.0)
     foam = mix(blue, WHITE, 0.35)
     shapes: list[Shape] = [rectangle((ends[0] - 1.0, ends[1] + 1.0), (-40.0, 40.0), blue)]
     for _ in range(70):
-        x, y = random.uniform(ends[0] - 0.8, ends[1] + 0.8), random.uniform(-6.0, 6.0)
-        shapes.append(mark((x, y, 0.0), (random.uniform(0.04, 0.06), random.uniform(0.3, 0.8)), foam, 2))
+        x = random.uniform(ends[0] - 0.8, ends[1] + 0.8)
+        y = random.uniform(-6.0, 6.0)
+        shapes.append(
+            mark((x, y, 0.0), (random.uniform(0.04, 0.06), random.uniform(0.3, 0.8)), foam, 2)
+        )
     length, width, bridge = widths
     planks = np.linspace(*ends, 24).tolist()
     for i, (a, b) in enumerate(itertools.pairwise(planks)):
@@ -190,15 +253,20 @@ def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top
         shapes.append(rectangle((a, b), (-bridge / 2, bridge / 2), tone, 1, top))
     points = []
     for x, color in zip(platforms, (0, 2), strict=True):
-        x_range, y_range = (x - length / 2, x + length / 2), (-width / 2, width / 2)
+        x_range = (x - length / 2, x + length / 2)
+        y_range = (-width / 2, width / 2)
         shapes.append(rectangle(x_range, y_range, mix(ROBOT_COLORS[color], STONE, 0.55), 1, top))
-        shapes += outline((x_range[0] + 0.06, x_range[1] - 0.06), (y_range[0] + 0.06, y_range[1] - 0.06), z=top)
+        shapes += outline(
+            (x_range[0] + 0.06, x_range[1] - 0.06), (y_range[0] + 0.06, y_range[1] - 0.06), z=top
+        )
         points += [(x, y, top) for y in y_range]
     return Ground(shapes=tuple(shapes), goals=tuple(points))
 
 
 def add_light(spec: mujoco.MjSpec, middle: tuple[float, float, float]) -> None:
-    """Adds a light that casts shadows, a sky, and the material of the ground, which renderers give its geoms."""
+    """Adds a light that casts shadows, a sky, and the material of the ground, which renderers give
+    its geoms.
+    """
     spec.worldbody.add_light(
         pos=middle,
         dir=(0.2, 0.3, -1),
@@ -210,9 +278,11 @@ def add_light(spec: mujoco.MjSpec, middle: tuple[float, float, float]) -> None:
     visual.headlight.ambient = (0.45, 0.45, 0.45)
     visual.headlight.diffuse = (0.35, 0.35, 0.35)
     visual.quality.shadowsize = 4096
-    visual.global_.offwidth, visual.global_.offheight = 1920, 1080
+    visual.global_.offwidth = 1920
+    visual.global_.offheight = 1080
     visual.rgba.haze = (*_HORIZON, 1.0)
-    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
+    texture = mujoco.mjtTexture
+    builtin = mujoco.mjtBuiltin
     spec.add_texture(
         name="sky",
         type=texture.mjTEXTURE_SKYBOX,
@@ -234,5 +304,7 @@ def add_light(spec: mujoco.MjSpec, middle: tuple[float, float, float]) -> None:
         width=256,
         height=256,
     )
-    material = spec.add_material(name=GROUND_MATERIAL, texuniform=True, texrepeat=(1.0, 1.0), specular=0.0)
+    material = spec.add_material(
+        name=GROUND_MATERIAL, texuniform=True, texrepeat=(1.0, 1.0), specular=0.0
+    )
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND_MATERIAL

@@ -31,7 +31,9 @@ Point = tuple[float, float]
 Place = tuple[float, float, float]
 
 
-def add_visual(body: Any, kind: Any, color: Color, group: int = VISUAL_GROUP, **options: Any) -> None:
+def add_visual(
+    body: Any, kind: Any, color: Color, group: int = VISUAL_GROUP, **options: Any
+) -> None:
     """Adds a massless geom without contacts to a body; `options` are those of `add_geom`."""
     body.add_geom(type=kind, rgba=color, contype=0, conaffinity=0, group=group, mass=0.0, **options)
 
@@ -41,7 +43,9 @@ def add_box(body: Any, color: Color, half: ArrayLike, pos: ArrayLike, **options:
     add_visual(body, Kind.mjGEOM_BOX, color, size=half, pos=pos, **options)
 
 
-def add_rod(body: Any, color: Color, radius: float, start: Sequence[float], end: Sequence[float]) -> None:
+def add_rod(
+    body: Any, color: Color, radius: float, start: Sequence[float], end: Sequence[float]
+) -> None:
     """Adds a visual cylinder between two points (3,), m."""
     add_visual(body, Kind.mjGEOM_CYLINDER, color, size=(radius, 0, 0), fromto=(*start, *end))
 
@@ -64,13 +68,18 @@ class Shape(NamedTuple):
         add_visual(body, self.kind, self.color, self.group, **self.options)
 
 
-def mark(center: Place, size: tuple[float, ...], color: Color = WHITE, level: int = 1, yaw: float = 0.0) -> Shape:
-    """Returns a flat box of extents `size` (2,), or a disc of radius `size` (1,), m, turned by `yaw` about z.
+def mark(
+    center: Place, size: tuple[float, ...], color: Color = WHITE, level: int = 1, yaw: float = 0.0
+) -> Shape:
+    """Returns a flat box of extents `size` (2,), or a disc of radius `size` (1,), m, turned by
+    `yaw` about z.
 
-    `center` is that of its top, with the height of what it is painted on; higher levels cover lower ones.
+    `center` is that of its top, with the height of what it is painted on; higher levels cover lower
+    ones.
     """
     x, y, z = center
-    half, disc = LAYER * level / 2, len(size) == 1
+    half = LAYER * level / 2
+    disc = len(size) == 1
     extents = (size[0], half, 0) if disc else (size[0] / 2, size[1] / 2, half)
     options = {"size": extents, "pos": (x, y, z + half), "quat": about_z(yaw)}
     return Shape(Kind.mjGEOM_CYLINDER if disc else Kind.mjGEOM_BOX, color, GROUND_GROUP, options)
@@ -78,7 +87,12 @@ def mark(center: Place, size: tuple[float, ...], color: Color = WHITE, level: in
 
 def rod(start: Place, end: Place, radius: float, color: Color) -> Shape:
     """Returns a cylinder between two points, m, such as a goal post."""
-    return Shape(Kind.mjGEOM_CYLINDER, color, VISUAL_GROUP, {"size": (radius, 0, 0), "fromto": (*start, *end)})
+    return Shape(
+        Kind.mjGEOM_CYLINDER,
+        color,
+        VISUAL_GROUP,
+        {"size": (radius, 0, 0), "fromto": (*start, *end)},
+    )
 
 
 def tuft(center: Place, half: Place, color: Color) -> Shape:
@@ -88,7 +102,12 @@ def tuft(center: Place, half: Place, color: Color) -> Shape:
 
 def slab(center: Place, size: Place, color: Color) -> Shape:
     """Returns an upright box of extents (3,), m, such as the side of a stage."""
-    return Shape(Kind.mjGEOM_BOX, color, VISUAL_GROUP, {"size": [extent / 2 for extent in size], "pos": center})
+    return Shape(
+        Kind.mjGEOM_BOX,
+        color,
+        VISUAL_GROUP,
+        {"size": [extent / 2 for extent in size], "pos": center},
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,29 +131,51 @@ def rectangle(x: Point, y: Point, color: Color, level: int = 1, z: float = 0.0) 
     return mark((sum(x) / 2, sum(y) / 2, z), (x[1] - x[0], y[1] - y[0]), color, level)
 
 
-def line(start: Point, end: Point, color: Color = WHITE, width: float = 0.05, level: int = 3, z: float = 0.0) -> Shape:
+def line(
+    start: Point,
+    end: Point,
+    color: Color = WHITE,
+    width: float = 0.05,
+    level: int = 3,
+    z: float = 0.0,
+) -> Shape:
     """Returns a straight line between two points (2,), m."""
-    (x0, y0), (x1, y1) = start, end
+    (x0, y0) = start
+    (x1, y1) = end
     yaw = float(np.arctan2(y1 - y0, x1 - x0))
-    return mark(((x0 + x1) / 2, (y0 + y1) / 2, z), (float(np.hypot(x1 - x0, y1 - y0)), width), color, level, yaw)
+    return mark(
+        ((x0 + x1) / 2, (y0 + y1) / 2, z),
+        (float(np.hypot(x1 - x0, y1 - y0)), width),
+        color,
+        level,
+        yaw,
+    )
 
 
-def outline(x: Point, y: Point, color: Color = WHITE, width: float = 0.05, z: float = 0.0) -> tuple[Shape, ...]:
+def outline(
+    x: Point, y: Point, color: Color = WHITE, width: float = 0.05, z: float = 0.0
+) -> tuple[Shape, ...]:
     """Returns the four edges of a rectangle."""
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
-    return tuple(line(a, b, color, width, z=z) for a, b in zip(corners, corners[1:] + corners[:1], strict=True))
+    return tuple(
+        line(a, b, color, width, z=z)
+        for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
+    )
 
 
 def circle(center: Point, radius: float, width: float) -> tuple[Shape, ...]:
     """Returns a white circle as short lines."""
     angles = np.linspace(0, 2 * np.pi, 37)
     reach = (radius + width / 2) / np.cos(np.pi / 36) - width / 2  # the lines' outer edges meet
-    points = [(float(center[0] + reach * np.cos(a)), float(center[1] + reach * np.sin(a))) for a in angles]
+    points = [
+        (float(center[0] + reach * np.cos(a)), float(center[1] + reach * np.sin(a))) for a in angles
+    ]
     return tuple(line(a, b, width=width) for a, b in itertools.pairwise(points))
 
 
 Style = Literal["boards", "fence"]
-"""Looks of walls, through which a camera sees the robots: boards with a rail above, or wooden fences."""
+"""Looks of walls, through which a camera sees the robots: boards with a rail above, or wooden
+fences."""
 
 WALL_COLOR: Color = (0.90, 0.89, 0.86, 1.0)
 WALL_GROUP = 1
@@ -143,8 +184,12 @@ _BOARD = 0.28  # height of the boards as a fraction of the wall's
 _RAIL = 0.045  # half height of a fence's rails, m
 
 
-def side_wall(world: Any, style: Style, center: np.ndarray, half: tuple[float, float, float], yaw: float) -> None:
-    """Adds the look of a fixed wall of half extents (thickness, length, height) at its `center` (3,), m."""
+def side_wall(
+    world: Any, style: Style, center: np.ndarray, half: tuple[float, float, float], yaw: float
+) -> None:
+    """Adds the look of a fixed wall of half extents (thickness, length, height) at its `center`
+    (3,), m.
+    """
     x, y, z = half
     quat = about_z(yaw)
 
@@ -167,7 +212,9 @@ def side_wall(world: Any, style: Style, center: np.ndarray, half: tuple[float, f
 
 
 def gate_wall(body: Any, style: Style, half: np.ndarray, inner: float) -> None:
-    """Adds the look of a wall of half extents (3,), m, to its body; `inner` is the sign of y towards the gap."""
+    """Adds the look of a wall of half extents (3,), m, to its body; `inner` is the sign of y
+    towards the gap.
+    """
     x, y, z = half
     if style == "fence":
         for part in (0.22, 0.56, 0.9):

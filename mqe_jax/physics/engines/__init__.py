@@ -22,12 +22,14 @@ ENGINES: dict[str, str] = {
     "c": "mqe_jax.physics.engines.c:CEngine",
     "jax": "mqe_jax.physics.engines.mjx:JaxEngine",
 }
-"""Engines by name as MODULE:CLASS, imported on demand: a new one is one line. `auto` is the first that is preferred
-on this machine."""
+"""Engines by name as MODULE:CLASS, imported on demand: a new one is one line. `auto` is the first
+that is preferred on this machine."""
 
 
 def resolve(impl: str = "auto") -> str:
-    """Returns the name of an engine that can run here; `auto` is warp on an NVIDIA GPU, c on a CPU, else jax."""
+    """Returns the name of an engine that can run here; `auto` is warp on an NVIDIA GPU, c on a CPU,
+    else jax.
+    """
     if known_name("impl: unknown engine", impl, ("auto", *ENGINES)) == "auto":
         return next(name for name in ENGINES if pkgutil.resolve_name(ENGINES[name]).is_preferred())
     if (obstacle := pkgutil.resolve_name(ENGINES[impl]).obstacle()) is not None:
@@ -36,5 +38,7 @@ def resolve(impl: str = "auto") -> str:
 
 
 def make(model: mujoco.MjModel, *, impl: str = "auto", **options: Any) -> Engine:
-    """Creates an engine by name for a compiled model; the options are those of `Engine`; InputError as `resolve`."""
+    """Creates an engine by name for a compiled model; the options are those of `Engine`; InputError
+    as `resolve`.
+    """
     return pkgutil.resolve_name(ENGINES[resolve(impl)])(model, **options)

@@ -34,7 +34,8 @@ class CEngine(Engine):
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
         own = model.__copy__()
-        # No silent reset: a diverged environment keeps its non-finite state, so that the task can terminate it.
+        # No silent reset: a diverged environment keeps its non-finite state, so that the task can
+        # terminate it.
         own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         content = np.zeros(mujoco.mj_sizeModel(own), np.uint8)
         mujoco.mj_saveModel(own, None, content)
@@ -56,11 +57,16 @@ class CEngine(Engine):
         platform = jax.default_backend()
         if platform == "cpu":
             return None
-        return f"runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl 'warp' or 'jax'"
+        return (
+            f"runs on a CPU but JAX runs on {platform}: set JAX_PLATFORMS=cpu, or choose impl "
+            "'warp' or 'jax'"
+        )
 
     def blank(self) -> "mjx.Data":
         device = jax.local_devices(backend="cpu")[0]
-        return private.without_pointers(private.load_mjx().make_data(self.model, device, impl="cpp"))
+        return private.without_pointers(
+            private.load_mjx().make_data(self.model, device, impl="cpp")
+        )
 
     def advance(
         self, data: "mjx.Data", fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
@@ -85,7 +91,9 @@ class CEngine(Engine):
         return data, jnp.zeros((), bool)
 
     def _number(self, *options: Any) -> int:
-        """Returns a number that names the physics with these options: of its content, not of this process."""
+        """Returns a number that names the physics with these options: of its content, not of this
+        process.
+        """
         motors = () if self.motors is None else dataclasses.astuple(self.motors)
         content = hashlib.sha256(self._content)
         content.update(repr((*options, [np.asarray(value).tolist() for value in motors])).encode())
@@ -93,10 +101,13 @@ class CEngine(Engine):
 
 
 class _Stepper:
-    """Steps environments of one model in batches, which it keeps for the next call until its engine is gone."""
+    """Steps environments of one model in batches, which it keeps for the next call until its engine
+    is gone.
+    """
 
     def __init__(self, model: mujoco.MjModel, motors: Motors | None) -> None:
-        self._model, self._motors = model, motors
+        self._model = model
+        self._motors = motors
         self._idle: dict[tuple[int, tuple[str, ...], bool], list[tuple[Batch, _Rows | None]]] = {}
         self._lock = threading.Lock()
         self._retired = False
@@ -105,12 +116,19 @@ class _Stepper:
         return _Stepper, (self._model, self._motors)  # a copy has its own batches
 
     def retire(self) -> None:
-        """Frees its batches, and those of later calls when they end. It takes no lock: a finaliser may interrupt."""
+        """Frees its batches, and those of later calls when they end.
+
+        It takes no lock: a finaliser may interrupt.
+        """
         self._retired = True
         self._idle = {}
 
-    def call(self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: np.ndarray) -> np.ndarray:
-        """Returns positions, velocities, accelerations and sensors after some physics steps (N, sum of the sizes)."""
+    def call(
+        self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: np.ndarray
+    ) -> np.ndarray:
+        """Returns positions, velocities, accelerations and sensors after some physics steps (N, sum
+        of the sizes).
+        """
         qpos, *rest = arrays
         lead = qpos.shape[:-1]
         count = int(np.prod(lead)) if lead else 1
@@ -118,7 +136,9 @@ class _Stepper:
         key = count, names, forced
         with self._lock:
             idle = self._idle.setdefault(key, [])
-            batch, rows = idle.pop() if idle else (Batch(self._model, nsim=count), self._repeat(count))
+            batch, rows = (
+                idle.pop() if idle else (Batch(self._model, nsim=count), self._repeat(count))
+            )
         try:
             row = self._step_batch(batch, rows, names, forced, substeps, flat)
         finally:
@@ -135,7 +155,9 @@ class _Stepper:
         substeps: int,
         flat: Iterator[np.ndarray],
     ) -> np.ndarray:
-        """Returns the results of a batch (N, sum of the sizes), from the arguments of the call (N, ...)."""
+        """Returns the results of a batch (N, sum of the sizes), from the arguments of the call (N,
+        ...).
+        """
         start = {name: next(flat) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
         for name, values in start.items():
             batch.bind(name)[:] = values
@@ -156,37 +178,51 @@ class _Stepper:
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
     def _repeat(self, count: int) -> _Rows | None:
-        """Returns motors, gain (count, J) and bias (count, J, 3) of the model, repeated for each environment."""
+        """Returns motors, gain (count, J) and bias (count, J, 3) of the model, repeated for each
+        environment.
+        """
         if self._motors is None:
             return None
-        gain, bias = self._model.actuator_gainprm[:, 0], self._model.actuator_biasprm[:, :3]
-        gain, bias = np.tile(gain.astype(np.float32), (count, 1)), _columns(np.tile(bias, (count, 1, 1)))
+        gain = self._model.actuator_gainprm[:, 0]
+        bias = self._model.actuator_biasprm[:, :3]
+        gain = np.tile(gain.astype(np.float32), (count, 1))
+        bias = _columns(np.tile(bias, (count, 1, 1)))
         return self._motors.repeat(count), gain, bias
 
 
 def _drive(
-    batch: Batch, motors: Motors, rows: _Rows, substeps: int, names: tuple[str, ...], start: dict[str, np.ndarray]
+    batch: Batch,
+    motors: Motors,
+    rows: _Rows,
+    substeps: int,
+    names: tuple[str, ...],
+    start: dict[str, np.ndarray],
 ) -> None:
     """Steps a batch from `start`, with the motors' limits in every physics step.
 
-    The limits seldom act on robots that walk. So the environments whose motors are idle (`Motors.idle`), unless
-    they are few, make their physics steps in one call without limits. The states between these steps are then
-    checked likewise. The environments that fail a check step from `start` with the limits evaluated in every
-    physics step. The result is that of doing so in all environments, to the last bit.
+    The limits seldom act on robots that walk. So the environments whose motors are idle
+    (`Motors.idle`), unless they are few, make their physics steps in one call without limits. The
+    states between these steps are then checked likewise. The environments that fail a check step
+    from `start` with the limits evaluated in every physics step. The result is that of doing so in
+    all environments, to the last bit.
     """
-    angles, speeds = motors.joint_qpos, motors.joint_qvel
+    angles = motors.joint_qpos
+    speeds = motors.joint_qvel
     every, gain, bias = rows
     if "actuator_gainprm" in names:
         gain = batch.expand("actuator_gainprm")[..., 0].astype(np.float32)
     if "actuator_biasprm" in names:
         bias = _columns(batch.expand("actuator_biasprm")[..., :3])
-    asked, position, velocity = start["ctrl"], start["qpos"][:, angles], start["qvel"][:, speeds]
+    asked = start["ctrl"]
+    position = start["qpos"][:, angles]
+    velocity = start["qvel"][:, speeds]
     idle = every.idle(asked, position, velocity, gain, bias)
     if np.count_nonzero(idle) > SHARE * len(idle):
         ids = np.flatnonzero(idle)
         path = batch.rollout(substeps, record=("qpos", "qvel"), ids=ids)
         for step in range(substeps - 1):
-            position[ids], velocity[ids] = path["qpos"][:, step][:, angles], path["qvel"][:, step][:, speeds]
+            position[ids] = path["qpos"][:, step][:, angles]
+            velocity[ids] = path["qvel"][:, step][:, speeds]
             idle &= every.idle(asked, position, velocity, gain, bias)
         # Unlike steps, a rollout ends where the engine warns.
         idle &= batch.bind("time") > (substeps - 0.5) * motors.timestep
@@ -198,7 +234,9 @@ def _drive(
             batch.bind(name)[ids] = values[ids]
         batch.bind("time")[ids] = 0.0
         if len(ids) < batch.nsim:
-            every, gain, bias = motors.repeat(len(ids)), gain[ids], bias[ids]
+            every = motors.repeat(len(ids))
+            gain = gain[ids]
+            bias = bias[ids]
         _step_limited(batch, every, substeps, ids, gain, bias)
     _clamp(batch, motors, slice(None))
 
@@ -206,11 +244,17 @@ def _drive(
 def _step_limited(
     batch: Batch, motors: Motors, substeps: int, ids: np.ndarray, gain: np.ndarray, bias: np.ndarray
 ) -> None:
-    """Steps the environments `ids` with the limits evaluated in every physics step; `motors` has a row for each."""
+    """Steps the environments `ids` with the limits evaluated in every physics step; `motors` has a
+    row for each.
+    """
     rows = slice(None) if len(ids) == batch.nsim else ids[:, None]  # numpy is faster with a slice
-    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    angles, speeds = motors.joint_qpos, motors.joint_qvel
-    asked, armature = ctrl[ids].astype(np.float32), batch.expand("dof_armature")
+    qpos = batch.bind("qpos")
+    qvel = batch.bind("qvel")
+    ctrl = batch.bind("ctrl")
+    angles = motors.joint_qpos
+    speeds = motors.joint_qvel
+    asked = ctrl[ids].astype(np.float32)
+    armature = batch.expand("dof_armature")
     base = armature[rows, speeds]
     try:
         for _ in range(substeps):
@@ -224,9 +268,13 @@ def _step_limited(
 
 
 def _clamp(batch: Batch, motors: Motors, rows: Any) -> None:
-    """Clamps the joint speeds of environments after a physics step; `rows` is their column of ids, or a slice."""
-    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
-    angles, speeds = motors.joint_qpos, motors.joint_qvel
+    """Clamps the joint speeds of environments after a physics step; `rows` is their column of ids,
+    or a slice.
+    """
+    qpos = batch.bind("qpos")
+    qvel = batch.bind("qvel")
+    angles = motors.joint_qpos
+    speeds = motors.joint_qvel
     velocity = qvel[rows, speeds]
     if np.any(np.abs(velocity) > CLAMP * float(motors.speed.min())):
         qpos[rows, angles], qvel[rows, speeds] = motors.clamp(qpos[rows, angles], velocity)

@@ -1,7 +1,8 @@
 """The protocol of physics engines.
 
-The functions are written for one environment and batched by `jax.vmap`. Model parameters that differ between
-environments (friction, masses, motor strength) are passed to `Engine.step` as arrays named after `mjModel` fields.
+The functions are written for one environment and batched by `jax.vmap`. Model parameters that
+differ between environments (friction, masses, motor strength) are passed to `Engine.step` as arrays
+named after `mjModel` fields.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from mqe_jax.physics.robots.motors import Motors
 if TYPE_CHECKING:
     from mujoco import mjx
 
-STATE_FIELDS = tuple("qpos qvel qacc_warmstart ctrl mocap_pos mocap_quat xfrc_applied time sensordata".split())
+STATE_FIELDS = tuple(
+    "qpos qvel qacc_warmstart ctrl mocap_pos mocap_quat xfrc_applied time sensordata".split()
+)
 """Fields of `mjx.Data` that carry the state; all others are recomputed from them in every step."""
 
 
@@ -30,13 +33,15 @@ STATE_FIELDS = tuple("qpos qvel qacc_warmstart ctrl mocap_pos mocap_quat xfrc_ap
 class Engine(abc.ABC):
     """Steps one environment of a compiled model; batch with `jax.vmap`.
 
-    An engine defines `impl`, `blank` and `advance`, and where it cannot always run, `preferred` and `obstacle`.
+    An engine defines `impl`, `blank` and `advance`, and where it cannot always run, `preferred` and
+    `obstacle`.
     """
 
     impl: ClassVar[str]  # name of the engine in the registry
     model: mujoco.MjModel  # compiled model
     _: dataclasses.KW_ONLY
-    motors: Motors | None = None  # motors that drive its actuators; without them the actuators have no speed limit
+    # motors that drive its actuators; without them the actuators have no speed limit
+    motors: Motors | None = None
     num_substeps: int = 4  # physics steps per call of `step`
     num_envs: int = 4096  # environments for which buffers are sized that environments share
     contacts_per_env: int = 32
@@ -44,16 +49,21 @@ class Engine(abc.ABC):
     max_constraints_per_env: int = 160
     """Maximum constraints of each environment, for engines with such a limit (Warp's njmax)."""
     sparse_solver: bool | None = None
-    """Whether the solver skips the zeros between robots that do not touch, on Warp (`newton.py`); None: if it pays."""
+    """Whether the solver skips the zeros between robots that do not touch, on Warp (`newton.py`);
+    None: if it pays."""
 
     @classmethod
     def is_preferred(cls) -> bool:
-        """Returns whether `auto` chooses this engine on this machine, unless one before it in the registry is."""
+        """Returns whether `auto` chooses this engine on this machine, unless one before it in the
+        registry is.
+        """
         return False
 
     @classmethod
     def obstacle(cls) -> str | None:
-        """Returns why this machine cannot run the engine, as the end of "impl 'NAME' ..."; None if it can."""
+        """Returns why this machine cannot run the engine, as the end of "impl 'NAME' ..."; None if
+        it can.
+        """
         return None
 
     def holds(self, num_envs: int) -> bool:
@@ -68,15 +78,23 @@ class Engine(abc.ABC):
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances one environment by `num_substeps` physics steps under the control `data.ctrl`, which stays.
+        """Advances one environment by `num_substeps` physics steps under the control `data.ctrl`,
+        which stays.
 
-        `fields` are as of `step`, whose overflow flag it also returns; `forced` says whether `data.xfrc_applied` may
-        differ from zero.
+        `fields` are as of `step`, whose overflow flag it also returns; `forced` says whether
+        `data.xfrc_applied` may differ from zero.
         """
 
-    def init(self, qpos: jax.Array, qvel: jax.Array, mocap_pos: jax.Array, ctrl: jax.Array) -> mjx.Data:
-        """Returns the initial state of one environment, without a forward pass; `mocap_pos` are (nmocap, 3), m."""
-        as_float = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    def init(
+        self, qpos: jax.Array, qvel: jax.Array, mocap_pos: jax.Array, ctrl: jax.Array
+    ) -> mjx.Data:
+        """Returns the initial state of one environment, without a forward pass; `mocap_pos` are
+        (nmocap, 3), m.
+        """
+
+        def as_float(x):
+            return jnp.asarray(x, jnp.float32)
+
         return self._template.replace(
             qpos=as_float(qpos),
             qvel=as_float(qvel),
@@ -98,11 +116,13 @@ class Engine(abc.ABC):
         xfrc_applied: jax.Array | None = None,
         num_substeps: int | None = None,
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances one environment by steps under a constant control (nu,), joint targets (rad) or torques (N m).
+        """Advances one environment by steps under a constant control (nu,), joint targets (rad) or
+        torques (N m).
 
-        `fields` are the model fields that this environment overrides, by their `mjModel` names, `xfrc_applied` external
-        forces and torques on the bodies (nbody, 6), N and N m, world frame. Returns the state, and whether contacts or
-        constraints may have been dropped in any physics step () bool.
+        `fields` are the model fields that this environment overrides, by their `mjModel` names,
+        `xfrc_applied` external forces and torques on the bodies (nbody, 6), N and N m, world frame.
+        Returns the state, and whether contacts or constraints may have been dropped in any physics
+        step () bool.
         """
         data = data.replace(ctrl=ctrl.astype(jnp.float32))
         if xfrc_applied is not None:
@@ -112,12 +132,19 @@ class Engine(abc.ABC):
             return self.advance(data, dict(fields or {}), xfrc_applied is not None, substeps)
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
-        """Returns `first` where `choose` () is true, else `second`; copies only the state fields."""
-        merged = {name: jnp.where(choose, getattr(first, name), getattr(second, name)) for name in STATE_FIELDS}
+        """Returns `first` where `choose` () is true, else `second`; copies only the state
+        fields.
+        """
+        merged = {
+            name: jnp.where(choose, getattr(first, name), getattr(second, name))
+            for name in STATE_FIELDS
+        }
         return second.replace(**merged)
 
     @functools.cached_property
     def _template(self) -> mjx.Data:
-        """Template of `init`, created on first use: importing MJX takes a second, which `mqe tasks` avoids."""
+        """Template of `init`, created on first use: importing MJX takes a second, which `mqe tasks`
+        avoids.
+        """
         with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
             return self.blank()

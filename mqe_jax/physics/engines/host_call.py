@@ -1,9 +1,11 @@
-"""Host functions called from compiled programs by name and number, so that JAX's compilation cache can store them.
+"""Host functions called from compiled programs by name and number, so that JAX's compilation cache
+can store them.
 
-JAX does not store programs that contain its own callbacks, since those hold addresses of this process. Here a program
-holds a number that a function has in every process; XLA calls one handler, a C function made by ctypes, which finds the
-function by that number. The structures are those of XLA's stable C interface (`jax.ffi.include_dir()`,
-xla/ffi/api/c_api.h, version 0.3). With another version of it, JAX's callbacks do the same without being stored.
+JAX does not store programs that contain its own callbacks, since those hold addresses of this
+process. Here a program holds a number that a function has in every process; XLA calls one handler,
+a C function made by ctypes, which finds the function by that number. The structures are those of
+XLA's stable C interface (`jax.ffi.include_dir()`, xla/ffi/api/c_api.h, version 0.3). With another
+version of it, JAX's callbacks do the same without being stored.
 """
 
 import atexit
@@ -22,7 +24,9 @@ import numpy as np
 
 TARGET = "mqe_jax_host_call"
 _VERSION = 0, 3
-_METADATA, _EXECUTE, _INTERNAL = 1, 3, 13
+_METADATA = 1
+_EXECUTE = 3
+_INTERNAL = 13
 _DTYPES = {1: np.bool_, 4: np.int32, 5: np.int64, 8: np.uint32, 11: np.float32, 12: np.float64}
 
 HostFunction = Callable[..., np.ndarray]
@@ -45,13 +49,19 @@ def _structure(name: str, *fields: tuple[str, Any]) -> Any:
 
 _Extension._fields_ = [("struct_size", c_size_t), ("type", c_int), ("next", POINTER(_Extension))]
 _Version = _structure("_Version", ("major", c_int), ("minor", c_int))
-_Buffer = _structure("_Buffer", ("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64)))
+_Buffer = _structure(
+    "_Buffer", ("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64))
+)
 _Items = ("size", c_int64), ("types", c_void_p)
-_List = _structure("_List", *_Items, ("items", POINTER(POINTER(_Buffer))))  # XLA_FFI_Args and XLA_FFI_Rets
-_Attributes = _structure("_Attributes", *_Items, ("names", c_void_p), ("items", POINTER(POINTER(_Scalar))))
+# XLA_FFI_Args and XLA_FFI_Rets
+_List = _structure("_List", *_Items, ("items", POINTER(POINTER(_Buffer))))
+_Attributes = _structure(
+    "_Attributes", *_Items, ("names", c_void_p), ("items", POINTER(POINTER(_Scalar)))
+)
 _Error = _structure("_Error", ("message", c_char_p), ("code", c_int))
 _Create = ctypes.CFUNCTYPE(c_void_p, POINTER(_Error))
-_Api = _structure("_Api", ("version", _Version), ("internal", c_void_p), ("create_error", _Create))  # its beginning
+# its beginning
+_Api = _structure("_Api", ("version", _Version), ("internal", c_void_p), ("create_error", _Create))
 _Frame = _structure(
     "_Frame",
     ("api", POINTER(_Api)),
@@ -75,16 +85,23 @@ _KEPT = 64
 _owners: dict[int, weakref.WeakKeyDictionary[Any, HostFunction]] = {}
 """Functions of each number by their owners; they do the same, so any whose owner lives will do."""
 _latest: dict[int, HostFunction] = {}
-"""The last function of each of the last `_KEPT` numbers, for programs that are called, or run, without an owner."""
+"""The last function of each of the last `_KEPT` numbers, for programs that are called, or run,
+without an owner."""
 
 
 def host_call(
-    number: int, owner: Any, function: HostFunction, result: jax.ShapeDtypeStruct, arguments: Sequence[jax.Array]
+    number: int,
+    owner: Any,
+    function: HostFunction,
+    result: jax.ShapeDtypeStruct,
+    arguments: Sequence[jax.Array],
 ) -> jax.Array:
-    """Returns the result of a host function in a compiled program; batched with all its arguments by `vmap`.
+    """Returns the result of a host function in a compiled program; batched with all its arguments
+    by `vmap`.
 
-    Functions of one number (64 bits), the same in every process, do the same; those whose owners live are preferred,
-    which they must not reference. `result` has the shape and dtype without batch axes.
+    Functions of one number (64 bits), the same in every process, do the same; those whose owners
+    live are preferred, which they must not reference. `result` has the shape and dtype without
+    batch axes.
     """
     _owners.setdefault(number, weakref.WeakKeyDictionary())[owner] = function
     _latest.pop(number, None)
@@ -92,9 +109,13 @@ def host_call(
     while len(_latest) > _KEPT:
         _latest.pop(next(iter(_latest)), None)
     if FITS:
-        out = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")(*arguments, number=np.int64(number))
+        out = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")(
+            *arguments, number=np.int64(number)
+        )
     else:
-        out = jax.pure_callback(functools.partial(_call, number), result, *arguments, vmap_method="broadcast_all")
+        out = jax.pure_callback(
+            functools.partial(_call, number), result, *arguments, vmap_method="broadcast_all"
+        )
     assert isinstance(out, jax.Array)
     return out
 
@@ -141,10 +162,14 @@ def _handler(pointer: Any) -> int | None:
 
 
 def _fits() -> bool:
-    """Returns whether JAX's C interface has this version, or a later one of the same major version."""
+    """Returns whether JAX's C interface has this version, or a later one of the same major
+    version.
+    """
     header = Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h"
     text = header.read_text("utf-8", "replace") if header.is_file() else ""
-    major, minor = (re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR"))
+    major, minor = (
+        re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")
+    )
     return bool(major and minor and int(major[1]) == _VERSION[0] and int(minor[1]) >= _VERSION[1])
 
 
@@ -156,7 +181,9 @@ if FITS:
 
 @atexit.register
 def _finish() -> None:
-    """Waits for programs whose results exist: their threads cannot call Python while the interpreter ends."""
+    """Waits for programs whose results exist: their threads cannot call Python while the
+    interpreter ends.
+    """
     for array in jax.live_arrays():
         with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
             array.block_until_ready()

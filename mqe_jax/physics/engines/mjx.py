@@ -21,21 +21,32 @@ from mqe_jax.physics.robots.motors import Motors
 if TYPE_CHECKING:
     from mujoco import mjx
 
-_BIT, _JACOBIAN = mujoco.mjtDisableBit, mujoco.mjtJacobian
-_FRICTION, _PASSIVE = _BIT.mjDSBL_FRICTIONLOSS, _BIT.mjDSBL_SPRING | _BIT.mjDSBL_DAMPER
-_MAX_DENSE = 50  # degrees of freedom up to which Warp's line search needs no extra kernels for dense Jacobians
-# Degrees of freedom above which Warp's solver skips zeros by default. On an H200 this gains nothing with four robots
-# (78, the most of the paper) and a third with eight (150): sizes/warp in results/measurements.json.
+_BIT = mujoco.mjtDisableBit
+_JACOBIAN = mujoco.mjtJacobian
+_FRICTION: int = int(_BIT.mjDSBL_FRICTIONLOSS)
+_PASSIVE: int = int(_BIT.mjDSBL_SPRING) | int(_BIT.mjDSBL_DAMPER)
+# degrees of freedom up to which Warp's line search needs no extra kernels for dense Jacobians
+_MAX_DENSE = 50
+# Degrees of freedom above which Warp's solver skips zeros by default. On an H200 this gains nothing
+# with four robots (78, the most of the paper) and a third with eight (150): sizes/warp in
+# results/measurements.json.
 _MAX_FULL = 80
 
-# The model fields of each term of the dynamics; where all are zero, so is the term. Without springs and dampers Warp
-# and MuJoCo compute no passive force at all, so theirs include gravity compensation and adhesion.
+# The model fields of each term of the dynamics; where all are zero, so is the term. Without springs
+# and dampers Warp and MuJoCo compute no passive force at all, so theirs include gravity
+# compensation and adhesion.
 _TERMS: dict[int, tuple[str, ...]] = {
     _FRICTION: ("dof_frictionloss", "tendon_frictionloss"),
     _PASSIVE: (
         *("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"),
         *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
-        *("actuator_damping", "actuator_dampingpoly", "body_gravcomp", "geom_adhesion", "pair_adhesion"),
+        *(
+            "actuator_damping",
+            "actuator_dampingpoly",
+            "body_gravcomp",
+            "geom_adhesion",
+            "pair_adhesion",
+        ),
     ),
 }
 
@@ -47,14 +58,19 @@ class MjxEngine(Engine):
     unroll = 1
     """Physics steps in one iteration of the loop over them; more compile longer."""
     last_apart = False
-    """Whether the last physics step is not in the loop, and the others compute no sensors, which nothing reads."""
+    """Whether the last physics step is not in the loop, and the others compute no sensors, which
+    nothing reads."""
 
     @abc.abstractmethod
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """Advances by one physics step of `mjx_model`, possibly with other field values; returns the overflow flag."""
+        """Advances by one physics step of `mjx_model`, possibly with other field values; returns
+        the overflow flag.
+        """
 
     def unused_terms(self, fields: Collection[str]) -> int:
-        """Returns the disable flags of terms that need no computation where environments override some fields."""
+        """Returns the disable flags of terms that need no computation where environments override
+        some fields.
+        """
         return 0
 
     def advance(
@@ -65,21 +81,31 @@ class MjxEngine(Engine):
         model = _disable(model, self.unused_terms(fields))
         loop = _disable(model, _BIT.mjDSBL_SENSOR) if self.last_apart else model
 
-        def substep(model: mjx.Model, carry: tuple[mjx.Data, jax.Array]) -> tuple[mjx.Data, jax.Array]:
+        def substep(
+            model: mjx.Model, carry: tuple[mjx.Data, jax.Array]
+        ) -> tuple[mjx.Data, jax.Array]:
             data, overflow = self.physics_step(*self._drive(model, carry[0], ctrl))
             return data, carry[1] | overflow
 
-        carry, length = (data, jnp.zeros((), bool)), num_substeps - self.last_apart
-        carry, _ = jax.lax.scan(lambda carry, _: (substep(loop, carry), None), carry, None, length, unroll=self.unroll)
+        carry = (data, jnp.zeros((), bool))
+        length = num_substeps - self.last_apart
+        carry, _ = jax.lax.scan(
+            lambda carry, _: (substep(loop, carry), None), carry, None, length, unroll=self.unroll
+        )
         data, overflow = substep(model, carry) if self.last_apart else carry
         return self._clamp(data.replace(ctrl=ctrl)), overflow
 
-    def _drive(self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array) -> tuple[mjx.Model, mjx.Data]:
-        """Returns model and data for one physics step: the motors' armature and control, and the clamped joints."""
+    def _drive(
+        self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array
+    ) -> tuple[mjx.Model, mjx.Data]:
+        """Returns model and data for one physics step: the motors' armature and control, and the
+        clamped joints.
+        """
         motors = self.motors
         if motors is None:
             return model, data
-        gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
+        gain = model.actuator_gainprm[:, 0]
+        bias = model.actuator_biasprm[:, :3]
         ctrl, added = motors.limit(jnp, ctrl, *self._joints(data, motors), gain, bias)
         armature = model.dof_armature + scatter(np.zeros(self.model.nv), motors.joint_qvel, added)
         return model.replace(dof_armature=armature), self._clamp(data).replace(ctrl=ctrl)
@@ -90,7 +116,8 @@ class MjxEngine(Engine):
         if motors is None:
             return data
         position, velocity = self._joints(data, motors)
-        qpos, qvel = scatter(data.qpos, motors.joint_qpos, position), scatter(data.qvel, motors.joint_qvel, velocity)
+        qpos = scatter(data.qpos, motors.joint_qpos, position)
+        qvel = scatter(data.qvel, motors.joint_qvel, velocity)
         return data.replace(qpos=qpos, qvel=qvel)
 
     def _joints(self, data: mjx.Data, motors: Motors) -> tuple[jax.Array, jax.Array]:
@@ -119,7 +146,9 @@ class JaxEngine(MjxEngine):
         return private.load_mjx().make_data(self.model, jax.local_devices()[0], impl="jax")
 
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """Advances by one physics step; contacts may have been dropped if the capped contact list is full."""
+        """Advances by one physics step; contacts may have been dropped if the capped contact list
+        is full.
+        """
         data = self._step(model, data)
         contact = private.contact(data)
         if len(contact.dist) == self._step.max_contacts:
@@ -130,7 +159,8 @@ class JaxEngine(MjxEngine):
 class WarpEngine(MjxEngine):
     """MJX-Warp on an NVIDIA GPU; environments share a contact buffer of fixed size.
 
-    It launches each kernel also where it adds zero, so terms that are zero for the whole model are disabled.
+    It launches each kernel also where it adds zero, so terms that are zero for the whole model are
+    disabled.
     """
 
     impl = "warp"
@@ -143,11 +173,15 @@ class WarpEngine(MjxEngine):
         private.keep_streams()
         self._model = _with_jacobian(model)
         device = jax.local_devices()[0]
-        self.mjx_model = private.without_warnings(self._mjx.put_model(self._model, device, impl="warp"))
+        self.mjx_model = private.without_warnings(
+            self._mjx.put_model(self._model, device, impl="warp")
+        )
         needs = private.sparse_newton_needs(self.mjx_model)
         if needs and self.sparse_solver:
             fail("sparse_solver", True, f"None or False: it needs {needs}")
-        if not needs and (model.nv > _MAX_FULL if self.sparse_solver is None else self.sparse_solver):
+        if not needs and (
+            model.nv > _MAX_FULL if self.sparse_solver is None else self.sparse_solver
+        ):
             self.mjx_model = private.with_sparse_newton(self.mjx_model)
 
     @classmethod
@@ -160,7 +194,9 @@ class WarpEngine(MjxEngine):
     def obstacle(cls) -> str | None:
         if private.warp_is_installed():
             return None
-        return "needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'"
+        return (
+            "needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'"
+        )
 
     def holds(self, num_envs: int) -> bool:
         return num_envs <= self.num_envs
@@ -171,12 +207,16 @@ class WarpEngine(MjxEngine):
         return self._mjx.make_data(self._model, jax.local_devices()[0], impl="warp", **sizes)
 
     def unused_terms(self, fields: Collection[str]) -> int:
-        """Returns the disable flags of terms that are zero for the model, and that no field of environments changes."""
-        model, flags = self.model, 0
+        """Returns the disable flags of terms that are zero for the model, and that no field of
+        environments changes.
+        """
+        model = self.model
+        flags = 0
         for flag, names in _TERMS.items():
             if not any(name in fields or np.any(getattr(model, name)) for name in names):
                 flags |= flag
-        # Flexes and fluids add passive forces; without dampers, implicit integrators ignore the actuators' derivatives.
+        # Flexes and fluids add passive forces; without dampers, implicit integrators ignore the
+        # actuators' derivatives.
         fluid = (model.opt.density, model.opt.viscosity, *model.opt.wind)
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER or model.nflex or any(fluid):
             flags &= ~_PASSIVE
@@ -185,7 +225,9 @@ class WarpEngine(MjxEngine):
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances by physics steps; the overflow flag is Warp's own, which it sets but never clears."""
+        """Advances by physics steps; the overflow flag is Warp's own, which it sets but never
+        clears.
+        """
         data, _ = super().advance(private.without_overflow(data), fields, forced, num_substeps)
         return data, private.overflow(data)
 
@@ -194,7 +236,9 @@ class WarpEngine(MjxEngine):
 
 
 def _with_jacobian(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns the model, or a copy with dense Jacobians where it leaves the choice and they take fewer kernels."""
+    """Returns the model, or a copy with dense Jacobians where it leaves the choice and they take
+    fewer kernels.
+    """
     if model.opt.jacobian != _JACOBIAN.mjJAC_AUTO or model.nv > _MAX_DENSE:
         return model
     model = copy.copy(model)

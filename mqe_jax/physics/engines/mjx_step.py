@@ -1,9 +1,10 @@
 """MJX-JAX's physics step with the contacts of MuJoCo's C engine.
 
-MJX-JAX detects no contact with a box before the surfaces meet, whatever the margin. Here collisions are computed on
-spheres and capsules inflated by their margins; distances and positions are then those of the original surfaces.
-Between a plane and a box MJX-JAX keeps only corners within 1 mm of the deepest one; here all four lower corners count.
-It also misses or misplaces contacts between a capsule and an edge of a box, which are corrected for moving boxes.
+MJX-JAX detects no contact with a box before the surfaces meet, whatever the margin. Here collisions
+are computed on spheres and capsules inflated by their margins; distances and positions are then
+those of the original surfaces. Between a plane and a box MJX-JAX keeps only corners within 1 mm of
+the deepest one; here all four lower corners count. It also misses or misplaces contacts between a
+capsule and an edge of a box, which are corrected for moving boxes.
 """
 
 import copy
@@ -17,8 +18,17 @@ from mujoco import mjx
 
 from mqe_jax.physics.engines import private
 
-_BEFORE_COLLISION = (mjx.kinematics, mjx.com_pos, mjx.camlight, mjx.tendon, mjx.crb, mjx.tendon_armature, mjx.factor_m)
-_CORNERS = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)], np.float32)  # one of each opposite pair
+_BEFORE_COLLISION = (
+    mjx.kinematics,
+    mjx.com_pos,
+    mjx.camlight,
+    mjx.tendon,
+    mjx.crb,
+    mjx.tendon_armature,
+    mjx.factor_m,
+)
+# one of each opposite pair
+_CORNERS = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)], np.float32)
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE))
 
 
@@ -32,14 +42,17 @@ class MarginStep:
         without_margins.geom_rbound[:] += inflation
         self.model = mjx.put_model(without_margins, jax.local_devices()[0], impl="jax")
         capped = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "max_contact_points") >= 0
-        self.max_contacts = int(model.numeric("max_contact_points").data[0]) if capped else -1  # of each dimension
+        # of each dimension
+        self.max_contacts = int(model.numeric("max_contact_points").data[0]) if capped else -1
         self._inflation = inflation.astype(np.float32)
         self._size = model.geom_size.astype(np.float32)
         self._size[:, 0] += self._inflation
         self._margin = model.geom_margin.astype(np.float32) - self._inflation
 
     def __call__(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        """Advances one environment by one physics step; `model` is `self.model`, possibly with other field values."""
+        """Advances one environment by one physics step; `model` is `self.model`, possibly with
+        other field values.
+        """
         data = self._forward_position(model, data)
         data = mjx.sensor_pos(model, data)
         data = mjx.fwd_velocity(model, data)
@@ -59,7 +72,9 @@ class MarginStep:
         return mjx.transmission(model, mjx.make_constraint(model, data))
 
     def _collision(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        inflated = model.replace(geom_size=jnp.asarray(self._size), geom_margin=jnp.asarray(self._margin))
+        inflated = model.replace(
+            geom_size=jnp.asarray(self._size), geom_margin=jnp.asarray(self._margin)
+        )
         if not private.contact(data).dist.size:
             return data
         contact = _contacts(inflated, data, self.max_contacts)
@@ -76,8 +91,8 @@ class MarginStep:
 def _contacts(model: mjx.Model, data: mjx.Data, cap: int) -> mjx.Contact:
     """Contacts by dimension, of each the deepest `cap`.
 
-    As `mjx.collision`, with `_plane_box`, and with `_capsule_box` for boxes that move: for all walls it would cost 7%
-    of a physics step in Narrow Gate.
+    As `mjx.collision`, with `_plane_box`, and with `_capsule_box` for boxes that move: for all
+    walls it would cost 7% of a physics step in Narrow Gate.
     """
     by_dimension: dict[int, list[Any]] = {}
     moves = model.body_weldid[model.geom_bodyid] != 0
@@ -92,10 +107,14 @@ def _contacts(model: mjx.Model, data: mjx.Data, cap: int) -> mjx.Contact:
                 both = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
                 nearest = _capsule_box(model, data, geom[rows])
                 corrected = _correct(dist[both], pos[both], frame[both], *nearest)
-                dist, pos, frame = (x.at[both].set(y) for x, y in zip((dist, pos, frame), corrected, strict=True))
+                dist, pos, frame = (
+                    x.at[both].set(y) for x, y in zip((dist, pos, frame), corrected, strict=True)
+                )
         count = len(dist) // len(geom)
         contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), pairs.contact)
-        by_dimension.setdefault(pairs.condim, []).append(contact.replace(dist=dist, pos=pos, frame=frame))
+        by_dimension.setdefault(pairs.condim, []).append(
+            contact.replace(dist=dist, pos=pos, frame=frame)
+        )
     kept = []
     for _, parts in sorted(by_dimension.items()):
         contact = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
@@ -106,28 +125,46 @@ def _contacts(model: mjx.Model, data: mjx.Data, cap: int) -> mjx.Contact:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *kept)
 
 
-def _plane_box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns distances (4 N,), positions (4 N, 3) and frames (4 N, 3, 3) of the lower corners of N boxes on planes."""
+def _plane_box(
+    model: mjx.Model, data: mjx.Data, geom: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns distances (4 N,), positions (4 N, 3) and frames (4 N, 3, 3) of the lower corners of N
+    boxes on planes.
+    """
     plane, box = geom.T
     normal = data.geom_xmat[plane][:, None, :, 2]
-    corners = jnp.sum((_CORNERS * model.geom_size[box][:, None])[..., None, :] * data.geom_xmat[box][:, None], axis=-1)
+    corners = jnp.sum(
+        (_CORNERS * model.geom_size[box][:, None])[..., None, :] * data.geom_xmat[box][:, None],
+        axis=-1,
+    )
     corners = jnp.where(jnp.sum(corners * normal, axis=-1, keepdims=True) > 0.0, -corners, corners)
     corners = corners + data.geom_xpos[box][:, None]
     dist = jnp.sum((corners - data.geom_xpos[plane][:, None]) * normal, axis=-1, keepdims=True)
     frame = private.make_frames(normal[:, 0])
-    return dist.ravel(), (corners - 0.5 * dist * normal).reshape(-1, 3), jnp.repeat(frame, 4, axis=0)
+    return (
+        dist.ravel(),
+        (corners - 0.5 * dist * normal).reshape(-1, 3),
+        jnp.repeat(frame, 4, axis=0),
+    )
 
 
-def _capsule_box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns distances (N,), positions (N, 3) and normals (N, 3) where N capsules are nearest to boxes.
+def _capsule_box(
+    model: mjx.Model, data: mjx.Data, geom: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns distances (N,), positions (N, 3) and normals (N, 3) where N capsules are nearest to
+    boxes.
 
-    The squared distance to the box is a convex, piecewise quadratic function of the position t in [-1, 1] on the
-    capsule's axis. Its minimum is between the two breakpoints of its derivative at which the sign changes.
+    The squared distance to the box is a convex, piecewise quadratic function of the position t in
+    [-1, 1] on the capsule's axis. Its minimum is between the two breakpoints of its derivative at
+    which the sign changes.
     """
     capsule, box = geom.T
-    turn, half = data.geom_xmat[box], model.geom_size[box]
-    radius, length = model.geom_size[capsule][:, :1], model.geom_size[capsule][:, 1:2]
-    center = jnp.sum(turn * (data.geom_xpos[capsule] - data.geom_xpos[box])[..., None], axis=1)  # box frame
+    turn = data.geom_xmat[box]
+    half = model.geom_size[box]
+    radius = model.geom_size[capsule][:, :1]
+    length = model.geom_size[capsule][:, 1:2]
+    # box frame
+    center = jnp.sum(turn * (data.geom_xpos[capsule] - data.geom_xpos[box])[..., None], axis=1)
     axis = jnp.sum(turn * data.geom_xmat[capsule][:, :, 2][..., None], axis=1) * length
 
     def outside(t: jax.Array) -> jax.Array:
@@ -142,15 +179,21 @@ def _capsule_box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> tuple[jax
     slope = jnp.sum(outside(t) * axis[:, None], axis=-1)
     low = jnp.max(jnp.where(slope <= 0.0, t, -1.0), axis=1, keepdims=True)
     high = jnp.min(jnp.where(slope >= 0.0, t, 1.0), axis=1, keepdims=True)
-    slope_low, slope_high = (jnp.sum(outside(x) * axis[:, None], axis=-1) for x in (low, high))
+    slope_low = jnp.sum(outside(low) * axis[:, None], axis=-1)
+    slope_high = jnp.sum(outside(high) * axis[:, None], axis=-1)
     rise = slope_high - slope_low
-    way = jnp.where(rise > 0.0, jnp.clip(-slope_low / jnp.where(rise > 0.0, rise, 1.0), 0.0, 1.0), 0.0)
+    way = jnp.where(
+        rise > 0.0, jnp.clip(-slope_low / jnp.where(rise > 0.0, rise, 1.0), 0.0, 1.0), 0.0
+    )
     t = low + way * (high - low)
     gap = outside(t)[:, 0]
     size = jnp.linalg.norm(gap, axis=-1, keepdims=True)
     normal = -gap / jnp.maximum(size, 1e-9)
     point = center + t * axis + 0.5 * (radius + size) * normal
-    to_world = lambda x: jnp.sum(turn * x[:, None], axis=-1)  # noqa: E731
+
+    def to_world(x):
+        return jnp.sum(turn * x[:, None], axis=-1)
+
     return (
         jnp.where(size > 1e-6, size - radius, -jnp.inf)[:, 0],
         data.geom_xpos[box] + to_world(point),
@@ -159,15 +202,25 @@ def _capsule_box(model: mjx.Model, data: mjx.Data, geom: jax.Array) -> tuple[jax
 
 
 def _correct(
-    dist: jax.Array, pos: jax.Array, frame: jax.Array, true_dist: jax.Array, true_pos: jax.Array, normal: jax.Array
+    dist: jax.Array,
+    pos: jax.Array,
+    frame: jax.Array,
+    true_dist: jax.Array,
+    true_pos: jax.Array,
+    normal: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Replaces the two contacts of MJX-JAX for each capsule and box, where the deeper one is not at the true distance.
+    """Replaces the two contacts of MJX-JAX for each capsule and box, where the deeper one is not at
+    the true distance.
 
     They are kept where the capsule's axis enters the box (`true_dist` -inf).
     """
     count = len(true_dist)
     found = jnp.min(dist.reshape(count, 2), axis=1)
-    wrong = (jnp.abs(found - true_dist) > 1e-5) & (jnp.minimum(found, true_dist) < 0.0) & jnp.isfinite(true_dist)
+    wrong = (
+        (jnp.abs(found - true_dist) > 1e-5)
+        & (jnp.minimum(found, true_dist) < 0.0)
+        & jnp.isfinite(true_dist)
+    )
     none = jnp.ones(count)
     dist = jnp.where(wrong[:, None], jnp.stack([true_dist, none], axis=1), dist.reshape(count, 2))
     pos = jnp.where(wrong[:, None, None], true_pos[:, None], pos.reshape(count, 2, 3))

@@ -1,10 +1,10 @@
 """The Newton step on Warp without the zeros between robots that do not touch.
 
-The constraint solver factors H = M + J^T D J, which couples two degrees of freedom only within a robot and across a
-contact. MuJoCo Warp factors it as a dense matrix, so the work grows with the cube of the number of robots. Here each
-block column of the Cholesky factor U, H = U^T U, starts at its first block that can differ from zero: no block above
-it ever fills. The work of robots that do not touch is then linear in their number. The solution is the same, to
-rounding.
+The constraint solver factors H = M + J^T D J, which couples two degrees of freedom only within a
+robot and across a contact. MuJoCo Warp factors it as a dense matrix, so the work grows with the
+cube of the number of robots. Here each block column of the Cholesky factor U, H = U^T U, starts at
+its first block that can differ from zero: no block above it ever fills. The work of robots that do
+not touch is then linear in their number. The solution is the same, to rounding.
 """
 
 import functools
@@ -23,7 +23,9 @@ def _tops_of_inertia(
     size: int,
     tops: wp.array2d[int],
 ):
-    """Sets the first block of each block column that M can fill: that of the first degree of freedom of its robot."""
+    """Sets the first block of each block column that M can fill: that of the first degree of
+    freedom of its robot.
+    """
     env, block = wp.tid()
     top = block
     for dof in range(block * BLOCK, wp.min(block * BLOCK + BLOCK, size)):
@@ -40,7 +42,9 @@ def _tops_of_constraints(
     row_column: wp.array3d[int],
     tops: wp.array2d[int],
 ):
-    """Lowers the first block of each block column to that of any constraint in it, active or not."""
+    """Lowers the first block of each block column to that of any constraint in it, active or
+    not.
+    """
     env, thread = wp.tid()
     for group in range(thread, groups[env], THREADS):
         row = first_row[env, group]
@@ -63,14 +67,24 @@ def _factor(
     """Computes the blocks of U from `tops` down to the diagonal, one block column after another."""
     for i in range(blocks):
         top = tops[i]
-        corner = wp.tile_load(hessian, shape=(BLOCK, BLOCK), offset=(i * BLOCK, i * BLOCK), storage="shared")
+        corner = wp.tile_load(
+            hessian, shape=(BLOCK, BLOCK), offset=(i * BLOCK, i * BLOCK), storage="shared"
+        )
         for k in range(top, i):
-            panel = wp.tile_load(hessian, shape=(BLOCK, BLOCK), offset=(k * BLOCK, i * BLOCK), storage="shared")
+            panel = wp.tile_load(
+                hessian, shape=(BLOCK, BLOCK), offset=(k * BLOCK, i * BLOCK), storage="shared"
+            )
             for j in range(wp.max(top, tops[k]), k):
-                left = wp.tile_load(factor, shape=(BLOCK, BLOCK), offset=(j * BLOCK, k * BLOCK), storage="shared")
-                right = wp.tile_load(factor, shape=(BLOCK, BLOCK), offset=(j * BLOCK, i * BLOCK), storage="shared")
+                left = wp.tile_load(
+                    factor, shape=(BLOCK, BLOCK), offset=(j * BLOCK, k * BLOCK), storage="shared"
+                )
+                right = wp.tile_load(
+                    factor, shape=(BLOCK, BLOCK), offset=(j * BLOCK, i * BLOCK), storage="shared"
+                )
                 wp.tile_matmul(wp.tile_transpose(left), right, panel, alpha=-1.0)
-            above = wp.tile_load(factor, shape=(BLOCK, BLOCK), offset=(k * BLOCK, k * BLOCK), storage="shared")
+            above = wp.tile_load(
+                factor, shape=(BLOCK, BLOCK), offset=(k * BLOCK, k * BLOCK), storage="shared"
+            )
             wp.tile_lower_solve_inplace(wp.tile_transpose(above), panel)
             wp.tile_store(factor, panel, offset=(k * BLOCK, i * BLOCK))
             wp.tile_matmul(wp.tile_transpose(panel), panel, corner, alpha=-1.0)
@@ -80,9 +94,16 @@ def _factor(
 
 @functools.cache
 def _step_kernel(padded: int, size: int) -> Any:
-    """Returns the kernel for H (padded, padded), whose first `size` rows and columns are degrees of freedom."""
+    """Returns the kernel for H (padded, padded), whose first `size` rows and columns are degrees of
+    freedom.
+    """
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"enable_mathdx_gemm": False})
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        module_options={"enable_mathdx_gemm": False},
+    )
     def kernel(
         done: wp.array[bool],
         stale: wp.array[int],  # environments in which it is 0 keep their last step
@@ -106,17 +127,31 @@ def _step_kernel(padded: int, size: int) -> Any:
         for i in range(blocks):  # solve U^T y = gradient
             x_i = wp.tile_view(x, shape=(BLOCK, 1), offset=(i * BLOCK, 0))
             for k in range(tops[env, i], i):
-                panel = wp.tile_load(factor[env], shape=(BLOCK, BLOCK), offset=(k * BLOCK, i * BLOCK), storage="shared")
+                panel = wp.tile_load(
+                    factor[env],
+                    shape=(BLOCK, BLOCK),
+                    offset=(k * BLOCK, i * BLOCK),
+                    storage="shared",
+                )
                 x_k = wp.tile_view(x, shape=(BLOCK, 1), offset=(k * BLOCK, 0))
                 wp.tile_matmul(wp.tile_transpose(panel), x_k, x_i, alpha=-1.0)
-            corner = wp.tile_load(factor[env], shape=(BLOCK, BLOCK), offset=(i * BLOCK, i * BLOCK), storage="shared")
+            corner = wp.tile_load(
+                factor[env], shape=(BLOCK, BLOCK), offset=(i * BLOCK, i * BLOCK), storage="shared"
+            )
             wp.tile_lower_solve_inplace(wp.tile_transpose(corner), x_i)
         for i in range(blocks - 1, -1, -1):  # solve U x = y
             x_i = wp.tile_view(x, shape=(BLOCK, 1), offset=(i * BLOCK, 0))
-            corner = wp.tile_load(factor[env], shape=(BLOCK, BLOCK), offset=(i * BLOCK, i * BLOCK), storage="shared")
+            corner = wp.tile_load(
+                factor[env], shape=(BLOCK, BLOCK), offset=(i * BLOCK, i * BLOCK), storage="shared"
+            )
             wp.tile_upper_solve_inplace(corner, x_i)
             for k in range(tops[env, i], i):
-                panel = wp.tile_load(factor[env], shape=(BLOCK, BLOCK), offset=(k * BLOCK, i * BLOCK), storage="shared")
+                panel = wp.tile_load(
+                    factor[env],
+                    shape=(BLOCK, BLOCK),
+                    offset=(k * BLOCK, i * BLOCK),
+                    storage="shared",
+                )
                 x_k = wp.tile_view(x, shape=(BLOCK, 1), offset=(k * BLOCK, 0))
                 wp.tile_matmul(panel, x_i, x_k, alpha=-1.0)
 
@@ -131,17 +166,29 @@ def _step_kernel(padded: int, size: int) -> Any:
     return kernel
 
 
-def step(model: Any, data: Any, context: Any, skip_unchanged: bool = False, skip_noflip: bool = False) -> None:
+def step(
+    model: Any, data: Any, context: Any, skip_unchanged: bool = False, skip_noflip: bool = False
+) -> None:
     """Sets the Newton step of a solve, as MuJoCo Warp's own `_cholesky_factorize_solve` does."""
-    envs, padded, size = data.nworld, model.nv_pad, model.nv
+    envs = data.nworld
+    padded = model.nv_pad
+    size = model.nv
     blocks = padded // BLOCK
     if not skip_unchanged:  # the first step of a solve, in which the constraints stay the same
         context.tops = wp.empty((envs, blocks), dtype=int)
         inertia = [model.M_rowadr, model.M_colind, size]
         wp.launch(_tops_of_inertia, dim=(envs, blocks), inputs=inertia, outputs=[context.tops])
         rows = data.efc
-        constraints = [rows.jtdaj_adr, rows.jtdaj_nblock, rows.J_rownnz, rows.J_rowadr, rows.J_colind]
-        wp.launch(_tops_of_constraints, dim=(envs, THREADS), inputs=constraints, outputs=[context.tops])
+        constraints = [
+            rows.jtdaj_adr,
+            rows.jtdaj_nblock,
+            rows.J_rownnz,
+            rows.J_rowadr,
+            rows.J_colind,
+        ]
+        wp.launch(
+            _tops_of_constraints, dim=(envs, THREADS), inputs=constraints, outputs=[context.tops]
+        )
         context.always = wp.full((envs,), 1, dtype=int)
     changed = context.quad_changed_count if skip_unchanged else context.always
     stale = context.state_changed_count if skip_noflip else context.always
@@ -149,7 +196,15 @@ def step(model: Any, data: Any, context: Any, skip_unchanged: bool = False, skip
     wp.launch_tiled(
         _step_kernel(padded, size),
         dim=envs,
-        inputs=[context.done, stale, changed, context.grad.reshape(column), context.h, context.tops, blocks],
+        inputs=[
+            context.done,
+            stale,
+            changed,
+            context.grad.reshape(column),
+            context.h,
+            context.tops,
+            blocks,
+        ],
         outputs=[
             context.hfactor,
             context.search.reshape((envs, size, 1)),

@@ -20,14 +20,18 @@ import numpy as np
 if TYPE_CHECKING:
     from mujoco import mjx
 
-# Warp's flags for a solver at its iteration limit: expected with few iterations, and not an overflow.
+# Warp's flags for a solver at its iteration limit: expected with few iterations, and not an
+# overflow.
 _ITERATIONS = 1 << 9 | 1 << 10
-# Version of mujoco-mjx whose Newton step `newton.py` replaces: with another one, compare both before it is raised.
+# Version of mujoco-mjx whose Newton step `newton.py` replaces: with another one, compare both
+# before it is raised.
 _NEWTON_OF = "3.17.0"
 
 
 class _Late(ModuleType):
-    """A module that is imported when it is used, once `ready`; until then, all its attributes are `object`."""
+    """A module that is imported when it is used, once `ready`; until then, all its attributes are
+    `object`.
+    """
 
     ready = False
 
@@ -37,9 +41,11 @@ class _Late(ModuleType):
 
 @functools.cache
 def load_mjx() -> ModuleType:
-    """Imports MJX, without the lines that it prints where Warp, which only an NVIDIA GPU needs, is not installed.
+    """Imports MJX, without the lines that it prints where Warp, which only an NVIDIA GPU needs, is
+    not installed.
 
-    The packages with which it computes convex hulls of meshes take 80% of this time; they are imported when it does.
+    The packages with which it computes convex hulls of meshes take 80% of this time; they are
+    imported when it does.
     """
     printed = io.StringIO()
     late = {name: _Late(name) for name in ("scipy.spatial", "trimesh") if name not in sys.modules}
@@ -58,8 +64,12 @@ def load_mjx() -> ModuleType:
 
 
 def without_pointers(data: mjx.Data) -> mjx.Data:
-    """Zeroes MJX's memory addresses in data made with impl `cpp`: they are invalid in another process."""
-    zeros = {name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")}
+    """Zeroes MJX's memory addresses in data made with impl `cpp`: they are invalid in another
+    process.
+    """
+    zeros = {
+        name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")
+    }
     return data.replace(_impl=dataclasses.replace(data._impl, **zeros))
 
 
@@ -75,8 +85,9 @@ def warp_is_installed() -> bool:
 def keep_streams() -> None:
     """Makes Warp remember JAX's streams until the process ends.
 
-    Warp forgets a stream when the garbage collector finds an old handle to it, even while a newer handle captures a
-    step. The capture then fails with "unknown stream" (warp 1.18, with several environments in one process).
+    Warp forgets a stream when the garbage collector finds an old handle to it, even while a newer
+    handle captures a step. The capture then fails with "unknown stream" (warp 1.18, with several
+    environments in one process).
     """
     stream = importlib.import_module("warp").Stream
     release = stream.__del__
@@ -90,7 +101,9 @@ def without_warnings(model: mjx.Model) -> mjx.Model:
 
 def without_overflow(data: mjx.Data) -> mjx.Data:
     """Clears Warp's overflow flags."""
-    return data.replace(_impl=dataclasses.replace(data._impl, overflow=jnp.zeros_like(data._impl.overflow)))
+    return data.replace(
+        _impl=dataclasses.replace(data._impl, overflow=jnp.zeros_like(data._impl.overflow))
+    )
 
 
 def overflow(data: mjx.Data) -> jax.Array:
@@ -99,7 +112,9 @@ def overflow(data: mjx.Data) -> jax.Array:
 
 
 def sparse_newton_needs(model: mjx.Model) -> str | None:
-    """Returns what a model on Warp lacks for `with_sparse_newton`, as the end of "needs ..."; None if nothing."""
+    """Returns what a model on Warp lacks for `with_sparse_newton`, as the end of "needs ..."; None
+    if nothing.
+    """
     if (found := importlib.metadata.version("mujoco-mjx")) != _NEWTON_OF:
         return f"mujoco-mjx {_NEWTON_OF}, not {found}"
     if not model._impl.is_sparse:
@@ -110,16 +125,20 @@ def sparse_newton_needs(model: mjx.Model) -> str | None:
 
 
 def with_sparse_newton(model: mjx.Model) -> mjx.Model:
-    """Returns a model whose Newton steps on Warp are those of `newton.py`; other models of the process keep theirs."""
+    """Returns a model whose Newton steps on Warp are those of `newton.py`; other models of the
+    process keep theirs.
+    """
     marked = _sparse_block_dim()(**vars(model._impl.block_dim))
     return model.replace(_impl=model._impl.replace(block_dim=marked))
 
 
 @functools.cache
 def _sparse_block_dim() -> type:
-    """Returns a type of Warp's block sizes that marks models, whose Newton steps Warp then takes from `newton.py`.
+    """Returns a type of Warp's block sizes that marks models, whose Newton steps Warp then takes
+    from `newton.py`.
 
-    Of all that MJX hands to Warp, this class is the only one that keeps its type, also in the keys of caches.
+    Of all that MJX hands to Warp, this class is the only one that keeps its type, also in the keys
+    of caches.
     """
     from mujoco.mjx.third_party.mujoco_warp._src import solver
     from mujoco.mjx.warp import types
@@ -133,7 +152,8 @@ def _sparse_block_dim() -> type:
     dense: Any = solver._cholesky_factorize_solve
 
     def step(model: Any, *arguments: Any, **options: Any) -> None:
-        sparse = isinstance(model.block_dim, SparseBlockDim) and model.is_sparse  # dense copies solve scenes with sleep
+        # dense copies solve scenes with sleep
+        sparse = isinstance(model.block_dim, SparseBlockDim) and model.is_sparse
         (newton.step if sparse else dense)(model, *arguments, **options)
 
     solver._cholesky_factorize_solve = step
@@ -163,18 +183,26 @@ class GeomPairs(NamedTuple):
     geoms: np.ndarray  # numbers of the geoms (K, 2)
     contact: mjx.Contact  # parameters of their contacts (K, ...)
     collide: Callable[[mjx.Model, mjx.Data], tuple[jax.Array, jax.Array, jax.Array]]
-    """Returns distances (K C,), positions (K C, 3) and frames (K C, 3, 3) of C contacts for each pair."""
+    """Returns distances (K C,), positions (K C, 3) and frames (K C, 3, 3) of C contacts for each
+    pair."""
 
 
 def geom_pairs(model: mjx.Model, data: mjx.Data) -> list[GeomPairs]:
     """Returns the pairs of geoms between which MJX-JAX computes contacts, by their types."""
     from mujoco.mjx._src import collision_driver
 
-    found, geoms = [], collision_driver._geom_groups(model)
+    found = []
+    geoms = collision_driver._geom_groups(model)
     for key, pairs in collision_driver._contact_groups(model, data).items():
         function: Any = collision_driver._COLLISION_FUNC[key.types]  # pyright: ignore[reportArgumentType]
 
-        def collide(model: mjx.Model, data: mjx.Data, function: Any = function, key: Any = key, pairs: Any = pairs):
+        def collide(
+            model: mjx.Model,
+            data: mjx.Data,
+            function: Any = function,
+            key: Any = key,
+            pairs: Any = pairs,
+        ):
             return function(model, data, key, pairs.geom)
 
         found.append(GeomPairs(key.types, key.condim, np.array(geoms[key]), pairs, collide))

@@ -1,4 +1,6 @@
-"""Robots: the `Robot` type, robot data, body tree, index tables and kinematics; the registry of robots by name."""
+"""Robots: the `Robot` type, robot data, body tree, index tables and kinematics; the registry of
+robots by name.
+"""
 
 from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.settings import check_arguments

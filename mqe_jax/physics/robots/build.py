@@ -18,10 +18,10 @@ _GEOM_TYPES = {
 }
 
 
-# Contact settings of the robots' collision geoms, which take precedence over those of the other geom. The time constant
-# (s), which joint limits share, is the shortest that is stable at a physics step of 0.005 s; the second number is the
-# damping ratio. Contacts begin MARGIN before the surfaces meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics
-# step.
+# Contact settings of the robots' collision geoms, which take precedence over those of the other
+# geom. The time constant (s), which joint limits share, is the shortest that is stable at a physics
+# step of 0.005 s; the second number is the damping ratio. Contacts begin MARGIN before the surfaces
+# meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics step.
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 MARGIN = 0.003  # m
@@ -39,7 +39,9 @@ def _add_geom(body: Any, primitive: Primitive, left: int, **properties: Any) -> 
     x, y, z = primitive.position
     place: dict[str, Any] = {"pos": (x, left * y, z)}
     if primitive.end is not None:
-        place = {"fromto": (x, left * y, z, primitive.end[0], left * primitive.end[1], primitive.end[2])}
+        place = {
+            "fromto": (x, left * y, z, primitive.end[0], left * primitive.end[1], primitive.end[2])
+        }
     size = (*np.atleast_1d(primitive.size), 0.0, 0.0)[:3]
     body.add_geom(type=_GEOM_TYPES[primitive.kind], size=size, mass=0.0, **place, **properties)
 
@@ -47,7 +49,9 @@ def _add_geom(body: Any, primitive: Primitive, left: int, **properties: Any) -> 
 def _back(robot: Robot) -> float:
     """Returns the height of the highest visual shape of the trunk above the trunk's origin, m."""
     shapes = [shape.primitive for shape in robot.visuals if shape.link == "trunk"]
-    return max(max(x.position[2], (x.end or x.position)[2]) + np.atleast_1d(x.size)[-1] for x in shapes)
+    return max(
+        max(x.position[2], (x.end or x.position)[2]) + np.atleast_1d(x.size)[-1] for x in shapes
+    )
 
 
 def build_robot(
@@ -64,9 +68,9 @@ def build_robot(
 ) -> mujoco.MjSpec:
     """Builds one robot with a free base as an `MjSpec`, to be attached to a scene under a prefix.
 
-    `number` is its index in the scene, for its collision bits and, without `color`, its colour in `ROBOT_COLORS`. The
-    others are those of `Scene`; with `torque_control` actuators take torques (N m) instead of joint targets (rad). If
-    `numbered`, the index + 1 is on its back.
+    `number` is its index in the scene, for its collision bits and, without `color`, its colour in
+    `ROBOT_COLORS`. The others are those of `Scene`; with `torque_control` actuators take torques (N
+    m) instead of joint targets (rad). If `numbered`, the index + 1 is on its back.
     """
     agent_color = ROBOT_COLORS[(number if color is None else color) % len(ROBOT_COLORS)]
     shapes = robot.shapes(contacts)
@@ -109,13 +113,17 @@ def build_robot(
     for leg in LEGS:
         front = 1 if leg[0] == "F" else -1
         left = 1 if leg[1] == "L" else -1
-        hip = trunk.add_body(name=f"{leg}_hip", pos=(front * robot.leg_root[0], left * robot.leg_root[1], 0.0))
+        hip = trunk.add_body(
+            name=f"{leg}_hip", pos=(front * robot.leg_root[0], left * robot.leg_root[1], 0.0)
+        )
         _add_inertial(hip, robot.hip.reflect(front, left))
         thigh = hip.add_body(name=f"{leg}_thigh", pos=(0.0, left * robot.hip_length, 0.0))
         _add_inertial(thigh, robot.thigh.reflect(1, left))
         calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -robot.thigh_length))
         _add_inertial(calf, robot.calf.reflect(1, left))
-        for body, joint, axis in zip((hip, thigh, calf), JOINTS, ((1, 0, 0), (0, 1, 0), (0, 1, 0)), strict=True):
+        for body, joint, axis in zip(
+            (hip, thigh, calf), JOINTS, ((1, 0, 0), (0, 1, 0), (0, 1, 0)), strict=True
+        ):
             index = JOINT_NAMES.index(f"{leg}_{joint}")
             limits = (robot.joint_lower[index], robot.joint_upper[index])
             hinge = body.add_joint(
@@ -129,10 +137,13 @@ def build_robot(
             )
             if joint_mechanics:
                 hinge.armature = robot.rotor_inertia[index]
-                hinge.damping[0] = robot.joint_damping[index]  # the others are of the speed's square and cube
+                # the others are of the speed's square and cube
+                hinge.damping[0] = robot.joint_damping[index]
                 hinge.frictionloss = robot.friction_loss[index]
             add_shapes(body, joint, f"{leg}_", left)
-    gain, bias = (1.0, (0.0, 0.0, 0.0)) if torque_control else (robot.kp, (0.0, -robot.kp, -robot.kd))
+    gain, bias = (
+        (1.0, (0.0, 0.0, 0.0)) if torque_control else (robot.kp, (0.0, -robot.kp, -robot.kd))
+    )
     for name, limit in zip(JOINT_NAMES, robot.torque_limit, strict=True):
         actuator = spec.add_actuator(
             name=name,

@@ -1,12 +1,13 @@
 """Model parameters of the Unitree Go1.
 
-Source: the public Unitree Go1 description (masses, inertias, limits); collision shapes are spheres and capsules,
-which all three engines support.
+Source: the public Unitree Go1 description (masses, inertias, limits); collision shapes are spheres
+and capsules, which all three engines support.
 
-Motors are those of walk-these-ways (its `go1.urdf`): 33.5 N m, and 50 rad/s at the hip, 28 at thigh and calf. Its walk
-policies and the paper's results are then comparable. Unitree's description gives 23.7 N m and 30.1 rad/s, at the calf
-35.55 N m and 20.06 rad/s. The torque line of a thigh is 20 N m up to 11.3 rad/s and zero at 28. A measured curve of the
-motor is higher: 20.2 N m up to 13.5 rad/s, zero at 30.
+Motors are those of walk-these-ways (its `go1.urdf`): 33.5 N m, and 50 rad/s at the hip, 28 at thigh
+and calf. Its walk policies and the paper's results are then comparable. Unitree's description gives
+23.7 N m and 30.1 rad/s, at the calf 35.55 N m and 20.06 rad/s. The torque line of a thigh is 20 N m
+up to 11.3 rad/s and zero at 28. A measured curve of the motor is higher: 20.2 N m up to 13.5 rad/s,
+zero at 30.
 """
 
 import numpy as np
@@ -32,8 +33,9 @@ _DARK = (0.19, 0.20, 0.23, 1.0)
 _GREY = (0.36, 0.38, 0.42, 1.0)
 _SILVER = (0.68, 0.70, 0.74, 1.0)
 
-# One capsule covers the trunk's box, 0.376 x 0.094 x 0.114, and the head's, 0.27 ahead of its centre; at most 2 cm of
-# their edges are outside. Hips are cylinders of radius 0.046, thighs boxes 0.034 x 0.0245, calves boxes 0.016 x 0.016.
+# One capsule covers the trunk's box, 0.376 x 0.094 x 0.114, and the head's, 0.27 ahead of its
+# centre; at most 2 cm of their edges are outside. Hips are cylinders of radius 0.046, thighs boxes
+# 0.034 x 0.0245, calves boxes 0.016 x 0.016.
 _COLLISION = (
     CollisionShape("trunk", capsule(0.065, (-0.125, 0, 0), (0.245, 0, 0))),
     CollisionShape("hip", sphere(0.05, (0, 0.06, 0))),
@@ -45,22 +47,34 @@ _COLLISION = (
 _VISUALS = (
     # Shell with rounded edges in the agent's colour, dark belly.
     VisualShape("trunk", box((0.15, 0.034, 0.052), (0.0, 0, 0.01)), tint=1.0),
-    VisualShape("trunk", capsule(0.024, (-0.145, 0.034, 0.038), (0.145, 0.034, 0.038)), tint=1.0, both=True),
+    VisualShape(
+        "trunk", capsule(0.024, (-0.145, 0.034, 0.038), (0.145, 0.034, 0.038)), tint=1.0, both=True
+    ),
     VisualShape("trunk", box((0.152, 0.058, 0.026), (0.0, 0, 0.012)), tint=1.0),
     VisualShape("trunk", box((0.125, 0.0595, 0.010), (0.0, 0, 0.006)), _SILVER),
     VisualShape("trunk", box((0.155, 0.05, 0.024), (0, 0, -0.034)), _DARK),
     # Motors of the hips, which close the trunk in front and behind.
-    VisualShape("trunk", cylinder(0.044, (0.148, 0.047, 0.0), (0.222, 0.047, 0.0)), _DARK, both=True),
-    VisualShape("trunk", cylinder(0.044, (-0.148, 0.047, 0.0), (-0.222, 0.047, 0.0)), _DARK, both=True),
+    VisualShape(
+        "trunk", cylinder(0.044, (0.148, 0.047, 0.0), (0.222, 0.047, 0.0)), _DARK, both=True
+    ),
+    VisualShape(
+        "trunk", cylinder(0.044, (-0.148, 0.047, 0.0), (-0.222, 0.047, 0.0)), _DARK, both=True
+    ),
     VisualShape("trunk", box((0.03, 0.04, 0.034), (-0.186, 0, 0.014)), tint=1.0),
     # Rails and handle on the back.
-    VisualShape("trunk", capsule(0.006, (-0.12, 0.026, 0.066), (0.12, 0.026, 0.066)), _DARK, both=True),
+    VisualShape(
+        "trunk", capsule(0.006, (-0.12, 0.026, 0.066), (0.12, 0.026, 0.066)), _DARK, both=True
+    ),
     VisualShape("trunk", box((0.045, 0.02, 0.006), (-0.06, 0, 0.064)), _SILVER),
     # Neck and head: angular snout, dark face with two cameras.
     VisualShape("trunk", box((0.05, 0.036, 0.03), (0.2, 0, 0.016)), tint=1.0),
-    VisualShape("trunk", capsule(0.032, (0.235, 0.014, 0.034), (0.275, 0.014, 0.036)), tint=1.0, both=True),
+    VisualShape(
+        "trunk", capsule(0.032, (0.235, 0.014, 0.034), (0.275, 0.014, 0.036)), tint=1.0, both=True
+    ),
     VisualShape("trunk", ellipsoid((0.022, 0.047, 0.035), (0.296, 0, 0.032)), _BLACK),
-    VisualShape("trunk", cylinder(0.013, (0.29, 0.021, 0.038), (0.315, 0.021, 0.038)), _SILVER, both=True),
+    VisualShape(
+        "trunk", cylinder(0.013, (0.29, 0.021, 0.038), (0.315, 0.021, 0.038)), _SILVER, both=True
+    ),
     # Legs: round covers in the agent's colour, tapered thighs, slim shanks, dark feet.
     VisualShape("hip", cylinder(0.044, (0, 0.028, 0), (0, 0.062, 0)), _SILVER),
     VisualShape("hip", cylinder(0.036, (0, 0.02, 0), (0, 0.075, 0)), _DARK),
@@ -79,7 +93,9 @@ GO1 = Robot(
     title="Unitree Go1",
     trunk=Link(4.8, (0.0116, 0.0044, 0.0001), (0.01613, 0.03651, 0.04469, 0.00059, 7.3e-6, 2.1e-5)),
     hip=Link(0.5103, (-0.0054, -0.0007, 0.0), (3.053e-4, 5.909e-4, 3.966e-4, 0.0, 0.0, 0.0)),
-    thigh=Link(0.8989, (-0.0035, -0.0189, -0.0327), (5.396e-3, 5.142e-3, 1.025e-3, 0.0, 3.38e-4, 0.0)),
+    thigh=Link(
+        0.8989, (-0.0035, -0.0189, -0.0327), (5.396e-3, 5.142e-3, 1.025e-3, 0.0, 3.38e-4, 0.0)
+    ),
     calf=_CALF.weld(_FOOT, (0.0, 0.0, -0.213)),
     leg_root=(0.1881, 0.04675),
     hip_length=0.08,
@@ -103,5 +119,7 @@ GO1 = Robot(
     stand_height=0.30,
     collision=_COLLISION,
     visuals=_VISUALS,
-    walk=WalkSettings("go1", stance_width=0.25, stance_length=0.428, min_knee_height=0.06, min_trunk_height=0.1),
+    walk=WalkSettings(
+        "go1", stance_width=0.25, stance_length=0.428, min_knee_height=0.06, min_trunk_height=0.1
+    ),
 )

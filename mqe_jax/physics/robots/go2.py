@@ -1,11 +1,11 @@
 """Model parameters of the Unitree Go2.
 
-Source: MuJoCo Menagerie's inertial parameters and limits of the Go2 and Unitree's description (motor speeds);
-collision shapes are spheres and capsules, which all three engines support.
+Source: MuJoCo Menagerie's inertial parameters and limits of the Go2 and Unitree's description
+(motor speeds); collision shapes are spheres and capsules, which all three engines support.
 
-Default angles and action scale for position control and the walk policy are the Go1's, whose legs have the same
-lengths. Gains scale with the mass (15.2 kg against 11.3 kg), which gives equal sag and damping: kp 30 (Go1: 20) and kd
-0.75 (Go1: 0.5). Torques reach the motors' limits.
+Default angles and action scale for position control and the walk policy are the Go1's, whose legs
+have the same lengths. Gains scale with the mass (15.2 kg against 11.3 kg), which gives equal sag
+and damping: kp 30 (Go1: 20) and kd 0.75 (Go1: 0.5). Torques reach the motors' limits.
 """
 
 import numpy as np
@@ -31,8 +31,8 @@ _BLACK = (0.05, 0.05, 0.07, 1.0)
 _DARK = (0.17, 0.18, 0.20, 1.0)
 _LIGHT = (0.70, 0.95, 1.0, 1.0)
 
-# As on the Go1: one capsule for trunk box and head cylinder, which leaves at most 2 cm of their edges outside. One
-# capsule follows the bent shank.
+# As on the Go1: one capsule for trunk box and head cylinder, which leaves at most 2 cm of their
+# edges outside. One capsule follows the bent shank.
 _COLLISION = (
     CollisionShape("trunk", capsule(0.065, (-0.125, 0, 0), (0.265, 0, 0))),
     CollisionShape("hip", sphere(0.05, (0, 0.065, 0))),
@@ -42,19 +42,33 @@ _COLLISION = (
 )
 
 _VISUALS = (
-    # A stripe along the back and panels on the flanks in the agent's colour, on a rounded light shell.
+    # A stripe along the back and panels on the flanks in the agent's colour, on a rounded light
+    # shell.
     VisualShape("trunk", ellipsoid((0.19, 0.034, 0.022), (-0.01, 0, 0.058)), tint=1.0),
     VisualShape("trunk", ellipsoid((0.15, 0.0745, 0.034), (0.0, 0, 0.016)), tint=1.0),
     VisualShape("trunk", box((0.16, 0.034, 0.056), (0.0, 0, 0.006)), _WHITE, tint=0.1),
-    VisualShape("trunk", capsule(0.03, (-0.155, 0.036, 0.032), (0.155, 0.036, 0.032)), _WHITE, tint=0.1, both=True),
+    VisualShape(
+        "trunk",
+        capsule(0.03, (-0.155, 0.036, 0.032), (0.155, 0.036, 0.032)),
+        _WHITE,
+        tint=0.1,
+        both=True,
+    ),
     VisualShape("trunk", box((0.165, 0.06, 0.024), (0.0, 0, 0.01)), _WHITE, tint=0.1),
     VisualShape("trunk", box((0.14, 0.05, 0.026), (0, 0, -0.034)), _DARK),
     # Motors of the hips.
     VisualShape("trunk", cylinder(0.045, (0.155, 0.047, 0), (0.228, 0.047, 0)), _GREY, both=True),
     VisualShape("trunk", cylinder(0.045, (-0.155, 0.047, 0), (-0.228, 0.047, 0)), _GREY, both=True),
     VisualShape("trunk", box((0.03, 0.045, 0.036), (-0.19, 0, 0.014)), _WHITE, tint=0.1),
-    # Rounded head, dark face with a ring of light and a camera, and the dome of the lidar under the chin.
-    VisualShape("trunk", capsule(0.036, (0.2, 0.01, 0.026), (0.272, 0.01, 0.034)), _WHITE, tint=0.1, both=True),
+    # Rounded head, dark face with a ring of light and a camera, and the dome of the lidar under the
+    # chin.
+    VisualShape(
+        "trunk",
+        capsule(0.036, (0.2, 0.01, 0.026), (0.272, 0.01, 0.034)),
+        _WHITE,
+        tint=0.1,
+        both=True,
+    ),
     VisualShape("trunk", ellipsoid((0.03, 0.041, 0.032), (0.29, 0, 0.034)), _LIGHT),
     VisualShape("trunk", ellipsoid((0.033, 0.036, 0.027), (0.291, 0, 0.034)), _BLACK),
     VisualShape("trunk", sphere(0.009, (0.318, 0, 0.038)), _GREY),
@@ -76,16 +90,28 @@ GO2 = Robot(
     name="go2",
     title="Unitree Go2",
     trunk=Link.from_principal(
-        6.921, (0.0211, 0.0, -0.0054), (0.1070, 0.0981, 0.0245), (-0.000543, 0.713435, -0.001738, 0.700719)
+        6.921,
+        (0.0211, 0.0, -0.0054),
+        (0.1070, 0.0981, 0.0245),
+        (-0.000543, 0.713435, -0.001738, 0.700719),
     ),
     hip=Link.from_principal(
-        0.678, (-0.0054, 0.0019, -0.0001), (8.840e-4, 5.960e-4, 4.800e-4), (0.497014, 0.499245, 0.505462, 0.498237)
+        0.678,
+        (-0.0054, 0.0019, -0.0001),
+        (8.840e-4, 5.960e-4, 4.800e-4),
+        (0.497014, 0.499245, 0.505462, 0.498237),
     ),
     thigh=Link.from_principal(
-        1.152, (-0.0037, -0.0223, -0.0327), (5.950e-3, 5.842e-3, 8.788e-4), (0.829533, 0.084764, -0.020063, 0.551623)
+        1.152,
+        (-0.0037, -0.0223, -0.0327),
+        (5.950e-3, 5.842e-3, 8.788e-4),
+        (0.829533, 0.084764, -0.020063, 0.551623),
     ),
     calf=Link.from_principal(
-        0.2414, (0.0063, -0.0006, -0.1414), (1.490e-3, 1.463e-3, 5.31e-5), (0.710672, 0.001541, -0.004501, 0.703508)
+        0.2414,
+        (0.0063, -0.0006, -0.1414),
+        (1.490e-3, 1.463e-3, 5.31e-5),
+        (0.710672, 0.001541, -0.004501, 0.703508),
     ),
     leg_root=(0.1934, 0.0465),
     hip_length=0.0955,
@@ -109,5 +135,7 @@ GO2 = Robot(
     stand_height=0.30,
     collision=_COLLISION,
     visuals=_VISUALS,
-    walk=WalkSettings("go2", stance_width=0.28, stance_length=0.438, min_knee_height=0.06, min_trunk_height=0.1),
+    walk=WalkSettings(
+        "go2", stance_width=0.28, stance_length=0.438, min_knee_height=0.06, min_trunk_height=0.1
+    ),
 )

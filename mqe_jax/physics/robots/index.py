@@ -1,4 +1,6 @@
-"""Index tables of the robots of a compiled scene, their state after a step, and closed-form kinematics of the legs."""
+"""Index tables of the robots of a compiled scene, their state after a step, and closed-form
+kinematics of the legs.
+"""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -26,11 +28,11 @@ class RobotIndex:
     bodies: np.ndarray  # all body ids of each robot (R, 13)
     geoms: np.ndarray  # collision geom ids of each robot (R, G)
     trunk_force: np.ndarray
-    """Addresses in sensordata of the strongest contact force on each of the trunk's T collision geoms (R, T, 3),
-    contact frame, N."""
+    """Addresses in sensordata of the strongest contact force on each of the trunk's T collision
+    geoms (R, T, 3), contact frame, N."""
     foot_force: np.ndarray
-    """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3) unless the scene has foot
-    sensors."""
+    """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3)
+    unless the scene has foot sensors."""
 
     @property
     def num_robots(self) -> int:
@@ -39,13 +41,17 @@ class RobotIndex:
 
 
 def scatter(base: Any, addresses: np.ndarray, values: jax.Array) -> jax.Array:
-    """Returns the array `base` (n,) with values at addresses, which are host integers of the same shape.
+    """Returns the array `base` (n,) with values at addresses, which are host integers of the same
+    shape.
 
-    A GPU computes this together with what precedes and follows it; a scatter takes kernels of its own.
+    A GPU computes this together with what precedes and follows it; a scatter takes kernels of its
+    own.
     """
     source = np.full(len(base), -1)
     source[addresses] = np.arange(addresses.size).reshape(addresses.shape)
-    return jnp.where(source < 0, jnp.asarray(base, values.dtype), jnp.ravel(values)[np.maximum(source, 0)])
+    return jnp.where(
+        source < 0, jnp.asarray(base, values.dtype), jnp.ravel(values)[np.maximum(source, 0)]
+    )
 
 
 def prefix(number: int) -> str:
@@ -58,8 +64,11 @@ def _geom_names(robot: Robot, part: str) -> list[str]:
 
 
 def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, *, feet: bool = False) -> None:
-    """Adds sensors of the strongest contact force on the trunks (and feet), which all engines support."""
-    force_bits, strongest = 1 << 1, 2
+    """Adds sensors of the strongest contact force on the trunks (and feet), which all engines
+    support.
+    """
+    force_bits = 1 << 1
+    strongest = 2
     names = _geom_names(robot, "trunk") + (_geom_names(robot, "foot") if feet else [])
     for number in range(num_robots):
         for name in names:
@@ -73,7 +82,12 @@ def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, *, feet: boo
 
 
 def index_robots(
-    model: mujoco.MjModel, robot: Robot, num_robots: int, *, contacts: str = "full", feet: bool = False
+    model: mujoco.MjModel,
+    robot: Robot,
+    num_robots: int,
+    *,
+    contacts: str = "full",
+    feet: bool = False,
 ) -> RobotIndex:
     """Builds the index tables of a compiled model's robots by looking up names."""
     numbers = range(num_robots)
@@ -117,7 +131,8 @@ class RobotState:
 
     position_w: jax.Array  # trunk origin in the environment frame (R, 3), m
     quaternion: jax.Array  # trunk orientation, wxyz (R, 4)
-    linear_velocity_w: jax.Array  # velocity of the trunk origin in the environment frame (R, 3), m/s
+    # velocity of the trunk origin in the environment frame (R, 3), m/s
+    linear_velocity_w: jax.Array
     angular_velocity_b: jax.Array  # angular velocity of the trunk in its own frame (R, 3), rad/s
     joint_position: jax.Array  # joint angles (R, 12), rad
     joint_velocity: jax.Array  # joint velocities (R, 12), rad/s
@@ -136,7 +151,9 @@ class RobotState:
 
     @property
     def base_info(self) -> jax.Array:
-        """Position and roll, pitch, yaw (R, 6): the base information of the paper's observations."""
+        """Position and roll, pitch, yaw (R, 6): the base information of the paper's
+        observations.
+        """
         return jnp.concatenate([self.position_w, self.euler], axis=-1)
 
     @property
@@ -151,11 +168,18 @@ class RobotState:
 
 
 def read_robots(
-    index: RobotIndex, qpos: jax.Array, qvel: jax.Array, sensordata: jax.Array, active: jax.Array | None = None
+    index: RobotIndex,
+    qpos: jax.Array,
+    qvel: jax.Array,
+    sensordata: jax.Array,
+    active: jax.Array | None = None,
 ) -> RobotState:
-    """Reads all robots from state vectors; `active` (A,) says which of the first take part, default all."""
+    """Reads all robots from state vectors; `active` (A,) says which of the first take part, default
+    all.
+    """
     every = jnp.ones(index.num_robots, bool)
-    base, base_velocity = qpos[index.base_qpos], qvel[index.base_qvel]
+    base = qpos[index.base_qpos]
+    base_velocity = qvel[index.base_qvel]
     return RobotState(
         position_w=base[:, :3],
         quaternion=base[:, 3:],
@@ -169,12 +193,16 @@ def read_robots(
 
 
 def foot_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
-    """Computes the feet's centres in the trunk frame (..., 4, 3), m, from joint angles (..., 12), rad."""
+    """Computes the feet's centres in the trunk frame (..., 4, 3), m, from joint angles (..., 12),
+    rad.
+    """
     return _leg_points(robot, joint_position, robot.foot_position)
 
 
 def knee_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
-    """Computes the knees (calf joints) in the trunk frame (..., 4, 3), m, from joint angles (..., 12), rad."""
+    """Computes the knees (calf joints) in the trunk frame (..., 4, 3), m, from joint angles (...,
+    12), rad.
+    """
     return _leg_points(robot, joint_position, (0.0, 0.0))
 
 

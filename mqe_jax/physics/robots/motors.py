@@ -1,15 +1,16 @@
 """Motors: the torque and the speed that a robot's joint motors can give.
 
-A motor has a controller's limit L, and a DC motor's stall torque S and speed limit V. In the direction of its speed v
-it gives at most L and at most S (1 - v / V). Above V it brakes, with L at (1 + `BAND`) V. These bounds are evaluated at
-the start of every physics step.
+A motor has a controller's limit L, and a DC motor's stall torque S and speed limit V. In the
+direction of its speed v it gives at most L and at most S (1 - v / V). Above V it brakes, with L at
+(1 + `BAND`) V. These bounds are evaluated at the start of every physics step.
 
-Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So some joints get an
-armature (rotor inertia) for this physics step. In a leg that is fast, or whose torques can carry it far beyond V within
-the step, it is the implicit form of the braking above V. In a joint whose torque line is too steep for the step (the
-calf of the Go2), it is the implicit form of that line, in proportion to the torque. A free joint then moves as by
-backward Euler. Speeds beyond `CLAMP` V, from torques, joint limits and contacts, are set to `CLAMP` V, as PhysX does
-with a joint's velocity limit.
+Explicit integration alone would carry light legs beyond V within one physics step of 5 ms. So some
+joints get an armature (rotor inertia) for this physics step. In a leg that is fast, or whose
+torques can carry it far beyond V within the step, it is the implicit form of the braking above V.
+In a joint whose torque line is too steep for the step (the calf of the Go2), it is the implicit
+form of that line, in proportion to the torque. A free joint then moves as by backward Euler. Speeds
+beyond `CLAMP` V, from torques, joint limits and contacts, are set to `CLAMP` V, as PhysX does with
+a joint's velocity limit.
 
 The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
 """
@@ -26,19 +27,28 @@ from mqe_jax.physics.robots.index import RobotIndex
 from mqe_jax.physics.robots.robot import Robot
 
 BAND = 0.15  # share of the speed limit above it at which the motor brakes with its full torque
-SLOW, FAST = 0.85, 1.0  # shares of a leg's lowest speed limit at which its armature begins and is complete
-REACH = 1.25  # share of its speed limit that a joint's torques may carry it to within a physics step without armature
+# shares of a leg's lowest speed limit at which its armature begins and is complete
+SLOW = 0.85
+FAST = 1.0
+# share of its speed limit that a joint's torques may carry it to within a physics step without
+# armature
+REACH = 1.25
 GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
-STEEP = 2.0  # timestep x slope of the torque line / inertia, above which explicit integration of the line is unstable
+# timestep x slope of the torque line / inertia, above which explicit integration of the line is
+# unstable
+STEEP = 2.0
 CLAMP = 1.09  # greatest share of the speed limit after a physics step
 ROUNDING = 1e-5  # relative margin that covers the rounding of single precision
 
 
 @functools.cache
 def leg_response(robot: Robot) -> np.ndarray:
-    """Returns how strongly torques accelerate a leg's joints in the default pose (3, 3), 1/(kg m^2), as magnitudes."""
+    """Returns how strongly torques accelerate a leg's joints in the default pose (3, 3), 1/(kg
+    m^2), as magnitudes.
+    """
     model = build_robot(robot, 0, visual=False).compile()
-    data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data = mujoco.MjData(model)
+    matrix = np.zeros((model.nv, model.nv))
     data.qpos[7:] = robot.default_joints
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, matrix)
@@ -59,9 +69,14 @@ class Motors:
 
     @classmethod
     def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> "Motors":
-        """Returns the motors of all robots of a scene, whose actuators are in the order of the robots' joints."""
+        """Returns the motors of all robots of a scene, whose actuators are in the order of the
+        robots' joints.
+        """
         assert np.array_equal(index.actuator.ravel(), np.arange(index.actuator.size))
-        per_joint = lambda values: np.tile(values, index.num_robots).astype(np.float32)  # noqa: E731
+
+        def per_joint(values):
+            return np.tile(values, index.num_robots).astype(np.float32)
+
         return cls(
             joint_qpos=index.joint_qpos.ravel(),
             joint_qvel=index.joint_qvel.ravel(),
@@ -72,10 +87,14 @@ class Motors:
             timestep=timestep,
         )
 
-    def limit(self, xp: Any, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> tuple[Any, Any]:
-        """Returns the control of one physics step under which the actuators' forces are the motors' torques (..., J).
+    def limit(
+        self, xp: Any, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any
+    ) -> tuple[Any, Any]:
+        """Returns the control of one physics step under which the actuators' forces are the motors'
+        torques (..., J).
 
-        It is `ctrl` if the motors can give its torque. The second result is the armature (..., J), kg m^2.
+        It is `ctrl` if the motors can give its torque. The second result is the armature (..., J),
+        kg m^2.
 
         Args:
             xp: numpy or jax.numpy.
@@ -87,7 +106,8 @@ class Motors:
         """
         pace = xp.abs(velocity)
         below = self.speed - pace
-        most = xp.minimum(xp.minimum(self._line * below, self._brake * below), self.torque)  # in the direction of v
+        # in the direction of v
+        most = xp.minimum(xp.minimum(self._line * below, self._brake * below), self.torque)
         most = xp.maximum(most, -self.torque)
         sign = xp.where(velocity < 0, np.float32(-1.0), np.float32(1.0))
         force = _force(ctrl, position, velocity, gain, bias)
@@ -96,10 +116,12 @@ class Motors:
         return ctrl, self._armature(xp, pace, xp.abs(given), given * sign < 0)
 
     def idle(self, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> np.ndarray:
-        """Returns where `limit`, for the same numpy arrays, surely returns `ctrl` itself and no armature (...,) bool.
+        """Returns where `limit`, for the same numpy arrays, surely returns `ctrl` itself and no
+        armature (...,) bool.
 
-        It takes less time. The torques' magnitudes must be at most L and S (1 - |v| / V), and speeds below those at
-        which armature begins, by a margin for rounding. Some braking and numbers that are not finite fail too.
+        It takes less time. The torques' magnitudes must be at most L and S (1 - |v| / V), and
+        speeds below those at which armature begins, by a margin for rounding. Some braking and
+        numbers that are not finite fail too.
         """
         pace = np.abs(velocity)
         effort = np.abs(_force(ctrl, position, velocity, gain, bias))
@@ -110,26 +132,34 @@ class Motors:
         return idle.all(axis=-1)
 
     def _kick(self, xp: Any, effort: Any) -> Any:
-        """Returns the speeds (..., J), rad/s, that torques of magnitude `effort` can add in a physics step."""
+        """Returns the speeds (..., J), rad/s, that torques of magnitude `effort` can add in a
+        physics step.
+        """
         size = len(self.response)
-        legs, added = effort.reshape(-1, size), self.timestep * self.response
+        legs = effort.reshape(-1, size)
+        added = self.timestep * self.response
         if xp is np:
             return (legs @ added).reshape(effort.shape)
-        # A GPU computes sums of products together with what precedes and follows them, a matrix product on its own.
+        # A GPU computes sums of products together with what precedes and follows them, a matrix
+        # product on its own.
         total = legs[:, :1] * added[0]
         for i in range(1, size):
             total += legs[:, i : i + 1] * added[i]
         return total.reshape(effort.shape)
 
     def _armature(self, xp: Any, pace: Any, effort: Any, against: Any) -> Any:
-        """Returns the armature (..., J), kg m^2, from magnitudes of speeds and torques, and which are opposed."""
+        """Returns the armature (..., J), kg m^2, from magnitudes of speeds and torques, and which
+        are opposed.
+        """
         size = len(self.response)
         fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
         near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
         reach = (pace + self._kick(xp, effort)) / self.speed
         if xp is np and near.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
             return np.zeros_like(pace)
-        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH).astype(np.float32)
+        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH).astype(
+            np.float32
+        )
         if self._steep.any():
             line = self._line * (self.speed + xp.where(against, pace, -pace))
             share = xp.minimum(effort / xp.maximum(line, ROUNDING), 1.0)  # of the line's torque
@@ -159,9 +189,13 @@ class Motors:
 
     @functools.cached_property
     def _light(self) -> np.ndarray:
-        """Slope of the torques without armature (..., J), N m s; less than `_line` where that is steep."""
+        """Slope of the torques without armature (..., J), N m s; less than `_line` where that is
+        steep.
+        """
         share = self._inertia / (self._inertia + self.timestep * self._line)
-        return np.where(self._steep, np.float32(1.0 - ROUNDING) * share, np.float32(1.0)) * self._line
+        return (
+            np.where(self._steep, np.float32(1.0 - ROUNDING) * share, np.float32(1.0)) * self._line
+        )
 
     @functools.cached_property
     def _brake(self) -> np.ndarray:
@@ -186,24 +220,38 @@ class Motors:
     @functools.cached_property
     def _slow(self) -> np.ndarray:
         """Speeds (..., J), rad/s, below which a leg has no armature for its speed."""
-        return np.float32((1.0 - ROUNDING) * SLOW) * np.repeat(self._leg_speed, len(self.response), axis=-1)
+        return np.float32((1.0 - ROUNDING) * SLOW) * np.repeat(
+            self._leg_speed, len(self.response), axis=-1
+        )
 
     @functools.cached_property
     def _near(self) -> np.ndarray:
-        """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry it further."""
-        return np.float32((1.0 - ROUNDING) * REACH) * np.where(self._steep, np.float32(np.inf), self.speed)
+        """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry
+        it further.
+        """
+        return np.float32((1.0 - ROUNDING) * REACH) * np.where(
+            self._steep, np.float32(np.inf), self.speed
+        )
 
     def repeat(self, count: int) -> "Motors":
-        """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast ones."""
-        rows = {name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")}
+        """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast
+        ones.
+        """
+        rows = {
+            name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")
+        }
         return dataclasses.replace(self, **rows)
 
     def clamp(self, position: Any, velocity: Any) -> tuple[Any, Any]:
-        """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most `fastest`."""
+        """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most
+        `fastest`.
+        """
         clamped = velocity.clip(-self.fastest, self.fastest)
         return position - self.timestep * (velocity - clamped), clamped
 
 
 def _force(ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> Any:
-    """Returns the forces (..., J), N m, that actuators give without limits; the arguments are those of `limit`."""
+    """Returns the forces (..., J), N m, that actuators give without limits; the arguments are those
+    of `limit`.
+    """
     return gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity

@@ -1,8 +1,8 @@
 """The `Robot` type: an immutable description of a quadruped with twelve joints.
 
-All values are in SI units (metre, kilogram, second, radian, newton). Link frames have x forward, y left and z up at
-zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf everywhere in this package. One leg
-is described, the front left; the others are its mirror images.
+All values are in SI units (metre, kilogram, second, radian, newton). Link frames have x forward, y
+left and z up at zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf
+everywhere in this package. One leg is described, the front left; the others are its mirror images.
 """
 
 import dataclasses
@@ -45,11 +45,16 @@ class Link:
     com: Vector
     """Centre of mass in the link frame (3,), m."""
     inertia: tuple[float, float, float, float, float, float]
-    """Inertia (xx, yy, zz, xy, xz, yz) about the centre of mass, in the axes of the link frame, kg m^2."""
+    """Inertia (xx, yy, zz, xy, xz, yz) about the centre of mass, in the axes of the link frame, kg
+    m^2."""
 
     @classmethod
-    def from_principal(cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]) -> "Link":
-        """Returns a link from principal `moments` of inertia (kg m^2) and the orientation of their axes, wxyz."""
+    def from_principal(
+        cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]
+    ) -> "Link":
+        """Returns a link from principal `moments` of inertia (kg m^2) and the orientation of their
+        axes, wxyz.
+        """
         w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
         axes = np.array(
             [
@@ -101,8 +106,10 @@ class Primitive:
     """Second end of the axis, m; None for the other kinds."""
 
 
-sphere, capsule = functools.partial(Primitive, "sphere"), functools.partial(Primitive, "capsule")
-cylinder, box = functools.partial(Primitive, "cylinder"), functools.partial(Primitive, "box")
+sphere = functools.partial(Primitive, "sphere")
+capsule = functools.partial(Primitive, "capsule")
+cylinder = functools.partial(Primitive, "cylinder")
+box = functools.partial(Primitive, "box")
 ellipsoid = functools.partial(Primitive, "ellipsoid")
 
 
@@ -115,11 +122,14 @@ class CollisionShape:
     primitive: Primitive
     """Its geometry, in the frame of `link`."""
     name: str = ""
-    """Unique in the robot; the part's name if empty. A leg's shapes are called `FL_<name>` and so on."""
+    """Unique in the robot; the part's name if empty. A leg's shapes are called `FL_<name>` and so
+    on."""
 
     def __post_init__(self) -> None:
         if self.part not in PARTS:
-            raise InputError(f"CollisionShape.part: unknown part {self.part!r}; allowed: {', '.join(PARTS)}")
+            raise InputError(
+                f"CollisionShape.part: unknown part {self.part!r}; allowed: {', '.join(PARTS)}"
+            )
         if not self.name:
             object.__setattr__(self, "name", self.part)
 
@@ -151,11 +161,14 @@ class VisualShape:
 
     def __post_init__(self) -> None:
         if self.link not in LINKS:
-            raise InputError(f"VisualShape.link: unknown link {self.link!r}; allowed: {', '.join(LINKS)}")
+            raise InputError(
+                f"VisualShape.link: unknown link {self.link!r}; allowed: {', '.join(LINKS)}"
+            )
 
     def mix_color(self, agent_color: Color) -> Color:
         """Returns the base colour mixed with the agent's colour."""
-        own, agent = np.asarray(self.color), np.asarray(agent_color)
+        own = np.asarray(self.color)
+        agent = np.asarray(agent_color)
         r, g, b, a = ((1.0 - self.tint) * own + self.tint * agent).tolist()
         return r, g, b, a
 
@@ -171,14 +184,17 @@ class WalkSettings:
     stance_length: float
     """Default distance between front and rear feet, m."""
     min_knee_height: float
-    """Minimum knee height, m; below it the leg is counted as touching the ground with thigh or calf."""
+    """Minimum knee height, m; below it the leg is counted as touching the ground with thigh or
+    calf."""
     min_trunk_height: float
     """Minimum height of the trunk origin, m; below it the robot has fallen."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Robot:
-    """A quadruped; make a variant with `dataclasses.replace`. Arrays (12,) are in the order of `JOINT_NAMES`.
+    """A quadruped; make a variant with `dataclasses.replace`.
+
+    Arrays (12,) are in the order of `JOINT_NAMES`.
 
     Example:
         ```python
@@ -222,14 +238,16 @@ class Robot:
     stall_torque: np.ndarray
     """Torques of the motors at rest (12,), N m; they fall linearly to zero at the speed limit."""
     rotor_inertia: np.ndarray
-    """Inertia of the rotors at the joints (12,), kg m^2; simulated where `joint_mechanics` is set."""
+    """Inertia of the rotors at the joints (12,), kg m^2; simulated where `joint_mechanics` is
+    set."""
     joint_damping: np.ndarray
     """Viscous friction of the joints (12,), N m s/rad; likewise."""
     friction_loss: np.ndarray
     """Dry friction of the joints (12,), N m; likewise."""
     joint_margin: float
-    """Distance before a joint limit at which its constraint begins, rad: a joint at its motor's speed limit passes the
-    limit by up to 0.25 rad within a physics step. A stiffer constraint needs more solver iterations."""
+    """Distance before a joint limit at which its constraint begins, rad: a joint at its motor's
+    speed limit passes the limit by up to 0.25 rad within a physics step. A stiffer constraint needs
+    more solver iterations."""
     kp: float
     """Proportional gain, N m/rad."""
     kd: float
@@ -237,7 +255,8 @@ class Robot:
     action_scale: np.ndarray
     """Scale of joint actions (12,), rad: joint target = default + scale x action."""
     stand_height: float
-    """Height of the trunk origin at the default angles, m; the walk policy's target at a zero height command."""
+    """Height of the trunk origin at the default angles, m; the walk policy's target at a zero
+    height command."""
     collision: tuple[CollisionShape, ...]
     visuals: tuple[VisualShape, ...]
     walk: WalkSettings
@@ -249,9 +268,17 @@ class Robot:
                 raise InputError(f"Robot.{name}: shape {array.shape}; expected ({NUM_JOINTS},)")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-        if not np.all((self.joint_lower < self.default_joints) & (self.default_joints < self.joint_upper)):
-            raise InputError(f"Robot.default_joints: {self.default_joints} must lie between the joint limits")
-        repeated = [name for name, count in Counter(shape.name for shape in self.collision).items() if count > 1]
+        if not np.all(
+            (self.joint_lower < self.default_joints) & (self.default_joints < self.joint_upper)
+        ):
+            raise InputError(
+                f"Robot.default_joints: {self.default_joints} must lie between the joint limits"
+            )
+        repeated = [
+            name
+            for name, count in Counter(shape.name for shape in self.collision).items()
+            if count > 1
+        ]
         if repeated:
             raise InputError(f"Robot.collision: duplicate names {', '.join(repeated)}")
         parts = [shape.part for shape in self.collision]
@@ -259,11 +286,15 @@ class Robot:
             raise InputError("Robot.collision: needs one foot shape and at least one trunk shape")
 
     def joint_targets(self, action: jax.Array, scale: float = 1.0) -> jax.Array:
-        """Returns joint targets (..., 12), rad: default + `scale` x the robot's scale x action (..., 12)."""
+        """Returns joint targets (..., 12), rad: default + `scale` x the robot's scale x action
+        (..., 12).
+        """
         return jnp.asarray(self.default_joints) + scale * self.action_scale * action
 
     def shapes(self, contacts: str = "full") -> tuple[CollisionShape, ...]:
-        """Returns the collision shapes of a set, one of `CONTACTS`; InputError for an unknown set."""
+        """Returns the collision shapes of a set, one of `CONTACTS`; InputError for an unknown
+        set.
+        """
         if contacts not in CONTACTS:
             raise InputError(f"contacts: unknown set {contacts!r}; allowed: {', '.join(CONTACTS)}")
         return tuple(shape for shape in self.collision if shape.part in CONTACTS[contacts])

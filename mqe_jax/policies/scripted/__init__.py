@@ -22,7 +22,8 @@ GAIN = 1.5  # 1/s, commanded speed per distance from the goal
 
 
 def find_scripted(task: str, name: str = "scripted") -> ScriptedPolicy:
-    """Returns a task's scripted policy: one team's observation blocks (A, width) by name -> its actions (A, 3).
+    """Returns a task's scripted policy: one team's observation blocks (A, width) by name -> its
+    actions (A, 3).
 
     Raises:
         InputError: if the task has none of this name.
@@ -35,7 +36,8 @@ def find_scripted(task: str, name: str = "scripted") -> ScriptedPolicy:
 
 @check_arguments(env=AnySingle, name=str)
 def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
-    """Returns the scripted policy of a task, from the observations (A, O) of one team to its actions (A, 3).
+    """Returns the scripted policy of a task, from the observations (A, O) of one team to its
+    actions (A, 3).
 
     Example:
         ```python
@@ -49,25 +51,31 @@ def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.
     Raises:
         InputError: if the task has none of this name.
     """
-    plan, layout = find_scripted(env.name, name), env.observation_layout
+    plan = find_scripted(env.name, name)
+    layout = env.observation_layout
     if env.varies:
         return functools.partial(_plan_with_absent, plan, layout)
     return lambda obs: plan(layout.split(obs))
 
 
 def _plan_with_absent(plan: ScriptedPolicy, layout: ObservationLayout, obs: jax.Array) -> jax.Array:
-    """Returns the actions (A, 3) of a policy that finds robots and other entities that take no part far away.
+    """Returns the actions (A, 3) of a policy that finds robots and other entities that take no part
+    far away.
 
-    They are those whose entries are 0. The block `active` says which agents take part (A,); the others' actions are 0.
+    They are those whose entries are 0. The block `active` says which agents take part (A,); the
+    others' actions are 0.
     """
     blocks = layout.split(obs)
     active = jnp.any(obs != 0, axis=-1)
     for block in layout.blocks:
         if block.name == "base":
-            rows, there, away = blocks["base"], active[:, None], _FAR * (1.0 + np.arange(len(obs))[:, None])
+            rows = blocks["base"]
+            there = active[:, None]
+            away = _FAR * (1.0 + np.arange(len(obs))[:, None])
         elif block.entities is not None:
             rows = blocks[block.name].reshape(len(obs), block.entities.count, -1)
-            there, away = jnp.any(rows != 0, axis=-1, keepdims=True), _FAR
+            there = jnp.any(rows != 0, axis=-1, keepdims=True)
+            away = _FAR
         else:
             continue
         far = rows.at[..., :2].set(away)
@@ -80,7 +88,9 @@ def pose(base: jax.Array) -> tuple[jax.Array, jax.Array]:
     return base[:, :2], base[:, 5]
 
 
-def go_to(position: jax.Array, yaw: jax.Array, goal: jax.Array, heading: jax.Array | float = 0.0) -> jax.Array:
+def go_to(
+    position: jax.Array, yaw: jax.Array, goal: jax.Array, heading: jax.Array | float = 0.0
+) -> jax.Array:
     """Returns the actions (A, 3) that steer robots to goal positions and a heading.
 
     Args:

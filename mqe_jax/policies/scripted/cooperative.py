@@ -1,4 +1,6 @@
-"""Scripted policies of the cooperative tasks but football: Narrow Gate, Climb on Seesaw, Sheep Dog, Push Box."""
+"""Scripted policies of the cooperative tasks but football: Narrow Gate, Climb on Seesaw, Sheep Dog,
+Push Box.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,16 +9,17 @@ import numpy as np
 from mqe_jax.policies.scripted import GAIN, Observation, go_to, pose
 from mqe_jax.terrain import ROW, rows_of
 
-# Narrow Gate: the first robot passes the gate while the second waits until the gate is clear. Of more than two robots
-# the others stand until the one before them is through. Each walks across the track behind the gate, then ahead to its
-# place; the places of the first ones are at the far end.
+# Narrow Gate: the first robot passes the gate while the second waits until the gate is clear. Of
+# more than two robots the others stand until the one before them is through. Each walks across the
+# track behind the gate, then ahead to its place; the places of the first ones are at the far end.
 _WIDTH = 3.0  # m, of the track
 _LANE_X = 4.65  # m, x of the way across, at most
 
 
 def plan_gate(obs: Observation) -> jax.Array:
     """Returns the robots' actions (A, 3)."""
-    (position, yaw), gate = pose(obs["base"]), obs["gate"]
+    (position, yaw) = pose(obs["base"])
+    gate = obs["gate"]
     agents = len(position)
     before = gate - jnp.array([0.65, 0.0])
     behind = gate + jnp.array([0.75, 0.0])
@@ -26,7 +29,9 @@ def plan_gate(obs: Observation) -> jax.Array:
     free = x[:-1] > 0.9
     if agents > 2:
         across = jnp.minimum(behind[:, 0], _LANE_X)
-        rest = jnp.where(jnp.abs(position[:, 1:] - rest[:, 1:]) < 0.1, rest, rest.at[:, 0].set(across))
+        rest = jnp.where(
+            jnp.abs(position[:, 1:] - rest[:, 1:]) < 0.1, rest, rest.at[:, 0].set(across)
+        )
         free |= (x[:-1] > 0.4) & (jnp.abs(y[:-1]) > 0.6)
     lined_up = (jnp.abs(y) < 0.1) & (x > -1.0)
     goal = jnp.where((lined_up | (x > -0.3))[:, None], behind, before)
@@ -39,7 +44,8 @@ def _rest(agents: int) -> np.ndarray:
     """Returns where robots rest beyond the gate (A, 2), m, mirrored from where they start."""
     columns, behind = rows_of(agents, _WIDTH)
     place = np.arange(agents)
-    row, count = place // columns, np.minimum(columns, agents - place // columns * columns)
+    row = place // columns
+    count = np.minimum(columns, agents - place // columns * columns)
     across = (place % columns - (count - 1) / 2) * _WIDTH / columns
     last = 5.3 if agents < 3 else 5.5
     return np.stack([last + behind - ROW * row, -across], axis=-1).astype(np.float32)
@@ -49,7 +55,8 @@ def _rest(agents: int) -> np.ndarray:
 _TOP = 8.1  # m, x of the climber's goal on the platform
 _NEAR_END = 3.87  # m, x at which the partner has all four feet on the plank
 _BEHIND = 0.9  # m, distance of the partner behind the climber
-# The climber steps onto the centre of the 1 m wide plank; with the feet of one side off the plank it would tip over.
+# The climber steps onto the centre of the 1 m wide plank; with the feet of one side off the plank
+# it would tip over.
 _FOOT = 2.6  # m, x of the climber's goal while it is off-centre
 _ENTRY = 2.9  # m, x up to which the climber stops if it is more than _CENTRED off-centre
 _CENTRED = 0.15  # m
@@ -60,7 +67,8 @@ _EDGE = 0.3  # m, distance from the centre line at which the outer feet are near
 def plan_seesaw(obs: Observation) -> jax.Array:
     """Returns both robots' actions (2, 3)."""
     position, yaw = pose(obs["base"])
-    x, offset = position[0, 0], jnp.abs(position[0, 1])
+    x = position[0, 0]
+    offset = jnp.abs(position[0, 1])
     off = ((x < _ENTRY) & (offset > _CENTRED)) | ((x < _LOW) & (offset > _EDGE))
     climb = jnp.where(off, _FOOT, _TOP)
     follow = jnp.minimum(x - _BEHIND, _NEAR_END)
@@ -71,14 +79,20 @@ def plan_seesaw(obs: Observation) -> jax.Array:
 # Sheep Dog: drive one sheep from behind, or gather a flock towards the gate.
 _BESIDE = 0.7  # m, between robots that walk behind one sheep
 _FREE = 1.2  # m, between robots below which those of a larger team keep apart
-_CLEAR_OF_SHEEP, _CLEAR_OF_ROBOTS = 0.62, 0.85  # m, between centres
-_STOP_X, _WALK_Y = 0.62, 2.7  # m, of robots: the least distance before the gate, the greatest |y|
+# m, between centres
+_CLEAR_OF_SHEEP = 0.62
+_CLEAR_OF_ROBOTS = 0.85
+# m, of robots: the least distance before the gate, the greatest |y|
+_STOP_X = 0.62
+_WALK_Y = 2.7
 _FASTEST = (1.0, 0.5)  # m/s, along x and y
 _BRAKING = 2.5  # 1/s, approach speed per distance that is left
 
 
 def _sides(obs: Observation) -> np.ndarray | jax.Array:
-    """Returns on which side of the sheep's path each robot walks (A, 1), from -1, the right, to 1."""
+    """Returns on which side of the sheep's path each robot walks (A, 1), from -1, the right, to
+    1.
+    """
     agents = len(obs["base"])
     if "active" not in obs:
         place = np.arange(agents) - (agents - 1) / 2
@@ -88,7 +102,9 @@ def _sides(obs: Observation) -> np.ndarray | jax.Array:
 
 
 def _apart(position: jax.Array, goal: jax.Array) -> jax.Array:
-    """Returns the goals (A, 2), m, in teams of more than two moved away from robots that are close."""
+    """Returns the goals (A, 2), m, in teams of more than two moved away from robots that are
+    close.
+    """
     if len(position) < 3:
         return goal
     between = position[:, None] - position[None]
@@ -99,10 +115,12 @@ def _apart(position: jax.Array, goal: jax.Array) -> jax.Array:
 def plan_sheep_easy(obs: Observation) -> jax.Array:
     """Returns the robots' actions (A, 3).
 
-    They walk behind the sheep, side by side across the line from the gate through it, and stop when it is through. Of
-    several sheep they drive the mean of those that are not.
+    They walk behind the sheep, side by side across the line from the gate through it, and stop when
+    it is through. Of several sheep they drive the mean of those that are not.
     """
-    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
+    (position, yaw) = pose(obs["base"])
+    gate = obs["gate"][0]
+    sheep = obs["sheep"][0].reshape(-1, 2)
     left = (sheep[:, 0] <= gate[0] + 0.4).astype(jnp.float32)
     sheep = left @ sheep / jnp.maximum(jnp.sum(left), 1)
     way = gate + jnp.array([0.6, 0.0]) - sheep
@@ -113,22 +131,29 @@ def plan_sheep_easy(obs: Observation) -> jax.Array:
 
 
 def plan_sheep_hard(obs: Observation) -> jax.Array:
-    """Returns the robots' actions (A, 3): teams of two or three divide the flock by sides, others by distance."""
+    """Returns the robots' actions (A, 3): teams of two or three divide the flock by sides, others
+    by distance.
+    """
     if "active" in obs:
         number = jnp.sum(obs["active"])
-        return jnp.where((number == 2) | (number == 3), _drive_by_side(obs), plan_sheep_by_distance(obs))
+        return jnp.where(
+            (number == 2) | (number == 3), _drive_by_side(obs), plan_sheep_by_distance(obs)
+        )
     return (_drive_by_side if len(obs["base"]) in (2, 3) else plan_sheep_by_distance)(obs)
 
 
 def _drive_by_side(obs: Observation) -> jax.Array:
     """Returns the actions (A, 3) of robots that each prefer one side of the flock.
 
-    Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far from the gate, on
-    the robot's side and close to it. Stragglers are driven back to the flock, whose cohesion keeps it together.
-    Of three robots the middle one prefers no side, and robots keep apart.
+    Each robot walks behind a weighted mean of the sheep positions; weights are larger for sheep far
+    from the gate, on the robot's side and close to it. Stragglers are driven back to the flock,
+    whose cohesion keeps it together. Of three robots the middle one prefers no side, and robots
+    keep apart.
     """
     side = _sides(obs)
-    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
+    (position, yaw) = pose(obs["base"])
+    gate = obs["gate"][0]
+    sheep = obs["sheep"][0].reshape(-1, 2)
     through = sheep[:, 0] > gate[0]
     way = sheep - gate - jnp.array([0.8, 0.0])
     apart = position[:, None] - sheep[None]
@@ -148,11 +173,14 @@ def _drive_by_side(obs: Observation) -> jax.Array:
 def plan_sheep_by_distance(obs: Observation) -> jax.Array:
     """Returns the actions (A, 3) of any number of robots, whatever their order.
 
-    Each robot walks behind a weighted mean of the sheep positions. Weights are larger for sheep that are far from the
-    gate, that the robot is behind, or that no other robot is closer to. Robots brake before they touch each other, a
-    sheep or the gate's wall, which would end the episode.
+    Each robot walks behind a weighted mean of the sheep positions. Weights are larger for sheep
+    that are far from the gate, that the robot is behind, or that no other robot is closer to.
+    Robots brake before they touch each other, a sheep or the gate's wall, which would end the
+    episode.
     """
-    (position, yaw), gate, sheep = pose(obs["base"]), obs["gate"][0], obs["sheep"][0].reshape(-1, 2)
+    (position, yaw) = pose(obs["base"])
+    gate = obs["gate"][0]
+    sheep = obs["sheep"][0].reshape(-1, 2)
     through = sheep[:, 0] > gate[0]
     way = sheep - gate - jnp.array([0.8, 0.0])
     far = jnp.linalg.norm(way, axis=-1)
@@ -170,7 +198,8 @@ def plan_sheep_by_distance(obs: Observation) -> jax.Array:
     for _ in range(2):
         velocity = _brake(velocity, apart, _CLEAR_OF_SHEEP)
         velocity = _brake(velocity, position[:, None] - position[None], _CLEAR_OF_ROBOTS)
-    (x, y), (ahead, left) = position.T, velocity.T
+    (x, y) = position.T
+    (ahead, left) = velocity.T
     ahead = jnp.minimum(ahead, _BRAKING * (last - x))
     left = jnp.clip(left, -_BRAKING * (_WALK_Y + y), _BRAKING * (_WALK_Y - y))
     velocity = jnp.stack([ahead, left], axis=-1)
@@ -178,17 +207,21 @@ def plan_sheep_by_distance(obs: Observation) -> jax.Array:
 
 
 def _brake(velocity: jax.Array, apart: jax.Array, least: float) -> jax.Array:
-    """Returns velocities (A, 2), m/s, with which robots stop before they come closer to others than a distance.
+    """Returns velocities (A, 2), m/s, with which robots stop before they come closer to others than
+    a distance.
 
     Args:
         velocity: wanted (A, 2), m/s.
-        apart: positions of the robots relative to the others (A, K, 2), m; a robot is not kept from itself.
+        apart: positions of the robots relative to the others (A, K, 2), m; a robot is not kept from
+            itself.
         least: the distance, m.
     """
     distance = jnp.linalg.norm(apart, axis=-1, keepdims=True)
     away = apart / jnp.maximum(distance, 1e-3)
     approach = -jnp.sum(velocity[:, None] * away, axis=-1, keepdims=True)
-    return velocity + jnp.sum(jnp.maximum(approach - _BRAKING * (distance - least), 0.0) * away, axis=1)
+    return velocity + jnp.sum(
+        jnp.maximum(approach - _BRAKING * (distance - least), 0.0) * away, axis=1
+    )
 
 
 # Push Box: both robots push the box side by side and correct its heading.
@@ -197,17 +230,21 @@ _APART = 0.6  # m, between two robots that push side by side, at most
 _ABREAST = 3  # robots that push side by side, at most; further rows push the robots before them
 _FACE = 0.8  # m, of the box's face on which they push
 _LENGTH = 0.8  # m, between the rows
-_LOOKAHEAD = 0.4  # m, of travel along the box's heading over which its lateral error is predicted; damps the steering
+# m, of travel along the box's heading over which its lateral error is predicted; damps the steering
+_LOOKAHEAD = 0.4
 
 
 def plan_pushbox(obs: Observation) -> jax.Array:
     """Returns the robots' actions (A, 3)."""
-    (position, yaw), gate, box = pose(obs["base"]), obs["gate"][0], obs["box"][0]
+    (position, yaw) = pose(obs["base"])
+    gate = obs["gate"][0]
+    box = obs["box"][0]
     row, column, columns = _places(len(position))
     lateral = column * min(_APART, _FACE / max(columns - 1, 1))
     w, x, y, z = obs["box_quaternion"][0]
     turned = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    turned = (turned + jnp.pi / 4) % (jnp.pi / 2) - jnp.pi / 4  # the box is symmetric under quarter turns
+    # the box is symmetric under quarter turns
+    turned = (turned + jnp.pi / 4) % (jnp.pi / 2) - jnp.pi / 4
     # Predicted lateral offset of the gate's centre from the box.
     offset = jnp.clip(gate[1] - box[1] - _LOOKAHEAD * jnp.sin(turned), -0.5, 0.5)
     along = jnp.array([jnp.cos(turned), jnp.sin(turned)])
@@ -226,7 +263,10 @@ def plan_pushbox(obs: Observation) -> jax.Array:
 
 
 def _places(agents: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Returns each robot's row behind the box and its column from the middle one (A,), and the number of columns."""
-    columns, place = min(agents, _ABREAST), np.arange(agents)
+    """Returns each robot's row behind the box and its column from the middle one (A,), and the
+    number of columns.
+    """
+    columns = min(agents, _ABREAST)
+    place = np.arange(agents)
     count = np.minimum(columns, agents - place // columns * columns)
     return place // columns, (place % columns - (count - 1) / 2).astype(np.float32), columns

@@ -1,4 +1,6 @@
-"""Scripted policies of football: move behind the ball, facing an open part of the goal, then push it."""
+"""Scripted policies of football: move behind the ball, facing an open part of the goal, then push
+it.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -8,25 +10,33 @@ from mqe_jax.policies.scripted import Observation, go_to
 
 _GOAL_AIMS = np.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]], np.float32)  # m, points in the goal
 _GOAL = np.array([12.0, 0.0], np.float32)  # m
-# Against the defender: the ball passes it on the flank at this point (x, distance from the centre line), m. On the
-# straight line to the goal it touches the defender and is deflected beyond the post.
+# Against the defender: the ball passes it on the flank at this point (x, distance from the centre
+# line), m. On the straight line to the goal it touches the defender and is deflected beyond the
+# post.
 _FLANK = (10.0, 1.5)
-_INNER_AIMS = np.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]], np.float32)  # m, further from the posts
+# m, further from the posts
+_INNER_AIMS = np.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]], np.float32)
 _TURN_IN = 9.4  # m, x of the ball from which it is pushed towards the goal
-_BOTH = 11.2  # m, x of the ball from which both robots attack: a first attack that failed leaves it at the goal line
+# m, x of the ball from which both robots attack: a first attack that failed leaves it at the goal
+# line
+_BOTH = 11.2
 _LEAD = 0.3  # s, over which the ball's motion is predicted
 _OWN_GOAL = np.array([2.5, 0.0], np.float32)  # m
 _WING = 1.8  # m, y of covering robots from the line between ball and own goal
-_KEEP_BACK = 2.0  # m, distance behind the ball of the supporting robot, which stays on the centre line
+# m, distance behind the ball of the supporting robot, which stays on the centre line
+_KEEP_BACK = 2.0
 
 
 def plan_defender(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3): one dribbles past the defender on the flank, then turns in to the goal.
+    """Returns both robots' actions (2, 3): one dribbles past the defender on the flank, then turns
+    in to the goal.
 
-    The defender is not observed; it is assumed to be at the target position of its control law. The robot nearer to the
-    point behind the ball, as seen from the goal, attacks; the other supports. Both attack a ball at the goal line.
+    The defender is not observed; it is assumed to be at the target position of its control law. The
+    robot nearer to the point behind the ball, as seen from the goal, attacks; the other supports.
+    Both attack a ball at the goal line.
     """
-    ball, velocity = obs["ball"][0, :2], obs["ball_velocity"][0, :2]
+    ball = obs["ball"][0, :2]
+    velocity = obs["ball_velocity"][0, :2]
     opponents = (0.6 * ball + 0.4 * _GOAL)[None]
     flank = jnp.array([_FLANK[0], jnp.where(ball[1] > 0, _FLANK[1], -_FLANK[1])])
     aims = jnp.where(ball[0] < _TURN_IN, flank, _INNER_AIMS)
@@ -46,16 +56,21 @@ def plan_defender(obs: Observation) -> jax.Array:
 def plan_match(obs: Observation) -> jax.Array:
     """Returns the actions (T, 3) of a team in its own frame."""
     mates = obs.get("teammate", jnp.full_like(obs["base"], 1e3))  # far away without one
-    mates, opponents = (x.reshape(len(x), -1, 6)[..., :2] for x in (mates, obs["opponents"]))
-    return jax.vmap(_play)(obs["base"], mates, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2])
+    mates = mates.reshape(len(mates), -1, 6)[..., :2]
+    opponents = obs["opponents"].reshape(len(obs["opponents"]), -1, 6)[..., :2]
+    return jax.vmap(_play)(
+        obs["base"], mates, opponents, obs["ball"][:, :2], obs["ball_velocity"][:, :2]
+    )
 
 
-def _play(own: jax.Array, mates: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
+def _play(
+    own: jax.Array, mates: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array
+) -> jax.Array:
     """Returns one robot's action (3,) by its place in the order of distances to the ball.
 
-    The nearest robot attacks the ball, the second one supports from behind it, and the others stand between ball and
-    own goal, alternately on either side. `own` is base information (6,), `mates` are positions (K, 2), m; the others
-    are those of `_attack`.
+    The nearest robot attacks the ball, the second one supports from behind it, and the others stand
+    between ball and own goal, alternately on either side. `own` is base information (6,), `mates`
+    are positions (K, 2), m; the others are those of `_attack`.
     """
     attack, way = _attack(own, opponents, ball, velocity, _GOAL_AIMS)
     ball = ball + _LEAD * velocity
@@ -71,16 +86,23 @@ def _play(own: jax.Array, mates: jax.Array, opponents: jax.Array, ball: jax.Arra
 
 
 def _cover(place: jax.Array, count: int, ball: jax.Array) -> jax.Array:
-    """Returns where one of `count` robots stands that neither attack nor support (2,), m; `place` () from 2."""
+    """Returns where one of `count` robots stands that neither attack nor support (2,), m; `place`
+    () from 2.
+    """
     share = (place - 1) / (count + 1)  # of the way to the own goal
     side = jnp.where(place % 2 == 0, 1.0, -1.0)
     return (1.0 - share) * ball + share * _OWN_GOAL + side * jnp.array([0.0, _WING])
 
 
 def _attack(
-    own: jax.Array, opponents: jax.Array, ball: jax.Array, velocity: jax.Array, aims: jax.Array | np.ndarray
+    own: jax.Array,
+    opponents: jax.Array,
+    ball: jax.Array,
+    velocity: jax.Array,
+    aims: jax.Array | np.ndarray,
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns the goal position of an attacker (2,), m, and the unit vector from the ball to the chosen aim (2,).
+    """Returns the goal position of an attacker (2,), m, and the unit vector from the ball to the
+    chosen aim (2,).
 
     Args:
         own: base information (6,).
@@ -89,7 +111,8 @@ def _attack(
         velocity: of the ball (2,), m/s.
         aims: candidate target points of the ball (M, 2), m.
     """
-    position, yaw = own[:2], own[5]
+    position = own[:2]
+    yaw = own[5]
     near = jnp.linalg.norm(position - ball) < 0.35
     ball = ball + _LEAD * velocity
     facing = jnp.array([jnp.cos(yaw), jnp.sin(yaw)])
@@ -99,12 +122,16 @@ def _attack(
     ways = aims - ball
     ways = ways / jnp.linalg.norm(ways, axis=-1, keepdims=True)
     lefts = ways[:, ::-1] * jnp.array([-1.0, 1.0])
-    ahead, apart = ways @ (opponents - ball).T, jnp.abs(lefts @ (opponents - ball).T)
+    ahead = ways @ (opponents - ball).T
+    apart = jnp.abs(lefts @ (opponents - ball).T)
     free = jnp.min(jnp.where(ahead > 0, jnp.minimum(apart, 0.5), 0.5), axis=1)
     straight = ways @ (facing - offset / jnp.maximum(distance, 1.0))
-    best = jax.nn.one_hot(jnp.argmax(2 * free + straight), len(aims))  # not an index, which ONNX graphs cannot batch
-    way, left = best @ ways, best @ lefts
-    along, lateral = offset @ way, offset @ left
+    # not an index, which ONNX graphs cannot batch
+    best = jax.nn.one_hot(jnp.argmax(2 * free + straight), len(aims))
+    way = best @ ways
+    left = best @ lefts
+    along = offset @ way
+    lateral = offset @ left
     lined_up = (along < -0.2) & (jnp.abs(lateral) < 0.1 + 0.3 * jnp.maximum(-along - 0.3, 0.0))
     between_legs = near & (jnp.abs(lateral) < 0.25) & (facing @ way > 0.5)
     push = position + 0.8 * way - 1.5 * lateral * left

@@ -1,4 +1,6 @@
-"""Scripted policies of the matches but football: Push Cylinder, Revolving Door, Sumo Wrestling, Traverse Bridge."""
+"""Scripted policies of the matches but football: Push Cylinder, Revolving Door, Sumo Wrestling,
+Traverse Bridge.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,8 @@ _EXCESS = 0.4  # m/s, goal speed of a pushing robot relative to the cylinder
 
 def plan_tug(obs: Observation) -> jax.Array:
     """Returns the robot's action (1, 3) in its own frame."""
-    (position, yaw), (cylinder, speed) = pose(obs["base"]), obs["cylinder"].T
+    (position, yaw) = pose(obs["base"])
+    (cylinder, speed) = obs["cylinder"].T
     x, y = position.T
     # Align first: a robot that pushes off-axis slides along the cylinder.
     before = jnp.minimum(cylinder - _BEFORE, y)
@@ -41,20 +44,26 @@ def plan_revolving_door(obs: Observation) -> jax.Array:
 
 # Sumo Wrestling: push the opponent out of the ring sideways, to avoid slipping past it.
 _CENTER = np.array([3.1, 0.0], np.float32)  # m, of the ring
-_AHEAD = 0.05  # m, forward offset of the contact point (the side between the legs) from the trunk's centre
+# m, forward offset of the contact point (the side between the legs) from the trunk's centre
+_AHEAD = 0.05
 _STAND_OFF = 0.65  # m, distance from the opponent until the robot is side on
-_EDGE = (1.5, 1.64)  # m, range of the distance from the centre at which the robot turns back; grows with the opponent's
+# m, range of the distance from the centre at which the robot turns back; grows with the opponent's
+_EDGE = (1.5, 1.64)
 
 
 def plan_wrestling(obs: Observation) -> jax.Array:
-    """Returns a team's actions (T, 3) in its own frame; each robot of a larger team meets the nearest opponent."""
-    (position, yaw), opponent = pose(obs["base"]), _nearest(obs)
+    """Returns a team's actions (T, 3) in its own frame; each robot of a larger team meets the
+    nearest opponent.
+    """
+    (position, yaw) = pose(obs["base"])
+    opponent = _nearest(obs)
     far = jnp.linalg.norm(opponent - _CENTER, axis=-1)
     outward = (opponent - _CENTER) / jnp.maximum(far, 1e-3)[:, None]
     left = jnp.stack([-outward[:, 1], outward[:, 0]], axis=-1)
     heading = jnp.arctan2(left[:, 1], left[:, 0])
     apart = position - opponent
-    along, across = jnp.sum(apart * outward, axis=-1), jnp.sum(apart * left, axis=-1) + _AHEAD
+    along = jnp.sum(apart * outward, axis=-1)
+    across = jnp.sum(apart * left, axis=-1) + _AHEAD
     side_on = (jnp.abs(jnp.sin(yaw - heading)) < 0.4) & (jnp.abs(across) < 0.12)
     pushing = (side_on | ((along > -0.5) & (jnp.abs(across) < 0.25))) & (along < 0.05)
     # A robot beyond the opponent walks around it.
@@ -67,29 +76,39 @@ def plan_wrestling(obs: Observation) -> jax.Array:
 
 
 def _nearest(obs: Observation) -> jax.Array:
-    """Returns the position (T, 2), m, of the opponent or, of several, of the nearest one that is still in."""
+    """Returns the position (T, 2), m, of the opponent or, of several, of the nearest one that is
+    still in.
+    """
     if "opponent" in obs:
         return obs["opponent"][:, :2]
-    opponents = obs["opponents"].reshape(len(obs["base"]), -1, 7)  # base information, and whether it is in
+    # base information, and whether it is in
+    opponents = obs["opponents"].reshape(len(obs["base"]), -1, 7)
     apart = jnp.linalg.norm(opponents[..., :2] - obs["base"][:, None, :2], axis=-1)
     apart = jnp.where(opponents[..., 6] > 0.5, apart, 1e3)
-    chosen = jax.nn.one_hot(jnp.argmin(apart, axis=-1), apart.shape[-1])  # as an index ONNX graphs cannot batch it
+    # as an index ONNX graphs cannot batch it
+    chosen = jax.nn.one_hot(jnp.argmin(apart, axis=-1), apart.shape[-1])
     return jnp.sum(chosen[..., None] * opponents[..., :2], axis=-2)
 
 
 # Traverse Bridge: push the opponent back from the end of the bridge, then walk beside it.
 _LEAD = 1.0  # m, distance of the goal ahead of the robot, for full speed while it pushes
-_NEAR = 1.0  # m, distance of the opponent ahead below which the robot aims at its centre, to avoid slipping past it
+# m, distance of the opponent ahead below which the robot aims at its centre, to avoid slipping past
+# it
+_NEAR = 1.0
 _MAX_AIM = 0.1  # m, y; the feet are 0.15 m from the robot's centre, the bridge's edges 0.35 m
 _OFF_BRIDGE = 7.25  # m, x, beyond which the hind feet are on the far platform
-_REST = (7.6, 0.6)  # m, x and |y| of the goal on the far platform, on the side away from the opponent
+# m, x and |y| of the goal on the far platform, on the side away from the opponent
+_REST = (7.6, 0.6)
 
 
 def plan_bridge(obs: Observation) -> jax.Array:
     """Returns the robot's action (1, 3) in its own frame."""
-    (position, yaw), opponent = pose(obs["base"]), obs["opponent"][:, :2]
+    (position, yaw) = pose(obs["base"])
+    opponent = obs["opponent"][:, :2]
     x, y = position.T
-    middle = jnp.where(opponent[:, 0] - x < _NEAR, jnp.clip(opponent[:, 1], -_MAX_AIM, _MAX_AIM), 0.0)
+    middle = jnp.where(
+        opponent[:, 0] - x < _NEAR, jnp.clip(opponent[:, 1], -_MAX_AIM, _MAX_AIM), 0.0
+    )
     beside = jnp.where(y > opponent[:, 1], _REST[1], -_REST[1])
     goal_x = jnp.where(x < _REST[0] - 0.1, x + _LEAD, _REST[0])
     goal_y = jnp.where(x > _OFF_BRIDGE, beside, middle)

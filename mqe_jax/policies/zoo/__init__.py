@@ -51,11 +51,13 @@ class Card:
     note: str
     """Sentences: which of how many seeds, steps, hardware, how many trainings shared it."""
     gpu_minutes: NonNegative | None
-    """Wall time on one GPU divided by the number of trainings that shared it, min; None if unknown."""
+    """Wall time on one GPU divided by the number of trainings that shared it, min; None if
+    unknown."""
     results: Mapping[str, Measured]
     """Rates by name, such as success, or win/scripted and loss/scripted."""
     endings: Mapping[str, float]
-    """Shares of these episodes by how they end (`mqe_jax.envs.state.ENDINGS`); in a match against the scripted team."""
+    """Shares of these episodes by how they end (`mqe_jax.envs.state.ENDINGS`); in a match against
+    the scripted team."""
 
 
 def names() -> list[str]:
@@ -94,7 +96,9 @@ def ship(policy: Trained, about: Card, folder: Path = FOLDER) -> Path:
 
 
 def heaviest(task: str) -> TrainedPolicy:
-    """Returns a task's shipped policy, of a mixture the member with the largest weight; errors as `card`."""
+    """Returns a task's shipped policy, of a mixture the member with the largest weight; errors as
+    `card`.
+    """
     policy = load(task)
     return policy.heaviest if isinstance(policy, Mixture) else policy
 

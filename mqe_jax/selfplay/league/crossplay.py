@@ -28,23 +28,35 @@ Array = NDArray[np.float64]
 
 
 @check_arguments(
-    batch=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], episodes=Episodes, key=RandomKey
+    batch=AnyBatch,
+    policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)],
+    episodes=Episodes,
+    key=RandomKey,
 )
-def cross_play(batch: VectorEnv, policies: Mapping[str, Policy], episodes: int, key: jax.Array) -> Array:
-    """Returns the success rates of teams whose agent 0 follows one policy and the others another one (P, P).
+def cross_play(
+    batch: VectorEnv, policies: Mapping[str, Policy], episodes: int, key: jax.Array
+) -> Array:
+    """Returns the success rates of teams whose agent 0 follows one policy and the others another
+    one (P, P).
 
-    The batch has P copies: a compiled program evaluates the teams of a row at once, and serves all rows.
+    The batch has P copies: a compiled program evaluates the teams of a row at once, and serves all
+    rows.
     """
     for name, policy in policies.items():
         check_policy(policy, batch, name)
     if batch.num_agents < 2 or len(teams_of(batch)) > 1:
         fail("task", batch.name, "one of a team of several agents")
-    count, team = len(policies), MixedTeam(tuple(policies.values()), (0,) * batch.num_agents)
+    count = len(policies)
+    team = MixedTeam(tuple(policies.values()), (0,) * batch.num_agents)
 
-    def act(seats: jax.Array, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    def act(
+        seats: jax.Array, seen: Observations, memory: Memory, key: jax.Array
+    ) -> tuple[jax.Array, Memory]:
         return dataclasses.replace(team, seats=seats).act(seen, memory, key)
 
-    evaluator = Evaluator(batch.with_groups(groups_of(team)), act, team.initial_memory(batch.num_envs))
+    evaluator = Evaluator(
+        batch.with_groups(groups_of(team)), act, team.initial_memory(batch.num_envs)
+    )
     rates = np.zeros((count, count))
     for first, row_key in enumerate(jax.random.split(key, count)):
         seats = jnp.tile(jnp.arange(count)[:, None], batch.num_agents).at[:, 0].set(first)
@@ -55,7 +67,9 @@ def cross_play(batch: VectorEnv, policies: Mapping[str, Policy], episodes: int, 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CrossPlay:
-    """Success of mixed teams of P policies and some reference policies, N in all; as text, tables."""
+    """Success of mixed teams of P policies and some reference policies, N in all; as text,
+    tables.
+    """
 
     task: str
     """Id of the task."""
@@ -66,11 +80,13 @@ class CrossPlay:
     episodes: int
     """Episodes of each team."""
     success: Array
-    """Success rates of teams whose agent 0 follows the row's policy, the others the column's (N, N)."""
+    """Success rates of teams whose agent 0 follows the row's policy, the others the column's (N,
+    N)."""
 
     @functools.cached_property
     def means(self) -> dict[str, Estimate]:
-        """Means of `success` over policies: `same`, `cross` and `gap` of `games.mates`, and with each reference policy.
+        """Means of `success` over policies: `same`, `cross` and `gap` of `games.mates`, and with
+        each reference policy.
 
         With a reference policy, named as it is, the means are of both places.
         """
@@ -83,43 +99,69 @@ class CrossPlay:
 
     @property
     def worst(self) -> tuple[int, int] | None:
-        """Indices of agent 0's policy and that of the others in the worst team of different policies; None with one."""
+        """Indices of agent 0's policy and that of the others in the worst team of different
+        policies; None with one.
+        """
         count = len(self.policies)
         pairs = itertools.permutations(range(count), 2)
         return min(pairs, key=lambda pair: self.success[pair], default=None)
 
     def rate(self, first: int, others: int) -> Estimate:
-        """Returns the success of a team, by the indices of agent 0's policy and that of the others."""
+        """Returns the success of a team, by the indices of agent 0's policy and that of the
+        others.
+        """
         return Estimate(*Rate.of(float(self.success[first, others]), self.episodes))
 
     def __repr__(self) -> str:
-        count, names = len(self.policies), [*self.policies, *self.references]
-        wide = max(50 * (rate.high - rate.low) for rate in itertools.starmap(self.rate, self._pairs))
-        shown = {"same": "policies with themselves", "cross": "different policies", "gap": "difference"}
+        count = len(self.policies)
+        names = [*self.policies, *self.references]
+        wide = max(
+            50 * (rate.high - rate.low) for rate in itertools.starmap(self.rate, self._pairs)
+        )
+        shown = {
+            "same": "policies with themselves",
+            "cross": "different policies",
+            "gap": "difference",
+        }
         shown |= {name: f"policies with {name}" for name in self.references}
         lines = [f"{self.task}: success in % of {self.episodes} episodes (95% interval)"]
         lines += [
-            f"{text:<26}{self.means[name].text(form='.1f')}" for name, text in shown.items() if name in self.means
+            f"{text:<26}{self.means[name].text(form='.1f')}"
+            for name, text in shown.items()
+            if name in self.means
         ]
         if self.worst is not None:
             first, others = self.worst
-            lines.append(f"{'worst different policies':<26}{self.rate(first, others).text(form='.1f')}: ")
+            lines.append(
+                f"{'worst different policies':<26}{self.rate(first, others).text(form='.1f')}: "
+            )
             lines[-1] += f"{first + 1} with {others + 1}"
-        lines += ["", f"agent 0 follows the row, the others the column; intervals are +-{wide:.0f} at most"]
+        lines += [
+            "",
+            f"agent 0 follows the row, the others the column; intervals are +-{wide:.0f} at most",
+        ]
         lines += [*table({"policy": [*map(shorten, names)]}), "", *grid(100 * self.success, ".0f")]
         columns = {}
         for at, name in enumerate(self.references, count):
             columns[f"agent 0 {name}"] = [self.rate(at, i).text() for i in range(count)]
             columns[f"others {name}"] = [self.rate(i, at).text() for i in range(count)]
         if columns:
-            lines += ["", "with a reference policy as a part of the team", *table({"": [""] * count, **columns})]
+            lines += [
+                "",
+                "with a reference policy as a part of the team",
+                *table({"": [""] * count, **columns}),
+            ]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the results as JSON can represent them."""
-        size, worst = range(len(self.success)), None
+        size = range(len(self.success))
+        worst = None
         if self.worst is not None:
-            worst = {"policies": [self.policies[i] for i in self.worst], **self.rate(*self.worst).to_dict()}
+            worst = {
+                "policies": [self.policies[i] for i in self.worst],
+                **self.rate(*self.worst).to_dict(),
+            }
         bounds = np.array([[self.rate(i, j) for j in size] for i in size])
         return {
             "task": self.task,
@@ -134,10 +176,19 @@ class CrossPlay:
     @check_arguments(folder=PathText)
     def save(self, folder: str | Path) -> None:
         """Writes the success of every team, and a picture of it, atomically."""
-        folder, names = Path(folder), [*self.policies, *self.references]
-        rows = [(names[i], names[j], self.episodes, *(f"{x:.4f}" for x in self.rate(i, j))) for i, j in self._pairs]
+        folder = Path(folder)
+        names = [*self.policies, *self.references]
+        rows = [
+            (names[i], names[j], self.episodes, *(f"{x:.4f}" for x in self.rate(i, j)))
+            for i, j in self._pairs
+        ]
         write_table(folder / CSV, ("agent0", "others", "episodes", "success", "low", "high"), rows)
-        draw(names, self.success, "success in %, agent 0 (row) with the others (column)", folder / PICTURE)
+        draw(
+            names,
+            self.success,
+            "success in %, agent 0 (row) with the others (column)",
+            folder / PICTURE,
+        )
 
     @property
     def _pairs(self) -> list[tuple[int, int]]:

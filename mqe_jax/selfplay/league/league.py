@@ -1,4 +1,5 @@
-"""A match against a pool of the learner's earlier policies, kept in the learner state between updates.
+"""A match against a pool of the learner's earlier policies, kept in the learner state between
+updates.
 
 Source: prioritised fictitious self-play (AlphaStar, doi 10.1038/s41586-019-1724-z).
 """
@@ -36,7 +37,8 @@ class LeagueState(NamedTuple):
     """The league's part of the learner state; K blocks of environments."""
 
     pool: Pool  # earlier policies
-    member: jax.Array  # member that each block plays (K,) int32; without meaning for blocks that play no member
+    # member that each block plays (K,) int32; without meaning for blocks that play no member
+    member: jax.Array
     played: jax.Array  # episodes of each block against it (K,) int32
     rating: jax.Array  # the learner's rating (), Elo points; the scripted policy has 0
     snapshot: jax.Array  # update of the last snapshot () int32
@@ -48,33 +50,53 @@ class Roster:
     """What the names in `TrainConfig.opponents` mean, one for each of K blocks of environments."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        is_one_of = lambda *kinds: np.array([name in kinds for name in names], bool)  # noqa: E731
+        def is_one_of(*kinds):
+            return np.array([name in kinds for name in names], bool)
+
         self.names = tuple(names)
-        self.newest, self.uniform = is_one_of("newest"), is_one_of("uniform")
-        """Blocks that play the policy itself; blocks that draw any member of the pool with equal chance (K,) bool."""
+        self.newest = is_one_of("newest")
+        self.uniform = is_one_of("uniform")
+        """Blocks that play the policy itself; blocks that draw any member of the pool with equal
+        chance (K,) bool."""
         self.members = self.uniform | is_one_of("older")
         """Blocks that play members of the pool (K,) bool."""
         self.reference = is_one_of("scripted")
         """Blocks whose opponent has the rating 0 (K,) bool."""
-        self.fixed = [name for name, own in zip(names, self.newest | self.members, strict=True) if not own]
-        """Names of the opponents that exist outside of the training too, and play in its evaluations."""
+        self.fixed = [
+            name for name, own in zip(names, self.newest | self.members, strict=True) if not own
+        ]
+        """Names of the opponents that exist outside of the training too, and play in its
+        evaluations."""
 
 
 class League:
     """Matches against fixed opponents, the newest policy and members of a pool; a `Matchmaker`."""
 
     @single
-    def __init__(self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig) -> None:
-        """Creates the matches of a training run; `opponents` are those of `TrainConfig.opponents`."""
+    def __init__(
+        self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig
+    ) -> None:
+        """Creates the matches of a training run; `opponents` are those of
+        `TrainConfig.opponents`.
+        """
         needs = needs_of(versus(matches, ["idle"]), config)
-        self._dims, self._config, self._roster = needs.dims, config, Roster(opponents)
+        self._dims = needs.dims
+        self._config = config
+        self._roster = Roster(opponents)
         drawn = int(self._roster.members.sum())
         if drawn and config.league.members <= drawn:
-            fail("league.members", config.league.members, f"more than the blocks that play members, {drawn}")
+            fail(
+                "league.members",
+                config.league.members,
+                f"more than the blocks that play members, {drawn}",
+            )
         params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
         statistics = running_init(needs.dims.observation, config.network.features(needs.dims))
         first = TrainedPolicy(params, statistics, needs, config, {})
-        load = lambda name: load_as("opponent", name, matches.env) if name in self._roster.fixed else first  # noqa: E731
+
+        def load(name):
+            return load_as("opponent", name, matches.env) if name in self._roster.fixed else first
+
         self.env = Versus(matches, list(map(load, opponents)), config.draw_reward)
         self._members = config.league.members if drawn else 1
 
@@ -92,17 +114,24 @@ class League:
         )
 
     def seat(self, state: TrainState) -> TrainState:
-        """Returns the state whose new environments play the policy itself and the members that the league names."""
+        """Returns the state whose new environments play the policy itself and the members that the
+        league names.
+        """
         opponents = list(state.rollout.env_state.opponents)
         for i, opponent in enumerate(opponents):
             if self._roster.newest[i] or self._roster.members[i]:
-                arrays = self._own(state) if self._roster.newest[i] else self._member(state.extra, i)
+                arrays = (
+                    self._own(state) if self._roster.newest[i] else self._member(state.extra, i)
+                )
                 opponents[i] = dataclasses.replace(opponent, arrays=arrays, before=arrays)
         return _with_opponents(state, opponents)
 
     def after(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
-        """Records the results of an update, takes a snapshot when due, and gives the blocks their opponents."""
-        opponents, own = list(state.rollout.env_state.opponents), self._own(state)
+        """Records the results of an update, takes a snapshot when due, and gives the blocks their
+        opponents.
+        """
+        opponents = list(state.rollout.env_state.opponents)
+        own = self._own(state)
         league = self._record(state.extra, opponents)
         league = self._snapshot(league, own, state.updates)
         league, changed = self._draw(league, opponents)
@@ -113,7 +142,9 @@ class League:
                 other = exchange(opponent, self._member(league, i))
                 opponent = jax.tree.map(lambda a, b: jnp.where(changed[i], a, b), other, opponent)  # noqa: B023
             opponents[i] = dataclasses.replace(opponent, outcomes=jnp.zeros_like(opponent.outcomes))
-        return dataclasses.replace(_with_opponents(state, opponents), extra=league), self._metrics(league)
+        return dataclasses.replace(_with_opponents(state, opponents), extra=league), self._metrics(
+            league
+        )
 
     def _member(self, league: LeagueState, block: int) -> PolicyArrays:
         """Returns the arrays of the member that a block plays."""
@@ -126,19 +157,27 @@ class League:
     def _own(self, state: TrainState) -> PolicyArrays:
         """Returns the arrays of the learner's policy."""
         scale = jnp.float32(self._config.action_scale)
-        return PolicyArrays(self._network.policy_params(state.params), state.obs_normalizer.obs, scale)
+        return PolicyArrays(
+            self._network.policy_params(state.params), state.obs_normalizer.obs, scale
+        )
 
     def _record(self, league: LeagueState, opponents: Sequence[Any]) -> LeagueState:
-        counts = devices.total(jnp.stack([opponent.outcomes for opponent in opponents])).astype(jnp.float32)
-        games, score = jnp.sum(counts, axis=1), counts[:, 0] + 0.5 * counts[:, 1]
-        plays_member, reference = self._roster.members, self._roster.reference
+        counts = devices.total(jnp.stack([opponent.outcomes for opponent in opponents])).astype(
+            jnp.float32
+        )
+        games = jnp.sum(counts, axis=1)
+        score = counts[:, 0] + 0.5 * counts[:, 1]
+        plays_member = self._roster.members
+        reference = self._roster.reference
         members = jnp.where(plays_member, games, 0.0)
         rated = jnp.where(plays_member | reference, games, 0.0)
         theirs = jnp.where(reference, 0.0, league.pool.rating[league.member])
         expected = 1.0 / (1.0 + 10.0 ** ((theirs - league.rating) / 400.0))
         gain = jnp.sum(jnp.where(rated > 0, score - games * expected, 0.0))
         return league._replace(
-            pool=pool.record_result(league.pool, league.member, jnp.where(plays_member, score, 0.0), members),
+            pool=pool.record_result(
+                league.pool, league.member, jnp.where(plays_member, score, 0.0), members
+            ),
             played=league.played + games.astype(jnp.int32),
             rating=league.rating + jnp.clip(gain, -_SWING, _SWING),
             recent=_FADE * league.recent + counts,
@@ -148,9 +187,14 @@ class League:
         settings = self._config.league
         every = -(-settings.snapshot_steps // self._config.steps_per_update)
         since = updates - league.snapshot
-        early = (since >= -(-every // 4)) & (pool.mean_win_rate(league.pool) >= settings.snapshot_win_rate)
+        early = (since >= -(-every // 4)) & (
+            pool.mean_win_rate(league.pool) >= settings.snapshot_win_rate
+        )
         due = (since >= every) | early
-        busy = jnp.any((jnp.arange(self._members) == league.member[:, None]) & self._roster.members[:, None], axis=0)
+        busy = jnp.any(
+            (jnp.arange(self._members) == league.member[:, None]) & self._roster.members[:, None],
+            axis=0,
+        )
         grown = pool.add(league.pool, own, updates, league.rating, busy)
         return league._replace(
             pool=jax.tree.map(lambda new, old: jnp.where(due, new, old), grown, league.pool),
@@ -167,7 +211,9 @@ class League:
             for k, uniform in zip(keys, self._roster.uniform, strict=True)
         ]
         member = jnp.where(enough, jnp.stack(drawn).astype(jnp.int32), league.member)
-        return league._replace(member=member, played=jnp.where(enough, 0, league.played), key=key), jnp.asarray(enough)
+        return league._replace(
+            member=member, played=jnp.where(enough, 0, league.played), key=key
+        ), jnp.asarray(enough)
 
     def _metrics(self, league: LeagueState) -> dict[str, jax.Array]:
         metrics = {

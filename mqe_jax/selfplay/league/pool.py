@@ -1,4 +1,6 @@
-"""A pool of earlier policies, as arrays: how the learner fares against each, who plays next, who leaves."""
+"""A pool of earlier policies, as arrays: how the learner fares against each, who plays next, who
+leaves.
+"""
 
 from typing import NamedTuple
 
@@ -40,16 +42,21 @@ def mean_win_rate(pool: Pool) -> jax.Array:
 
 
 def record_result(pool: Pool, member: jax.Array, score: jax.Array, games: jax.Array) -> Pool:
-    """Adds results of blocks against their members: indices (B,), wins plus half of the draws (B,), games (B,)."""
+    """Adds results of blocks against their members: indices (B,), wins plus half of the draws (B,),
+    games (B,).
+    """
     met = jnp.zeros_like(pool.games).at[member].add(games) > 0
     fade = jnp.where(met, _DECAY, 1.0)
     return pool._replace(
-        score=(pool.score * fade).at[member].add(score), games=(pool.games * fade).at[member].add(games)
+        score=(pool.score * fade).at[member].add(score),
+        games=(pool.games * fade).at[member].add(games),
     )
 
 
 def chances(pool: Pool, uniform: bool) -> jax.Array:
-    """Returns unnormalised log-probabilities (M,) of playing each member: `uniform`, or by (1 - win rate)^2."""
+    """Returns unnormalised log-probabilities (M,) of playing each member: `uniform`, or by (1 - win
+    rate)^2.
+    """
     weight = jnp.ones_like(pool.games) if uniform else jnp.square(1.0 - win_rate(pool)) + 1e-4
     return jnp.where(pool.born >= 0, jnp.log(weight), -jnp.inf)
 
@@ -57,8 +64,8 @@ def chances(pool: Pool, uniform: bool) -> jax.Array:
 def add(pool: Pool, arrays: PyTree, update: jax.Array, rating: jax.Array, busy: jax.Array) -> Pool:
     """Returns the pool with a new member in a free place, or in that of the member beaten most.
 
-    It has these arrays and this rating () after an update (). Members that are `busy` (M,) bool are being played and
-    stay; at least one is not.
+    It has these arrays and this rating () after an update (). Members that are `busy` (M,) bool are
+    being played and stay; at least one is not.
     """
     worth = jnp.where(busy, -1.0, jnp.where(pool.born < 0, 2.0, win_rate(pool)))
     place = jnp.argmax(worth)

@@ -11,10 +11,13 @@ from mqe_jax.envs.wrappers import Wrapper
 
 
 class BothSides(Wrapper):
-    """Matches; in the second half of them team 0 is the task's team 1. Outcomes and rewards are the new teams'.
+    """Matches; in the second half of them team 0 is the task's team 1.
 
-    The privileged observation has one more number: 1 if the teams have changed places, else 0. It makes a difference
-    even if a match is symmetric under a reflection: mirrored robots do not walk exactly alike.
+    Outcomes and rewards are the new teams'.
+
+    The privileged observation has one more number: 1 if the teams have changed places, else 0. It
+    makes a difference even if a match is symmetric under a reflection: mirrored robots do not walk
+    exactly alike.
     """
 
     def __init__(self, inner: Any) -> None:
@@ -53,6 +56,8 @@ class BothSides(Wrapper):
         return devices.rows(lambda n: jnp.arange(n) >= n // 2, self.num_envs)
 
     def _swap(self, x: jax.Array) -> jax.Array:
-        """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A, ...)."""
+        """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A,
+        ...).
+        """
         other = jnp.roll(x, self.num_agents // 2, axis=1)
         return where_rows(self._swaps(), other, x)

@@ -24,10 +24,15 @@ def shorten(name: str) -> str:
 
 
 def table(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """Yields the lines of a table with numbered rows, from its columns by header; the first one is on the left."""
+    """Yields the lines of a table with numbered rows, from its columns by header; the first one is
+    on the left.
+    """
     every = [[name, *column] for name, column in columns.items()]
     sides = ["<", *">" * len(every)]
-    padded = [[f"{text:{side}{max(map(len, x))}}" for text in x] for side, x in zip(sides, every, strict=False)]
+    padded = [
+        [f"{text:{side}{max(map(len, x))}}" for text in x]
+        for side, x in zip(sides, every, strict=False)
+    ]
     for number, row in enumerate(zip(*padded, strict=True)):
         yield " ".join([f"{number or '':>2}", *row]).rstrip()
 
@@ -49,7 +54,9 @@ def write_table(file: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]
     write_atomically(file, text.getvalue().encode())
 
 
-def draw(names: Sequence[str], shares: NDArray[Any], title: str, path: Path, *, diagonal: bool = True) -> None:
+def draw(
+    names: Sequence[str], shares: NDArray[Any], title: str, path: Path, *, diagonal: bool = True
+) -> None:
     """Draws shares (P, P) in percent, rows against columns, atomically."""
     from matplotlib.figure import Figure
 

@@ -16,45 +16,79 @@ from numpy.typing import NDArray
 from mqe_jax.core.limits import NonNegativeInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check_arguments, fail
-from mqe_jax.core.types import RESULTS, AnyBatch, AnyPolicy, Memory, Observations, RandomKey, observations
+from mqe_jax.core.types import (
+    RESULTS,
+    AnyBatch,
+    AnyPolicy,
+    Memory,
+    Observations,
+    RandomKey,
+    observations,
+)
 from mqe_jax.envs import VectorEnv
-from mqe_jax.selfplay.league.games import Analysis, Estimate, Results, analyse, estimate, games_of, resample
+from mqe_jax.selfplay.league.games import (
+    Analysis,
+    Estimate,
+    Results,
+    analyse,
+    estimate,
+    games_of,
+    resample,
+)
 from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
 from mqe_jax.selfplay.opponents import Versus
 from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.policy import Policy, check_policy
 
 Array = NDArray[np.float64]
-CSV, POLICIES, PICTURE = "tournament.csv", "policies.csv", "tournament.png"
+CSV = "tournament.csv"
+POLICIES = "policies.csv"
+PICTURE = "tournament.png"
 
 _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 40
 
 
 @check_arguments(matches=AnyBatch, policy=AnyPolicy, key=RandomKey)
-def play(matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array) -> NDArray[np.int64]:
-    """Returns a policy's outcomes as team 0 against each of K opponents, in each environment's first episode (K, 3)."""
+def play(
+    matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array
+) -> NDArray[np.int64]:
+    """Returns a policy's outcomes as team 0 against each of K opponents, in each environment's
+    first episode (K, 3).
+    """
     return _play(matches, [policy], opponents, [key])[0]
 
 
-@check_arguments(matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey)
-def round_robin(matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array) -> NDArray[np.int64]:
-    """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in `RESULTS`."""
+@check_arguments(
+    matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey
+)
+def round_robin(
+    matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array
+) -> NDArray[np.int64]:
+    """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in
+    `RESULTS`.
+    """
     teams = list(policies.values())
     return _play(matches, teams, teams, jax.random.split(key, len(teams)))
 
 
 @single
-def _play(matches: VectorEnv, policies: Sequence[Policy], opponents: Sequence[Policy], keys: Any) -> NDArray[np.int64]:
-    """Returns the outcomes of each of P policies as team 0, with its key, against each of K opponents (P, K, 3).
+def _play(
+    matches: VectorEnv, policies: Sequence[Policy], opponents: Sequence[Policy], keys: Any
+) -> NDArray[np.int64]:
+    """Returns the outcomes of each of P policies as team 0, with its key, against each of K
+    opponents (P, K, 3).
 
     One compiled program serves all policies.
     """
     for policy in policies:
         check_policy(policy, matches)
-    env, count = Versus(matches, opponents), matches.num_envs
+    env = Versus(matches, opponents)
+    count = matches.num_envs
 
-    def turn(i: int, seen: Observations, memories: tuple[Memory, ...], key: jax.Array) -> tuple[jax.Array, Any]:
+    def turn(
+        i: int, seen: Observations, memories: tuple[Memory, ...], key: jax.Array
+    ) -> tuple[jax.Array, Any]:
         action, memory = policies[i].act(seen.to(policies[i]), memories[i], key)
         return action, (*memories[:i], memory, *memories[i + 1 :])
 
@@ -75,7 +109,9 @@ def _play(matches: VectorEnv, policies: Sequence[Policy], opponents: Sequence[Po
         memories = tuple(policy.initial_memory(count) for policy in policies)
         nothing = jnp.zeros((count,), bool), jnp.zeros((count, 3), bool)
         start = env.reset(reset_key), memories, *nothing
-        (_, _, _, outcome), _ = jax.lax.scan(advance, start, jax.random.split(key, matches.max_episode_steps))
+        (_, _, _, outcome), _ = jax.lax.scan(
+            advance, start, jax.random.split(key, matches.max_episode_steps)
+        )
         return outcome
 
     outcomes = np.stack([run(jnp.int32(number), key) for number, key in enumerate(keys)])
@@ -84,7 +120,8 @@ def _play(matches: VectorEnv, policies: Sequence[Policy], opponents: Sequence[Po
 
 @check_arguments(results=Results)
 def scores(results: NDArray[Any]) -> Array:
-    """Returns the points of each policy against each, as both teams together, in games: (..., P, P, 3) to (..., P, P).
+    """Returns the points of each policy against each, as both teams together, in games: (..., P, P,
+    3) to (..., P, P).
 
     A draw counts half.
     """
@@ -96,8 +133,8 @@ def scores(results: NDArray[Any]) -> Array:
 def rate(results: NDArray[Any], reference: int) -> Estimate:
     """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,); `reference` has 0.
 
-    A draw is half a win; every pair has one drawn game more than it played, so that ratings are finite. Intervals are
-    of a Bayesian bootstrap of all these games.
+    A draw is half a win; every pair has one drawn game more than it played, so that ratings are
+    finite. Intervals are of a Bayesian bootstrap of all these games.
     """
     if reference >= len(results):
         fail("reference", reference, f"the index of one of the {len(results)} policies")
@@ -107,16 +144,21 @@ def rate(results: NDArray[Any], reference: int) -> Estimate:
 
 
 def _strengths(points: Array, reference: int) -> Array:
-    """Returns the maximum-likelihood ratings (..., P) of points (..., P, P), by Newton's method with bounded steps."""
+    """Returns the maximum-likelihood ratings (..., P) of points (..., P, P), by Newton's method
+    with bounded steps.
+    """
     count = points.shape[-1]
     points = points * (1 - np.eye(count))
-    games, strength = points + points.swapaxes(-1, -2), np.zeros(points.shape[:-1])
+    games = points + points.swapaxes(-1, -2)
+    strength = np.zeros(points.shape[:-1])
     for _ in range(_ITERATIONS):
         expected = 1 / (1 + np.exp(strength[..., None, :] - strength[..., :, None]))
-        slope, bend = (points - games * expected).sum(axis=-1), games * expected * (1 - expected)
+        slope = (points - games * expected).sum(axis=-1)
+        bend = games * expected * (1 - expected)
         total = bend.sum(axis=-1)
         curvature = total[..., None] * np.eye(count) - bend
-        curvature[..., reference, reference] += 1 + total.max(axis=-1)  # the reference stays where it is
+        # the reference stays where it is
+        curvature[..., reference, reference] += 1 + total.max(axis=-1)
         step = np.linalg.solve(curvature, slope[..., None])[..., 0]
         strength = strength + step / np.maximum(np.abs(step).max(axis=-1, keepdims=True) / 2, 1)
     return _POINTS * (strength - strength[..., reference, None])
@@ -141,11 +183,15 @@ class Standings:
         return analyse(self.results)
 
     def __repr__(self) -> str:
-        found, order = self.analysis, self._order
+        found = self.analysis
+        order = self._order
         wide = 50 * np.max(found.payoff.high - found.payoff.low)
-        names, ratings = [shorten(self.policies[i]) for i in order], [self.ratings.at(i).text(1) for i in order]
+        names = [shorten(self.policies[i]) for i in order]
+        ratings = [self.ratings.at(i).text(1) for i in order]
         columns = {"mean": found.mean, "worst case": found.worst, "Nash average": found.average}
-        texts = {name: [kind.at(i).text(form="+.0f") for i in order] for name, kind in columns.items()}
+        texts = {
+            name: [kind.at(i).text(form="+.0f") for i in order] for name, kind in columns.items()
+        }
         texts["Nash weight"] = [found.weight.at(i).text() for i in order]
         lines = [
             *table({"policy": names, "rating (95% interval)": ratings}),
@@ -162,17 +208,25 @@ class Standings:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the results as JSON can represent them, ratings with the strongest first."""
-        found, policies = self.analysis, []
+        found = self.analysis
+        policies = []
         for i in self._order:
             each = {name: x.at(i).to_dict() for name, x in found.by_policy().items()}
             policies.append({"policy": self.policies[i], **self.ratings.at(i).to_dict(), **each})
-        pairs = {"results": self.results.tolist(), "payoff": found.payoff.to_dict(), "cycles": found.cycles.to_dict()}
+        pairs = {
+            "results": self.results.tolist(),
+            "payoff": found.payoff.to_dict(),
+            "cycles": found.cycles.to_dict(),
+        }
         return {"task": self.task, "ratings": policies, "policies": [*self.policies], **pairs}
 
     @check_arguments(folder=PathText)
     def save(self, folder: str | Path) -> None:
-        """Writes the results of every pair, what they say of each policy, and a picture of the points, atomically."""
-        folder, pairs = Path(folder), []
+        """Writes the results of every pair, what they say of each policy, and a picture of the
+        points, atomically.
+        """
+        folder = Path(folder)
+        pairs = []
         both = self.results + self.results.swapaxes(0, 1)[..., ::-1]
         for i, j in itertools.product(range(len(self.policies)), repeat=2):
             games = max(int(both[i, j].sum()), 1)
@@ -182,10 +236,19 @@ class Standings:
         write_table(folder / CSV, ("team0", "team1", *RESULTS, *sides), pairs)
         kinds = {"rating": self.ratings, **self.analysis.by_policy()}
         header = [f"{name}{end}" for name in kinds for end in ("", "_low", "_high")]
-        rows = [(self.policies[i], *(f"{x[i]:.6g}" for kind in kinds.values() for x in kind)) for i in self._order]
+        rows = [
+            (self.policies[i], *(f"{x[i]:.6g}" for kind in kinds.values() for x in kind))
+            for i in self._order
+        ]
         write_table(folder / POLICIES, ("policy", *header), rows)
         share = scores(self.results) / np.maximum(scores(self.results) + scores(self.results).T, 1)
-        draw(self.policies, share, "points of 100 games, row against column", folder / PICTURE, diagonal=False)
+        draw(
+            self.policies,
+            share,
+            "points of 100 games, row against column",
+            folder / PICTURE,
+            diagonal=False,
+        )
 
     @property
     def _order(self) -> list[int]:
