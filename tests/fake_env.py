@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.cli import demo, launch, main
+from mqe_jax.cli import launch, main
 from mqe_jax.core import devices
 from mqe_jax.core.types import Outcome
 from mqe_jax.envs import TASKS, EnvironmentState
@@ -191,8 +191,7 @@ def install(patch: pytest.MonkeyPatch) -> None:
     def make_env(task: str, *arguments: Any, **named: Any) -> Any:
         return made(arguments[2]) if task == "fake" else real(task, *arguments, **named)
 
-    for module in (build, demo):
-        patch.setattr(module, "make_env", make_env)
+    patch.setattr(build, "make_env", make_env)
     patch.setitem(TASKS, "fake", FakeEnv)  # pyright: ignore[reportArgumentType]
 
 

@@ -19,6 +19,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
+from mqe_jax.presets import resolve
 from mqe_jax.runs import build
 from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
@@ -221,39 +222,12 @@ def test_a_policy_of_another_task_is_refused_by_name(
         )
 
 
-def test_a_parameter_that_is_given_counts_in_training_too() -> None:
-    tuned = build.base_config("go1sheep-easy", None)
-    assert (
-        tuned.training_env["rewards"]["failure"] == -10.0
-        and tuned.training_env["rewards"]["crossing"] == 10.0
-    )
-    given = {"rewards.failure": 0.0, "frozen_time": 1.0}
-    parsed = parse_train(
-        ["go1sheep-easy", *(word for name, x in given.items() for word in ("--set", f"{name}={x}"))]
-    )
-    learnt = build.settings_of("go1sheep-easy", None, given)
-    for settings in (build.for_task(x, "go1sheep-easy", given) for x in (parsed.settings, learnt)):
-        trained = settings.training_env
-        assert (
-            trained["rewards"] == {**tuned.training_env["rewards"], "failure": 0.0}
-            and trained["frozen_time"] == 1.0
-        )
-    both = build.settings_of("go1sheep-easy", {"train_env": {"rewards.failure": -5.0}}, given)
-    assert build.for_task(both, "go1sheep-easy", given).training_env["rewards"]["failure"] == -5.0
-
-
-def test_a_run_has_the_parameters_that_the_policy_to_start_from_needs() -> None:
-    settings = build.settings_of("go1tug", {"start": "go1tug"})
-    assert build.for_task(settings, "go1tug").env["skill"] == "agile"
-    assert build.for_task(settings, "go1tug", {"skill": "walk"}).env["skill"] == "walk"
-
-
 def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
     parsed = parse_train(
         ["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"]
     )
     expected = {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
-    assert parsed.settings == override(build.base_config("go1gate", "demo"), expected)
+    assert parsed.settings == override(resolve("go1gate", "demo"), expected)
     parsed = parse_train(
         ["go1gate", "--network.name", "mat", "--network.heads", "2", "--checkpoint.no-environments"]
     )

@@ -123,13 +123,13 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """
     few: dict[str, Any] = {"num_envs": 8, "rollout_steps": 16, "total_steps": 256, "ppo.epochs": 1}
     few |= {"network": {"recurrent": False, "hidden_sizes": (8,)}}
-    real = build.for_task
+    real = build.settings
 
-    def for_task(*arguments: Any) -> TrainConfig:
-        config = real(*arguments)
+    def settings(*arguments: Any, **named: Any) -> TrainConfig:
+        config = real(*arguments, **named)
         return override(TrainConfig(task=config.task, env=config.env, seed=config.seed), few)
 
-    monkeypatch.setattr(build, "for_task", for_task)
+    monkeypatch.setattr(build, "settings", settings)
     monkeypatch.setattr(QuadrupedEnv, "max_steps", 20)
     monkeypatch.chdir(tmp_path)
 

@@ -57,12 +57,10 @@ def test_settings_are_those_of_the_command(
     # in the empty folder of the test
     Path("file.yaml").write_text("{num_envs: 8, ppo: {epochs: 2}}")
     command = parse_train(words.split())
-    expected = build.for_task(command.settings, command.target, command.overrides())
+    expected = build.settings(command.target, command.settings)
     if isinstance(config, TrainConfig):
         config = command.settings
-    assert (
-        build.for_task(build.settings_of(command.target, config), command.target, env) == expected
-    )
+    assert build.settings(command.target, config, env=env) == expected
 
 
 run = pytest.fixture(scope="module")(lambda shared_programs: mqe_jax.learn(fake(), FEW, seed=2))

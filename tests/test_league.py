@@ -16,8 +16,8 @@ from mqe_jax import cli
 from mqe_jax.core.settings import build, override, to_mapping
 from mqe_jax.envs import make
 from mqe_jax.envs.wrappers import Deadline
+from mqe_jax.presets import resolve
 from mqe_jax.runs import build as setup
-from mqe_jax.runs.build import base_config
 from mqe_jax.selfplay.league import tournament
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.selfplay.opponents import versus
@@ -228,7 +228,7 @@ def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", MATCHES)
 def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> None:
-    config = base_config(task, None)
+    config = resolve(task)
     assert {"newest", "older", "scripted"} <= set(config.opponents) and config.num_envs % len(
         config.opponents
     ) == 0
@@ -240,9 +240,7 @@ def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> 
             "frozen_time": 0.0,
             "rewards": {"push": 3.0, "approach": 1.0},
         }
-    assert (
-        base_config(task, "paper/mappo").opponents == () == base_config("go1gate", None).opponents
-    )
+    assert resolve(task, "paper/mappo").opponents == () == resolve("go1gate").opponents
 
 
 def test_ratings_recover_the_strengths_behind_many_games() -> None:
@@ -283,7 +281,7 @@ def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(
     changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
     assert (
         setup.environments(
-            "c", override(base_config("go1revolvingdoor", "paper/mappo"), changes), 1
+            "c", override(resolve("go1revolvingdoor", "paper/mappo"), changes), 1
         ).eval_env
         is not None
     )

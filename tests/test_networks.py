@@ -14,16 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.cli.train import parse_train
 from mqe_jax.core.blocks import Block, entities
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory, Params
 from mqe_jax.physics.robots.go1 import GO1
-from mqe_jax.runs.presets import base_config, preset
+from mqe_jax.presets import preset
 from mqe_jax.skills.agile import FRAME_SIZE, NOW_SIZE
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.mat import Mat, log_std_of
-from mqe_jax.train.networks import NETWORKS, ActorCritic, EnvDims, Network
+from mqe_jax.train.networks import NETWORKS, EnvDims, Network
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train_seeds
 from mqe_jax.view.session import Session
@@ -65,37 +64,6 @@ def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
         -learn("mat", probes.pay_meeting, 100, small, fixed)[-20:].mean() / math.exp(2 * log_std)
         <= 1.2
     )
-
-
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_papers_file_is_its_algorithm(algorithm: str) -> None:
-    config = base_config("go1gate", None, algorithm)
-    again = override(config, preset(algorithm))
-    assert again == config, algorithm
-    assert (
-        config.action_scale == 0.5 and config.num_envs == 500 and config.total_steps == 40_000_000
-    )
-    assert isinstance(config.network, Mat if algorithm == "mat" else ActorCritic)
-
-
-def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
-    demo = base_config("go1gate", "demo")
-    joint = base_config("go1gate", "demo", "jrpo")
-    assert (joint.ppo.ratio, joint.ppo.value) == ("joint", "joint")
-    assert joint.network == override(demo, {"network.critic_input": "observations"}).network
-    assert base_config("go1gate", "demo", "mat").network == Mat()
-
-
-def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
-    assert base_config("go1gate", None) == base_config("go1gate", "tuned/go1gate")
-    assert base_config("go1plane", None) == base_config("go1plane", "paper/mappo")
-    assert base_config("go1bridgewrestling", None) == base_config("go1wrestling", None)
-    assert parse_train(["go1bridgewrestling"]).settings == base_config("go1wrestling", None)
-
-
-def test_unknown_names_get_the_nearest() -> None:
-    refuses(r"algorithm: 'mapo'.*did you mean 'mappo'", base_config, "go1gate", "demo", "mapo")
-    refuses(r"config: unknown name 'deno' \(did you mean 'demo'", base_config, "go1gate", "deno")
 
 
 KEY = jax.random.PRNGKey(0)

@@ -19,7 +19,8 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import Batch, Observations
 from mqe_jax.policies import load_as, parameters_for, zoo
-from mqe_jax.runs.build import for_task, prepare, settings_of
+from mqe_jax.runs import build
+from mqe_jax.runs.build import prepare
 from mqe_jax.train.needs import Needs, needs_of
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, check_policy, read_policy
@@ -65,16 +66,17 @@ def test_sensors_select_the_settings_of_policies_that_see_them() -> None:
     train = parse_train(flags)
     assert train.overrides() == SENSES and train.settings.imitation.teacher == "go1gate"
     assert (train.settings.group, train.settings.network.name) == ("onboard", "blocks")
-    assert train.settings == settings_of("go1gate", {"imitation.teacher": "go1gate"}, SENSES)
+    learnt = build.settings("go1gate", {"imitation.teacher": "go1gate"}, env=SENSES)
+    assert build.settings("go1gate", train.settings) == learnt
     network: Any = parse_train(
         ["go1gate", "--set", "senses=onboard", "--network.gru-size", "7"]
     ).settings.network
     assert network.gru_size == 7
     plain = parse_train(["go1gate", "--senses", "full"]).settings
     assert plain == parse_train(["go1gate"]).settings and plain.group == "policy"
-    demo = settings_of("go1gate", {"config": "demo", "group": "policy"}, SENSES)
+    demo = build.settings("go1gate", {"config": "demo", "group": "policy"}, env=SENSES)
     assert demo.group == "policy" and demo.num_envs == 128
-    assert settings_of("go1tug", None, {"senses": ["lidar"]}).group == "onboard"
+    assert build.settings("go1tug", env={"senses": ["lidar"]}).group == "onboard"
     listed = parse_train(["go1gate", "--senses", "[lidar, {name: detections, range: 2.0}]"])
     assert listed.overrides() == {"senses": ["lidar", {"name": "detections", "range": 2.0}]}
     assert listed.settings.group == "onboard"
@@ -85,13 +87,13 @@ def test_a_task_gets_what_its_teacher_needs(monkeypatch: pytest.MonkeyPatch) -> 
     needs = override(shipped.needs, {"skill": "agile", "command_ranges": {"vx": (-1.0, 1.5)}})
     teacher = dataclasses.replace(shipped, needs=needs)
     monkeypatch.setattr(zoo, "load", lambda name: teacher)
-    config = settings_of("go1gate", {"imitation.teacher": "go1gate"}, SENSES)
-    assert for_task(config, "go1gate", SENSES).env == {
+    changes = {"imitation.teacher": "go1gate"}
+    assert build.settings("go1gate", changes, env=SENSES).env == {
         **SENSES,
         "skill": "agile",
         "command_ranges": needs.command_ranges,
     }
-    given = for_task(config, "go1gate", {"skill": "walk"})
+    given = build.settings("go1gate", changes, env={**SENSES, "skill": "walk"})
     assert given.env["skill"] == "walk"
     refuses(
         r"imitation\.teacher: go1gate needs skill 'agile'.* has 'walk'",

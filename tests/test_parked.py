@@ -19,8 +19,8 @@ from mqe_jax.npc import flock
 from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.scripted.cooperative import _sides
+from mqe_jax.presets import resolve
 from mqe_jax.runs.build import make_learner
-from mqe_jax.runs.presets import base_config
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import running_init
@@ -435,8 +435,8 @@ def test_a_policy_with_a_size_is_refused_at_another_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", [BALL, SHEEP])
 def test_shipped_settings_train_a_range_of_sizes(task: str) -> None:
-    config: Any = base_config(task, "sizes")
-    usual: Any = base_config(task, None)
+    config: Any = resolve(task, "sizes")
+    usual: Any = resolve(task)
     assert (config.group, config.network.name) == (ENTITIES, "blocks")
     assert (
         config.training_env["fewest_agents"] < config.env["num_agents"]

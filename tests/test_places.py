@@ -11,7 +11,7 @@ import pytest
 from mqe_jax.cli.arguments import parse
 from mqe_jax.envs import TASKS
 from mqe_jax.policies import load_policy, zoo
-from mqe_jax.runs.presets import named_config
+from mqe_jax.presets import resolve
 from mqe_jax.train.policy import save_policy
 from tests.fake_env import SMALL
 from tests.inputs import refuses
@@ -113,7 +113,7 @@ def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (home / "c.yaml").write_text(
         "start: ~/start\nopponents: [idle, ~/other]\nenv: {skill_weights: ~/walk}\n"
     )
-    config = named_config("~/c.yaml", "go1tug")
+    config = resolve("go1tug", "~/c.yaml")
     assert config.start == f"{home}/start" and config.opponents == ("idle", f"{home}/other")
     assert TASKS["go1tug"].Params(**config.env).skill_weights == f"{home}/walk"
     words = ["--run-dir=~/run", "--config=~/c.yaml", "--dump-diverged=~/dumps"]

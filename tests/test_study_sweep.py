@@ -16,10 +16,10 @@ from mqe_jax.core.files import lock
 from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast
 from mqe_jax.policies import zoo
+from mqe_jax.presets import Layers, resolve
 from mqe_jax.runs import build as setup
-from mqe_jax.runs.presets import preset
 from mqe_jax.study import sweep as sweeps
-from mqe_jax.study.runs import read_runs
+from mqe_jax.study.runs import Cell, read_runs
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.config import TrainConfig
 from tests import training as probes
@@ -45,12 +45,12 @@ settings:
 VARIANTS = FILE + "variants: {plain: {}, scratch: {env: {control: position}}}\n"
 
 
-def config_of(task: str, algorithm: str) -> TrainConfig:
-    return override(TrainConfig(task=task), preset(algorithm))
+def config_of(cell: Cell, layers: Layers) -> TrainConfig:
+    return resolve(cell.task, TrainConfig(task=cell.task), cell.algorithm, layers)
 
 
-def of_train(task: str, algorithm: str) -> TrainConfig:
-    return setup.for_task(setup.base_config(task, None), task)
+def of_train(cell: Cell, layers: Layers) -> TrainConfig:
+    return setup.settings(cell.task, layers=layers)
 
 
 def load(tmp_path: Path, text: str = FILE) -> Sweep:

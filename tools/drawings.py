@@ -35,7 +35,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Polygon, Rectang
 import mqe_jax
 from mqe_jax.core.files import replacing
 from mqe_jax.envs.match import Match
-from mqe_jax.runs.build import base_config
+from mqe_jax.presets import resolve
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "drawings"
@@ -419,7 +419,7 @@ def league() -> Figure:
     """Whom a policy meets in a league: itself, its earlier versions, and fixed opponents, in equal
     shares.
     """
-    config = base_config("go1tug", "league")
+    config = resolve("go1tug", "league")
     steps = 1 * config.league.snapshot_steps / 1e6
     quarter = 0.25 * config.league.snapshot_steps / 1e6
     own = {"newest": BLUE, "older": VIOLET, "uniform": VIOLET}

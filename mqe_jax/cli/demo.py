@@ -12,7 +12,7 @@ from mqe_jax.core import interrupts
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_folder, write_atomically
 from mqe_jax.core.literal import echo
-from mqe_jax.runs.build import base_config, for_task, make_env
+from mqe_jax.runs import build
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
 from mqe_jax.train.evaluate import Rate
@@ -31,10 +31,10 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     interrupted run.
     """
     began = time.perf_counter()
-    config = for_task(base_config(DEMO_TASK, settings), DEMO_TASK)
+    config = build.settings(DEMO_TASK, settings)
     check_folder(run_dir)
     resume = (run_dir / CONFIG_FILE).exists()
-    _, batch = make_env(
+    _, batch = build.make_env(
         DEMO_TASK, impl, config.env, config.num_envs, final=config.network.critic_reads
     )
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"

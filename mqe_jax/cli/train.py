@@ -15,8 +15,8 @@ from mqe_jax.core import interrupts
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import override, settings_class
-from mqe_jax.runs.presets import base_config
+from mqe_jax.core.settings import settings_class
+from mqe_jax.presets import resolve
 from mqe_jax.train.config import TrainConfig
 
 HINT = "resume with the same command and --resume; the run is in {}"
@@ -36,11 +36,13 @@ class Source:
 
 
 @settings_class
-class Network:
-    """The network whose settings are flags."""
+class Choices:
+    """Flags on whose values the defaults of other flags depend."""
 
-    name: Annotated[str | None, tyro.conf.arg(name="network.name", metavar="NAME")] = None
+    network: Annotated[str | None, tyro.conf.arg(name="network.name", metavar="NAME")] = None
     """Registered name of the network."""
+    group: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Group of observations."""
 
 
 @settings_class
@@ -81,11 +83,7 @@ class Train(TaskOptions):
 
         run_dir = self.run_dir or Path("runs") / self.target
         seed = self.settings.seed
-        options: dict[str, Any] = {
-            "env": self.overrides(),
-            "impl": self.impl,
-            "resume": self.resume,
-        }
+        options: dict[str, Any] = {"impl": self.impl, "resume": self.resume}
         options |= {"run_dir": run_dir, "dump_diverged": self.dump_diverged}
         if self.num_seeds == 1:
             folders = [run_dir]
@@ -107,8 +105,8 @@ class Train(TaskOptions):
 
 
 def parse_train(arguments: Sequence[str]) -> Train:
-    """Parses the arguments of `mqe train`; settings' file, algorithm, network and sensors decide
-    the flags' defaults.
+    """Parses the arguments of `mqe train`; settings' file, algorithm, network, group and sensors
+    decide the flags' defaults.
 
     InputError without a task in front, or for a file, an algorithm or a network that is not
     allowed; SystemExit as of `mqe_jax.cli.arguments.parse`.
@@ -122,14 +120,17 @@ def parse_train(arguments: Sequence[str]) -> Train:
     source, others = tyro.cli(
         Source, args=list(arguments), add_help=False, return_unknown_args=True
     )
-    network, others = tyro.cli(Network, args=others, add_help=False, return_unknown_args=True)
+    chosen, others = tyro.cli(Choices, args=others, add_help=False, return_unknown_args=True)
     given, others = tyro.cli(TaskOptions, args=others, add_help=False, return_unknown_args=True)
-    settings = base_config(task, source.config, source.algorithm, given.overrides())
-    if network.name is not None and network.name != settings.network.name:
-        settings = override(settings, {"network": {"name": network.name}})
+    changes: dict[str, Any] = {"env": given.overrides()}
+    if chosen.network is not None:
+        changes["network.name"] = chosen.network
+    if chosen.group is not None:
+        changes["group"] = chosen.group
     for flag, name in {"--opponent": "opponents", "--mate": "mates"}.items():
         # tyro would append to those of the file
         if any(word.split("=")[0] == flag for word in others):
-            settings = override(settings, {name: ()})
+            changes[name] = ()
+    settings = resolve(task, source.config, source.algorithm, {"": changes})
     default = Train(target=tyro.MISSING, settings=settings, source=source)
     return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=MARKERS)

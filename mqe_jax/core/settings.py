@@ -240,11 +240,18 @@ def override(settings: T, changes: Mapping[str, Any]) -> T:
 def _joined(kind: Any, first: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(changes, Mapping):
         fail(kind.__name__, changes, "a mapping of names to values")
+    return merge(first, nested(changes))
+
+
+def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns changes with dotted names as nested ones; InputError for a name that is given
+    twice.
+    """
     made = merge({}, changes)  # which rejects what is nested too deep
     for name, following in itertools.pairwise(sorted(_names(changes))):
         if name == following:
             raise InputError(f"{name}: is given twice")
-    return merge(first, made)
+    return made
 
 
 def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:

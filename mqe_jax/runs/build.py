@@ -11,6 +11,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import (
+    FrozenMapping,
     Parameters,
     PathText,
     check,
@@ -18,6 +19,7 @@ from mqe_jax.core.settings import (
     differences,
     fail,
     merge,
+    nested,
     override,
 )
 from mqe_jax.core.types import Cast
@@ -26,7 +28,7 @@ from mqe_jax.envs import ALIASES, SCRIPTED, TASKS, QuadrupedEnv, TaskParams, Vec
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.policies import all_agents, load_as, load_policy, parameters_for, zoo
-from mqe_jax.runs.presets import base_config
+from mqe_jax.presets import resolve
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
 from mqe_jax.selfplay.league.sides import BothSides
@@ -69,28 +71,24 @@ def prepare(
     if len(set(seeds or ())) < len(seeds or ()):
         fail("seeds", seeds, "a list without repetitions")
     if isinstance(task, str | QuadrupedEnv):
-        settings = for_task(settings_of(task, config, env), task, env)
+        made = settings(task, config, env=env)
     elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
-        settings = settings_of("", config)
-        theirs = {"env": env, "opponents": settings.opponents, "mates": settings.mates}
-        theirs |= {"demonstrator": settings.curriculum.demonstrator}
+        made = settings(task, config)
+        theirs = {"env": env, "opponents": made.opponents, "mates": made.mates}
+        theirs |= {"demonstrator": made.curriculum.demonstrator}
         for name, value in theirs.items():
             if value:
                 fail(name, value, "left out for a batch of environments, which has its own")
-        if isinstance(inner := getattr(task, "env", None), QuadrupedEnv):
-            settings = for_task(settings, inner)
-        settings = override(settings, {"num_envs": task.num_envs, "evaluation.every": None})
+        made = override(made, {"num_envs": task.num_envs, "evaluation.every": None})
     else:
         fail(
             "task",
             task,
             "a task's id, an environment such as that of mqe_jax.make, or a batch of environments",
         )
-    configs = (
-        [settings] if seeds is None else [override(settings, {"seed": seed}) for seed in seeds]
-    )
+    configs = [made] if seeds is None else [override(made, {"seed": seed}) for seed in seeds]
     if isinstance(task, str | QuadrupedEnv):
-        return configs, environments(impl, settings, len(configs), task)
+        return configs, environments(impl, made, len(configs), task)
     return configs, Cast(task)
 
 
@@ -126,9 +124,9 @@ def make_learner(
     Raises:
         InputError: as `mqe_jax.learn`.
     """
-    (settings, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
+    (made, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
     return learner.make_learner(
-        cast.env, settings, league=cast.league, teacher=cast.teacher, stages=stages
+        cast.env, made, league=cast.league, teacher=cast.teacher, stages=stages
     )
 
 
@@ -403,42 +401,45 @@ def run_config(target: str) -> TrainConfig:
     return load_policy(target).config
 
 
-def settings_of(
-    task: str | QuadrupedEnv, config: Config, env: Mapping[str, Any] | None = None
+def settings(
+    task: TaskLike,
+    config: Config = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    layers: Mapping[str, Mapping[str, Any]] = FrozenMapping(),
 ) -> TrainConfig:
-    """Returns the settings that `config` of `mqe_jax.learn` stands for, without the task and its
-    parameters.
+    """Returns the settings of a training on a task, with the task and its parameters.
+
+    Layers lie between those of `config` and `env`. A task by its id gets the parameters that the
+    teacher and the policy to start from need. A line says if the settings are for another task.
     """
-    if isinstance(config, TrainConfig):
-        return config
     changes = dict(config) if isinstance(config, Mapping) else {"config": config}
     source = changes.pop("config", None)
     algorithm = changes.pop("algorithm", None)
-    if not isinstance(source, str | Path | None) or not isinstance(algorithm, str | None):
+    kinds = str | Path | TrainConfig | None
+    if not isinstance(source, kinds) or not isinstance(algorithm, str | None):
         fail("config", config, "a shipped name, a file, a TrainConfig, or a mapping of settings")
-    name = task.name if isinstance(task, QuadrupedEnv) else task
-    given = merge(parameters_of(task), env or {})
-    return override(
-        base_config(name, None if source is None else str(source), algorithm, given), changes
+    inner = task if isinstance(task, str | QuadrupedEnv) else getattr(task, "env", None)
+    name = ""
+    own: dict[str, Any] = {}
+    if isinstance(inner, str):
+        name = task_id(inner)
+    elif isinstance(inner, QuadrupedEnv):
+        name = inner.name
+        own = parameters_of(inner)
+    given = merge(nested(changes), {"env": merge(own, env or {})})
+
+    def needs(settings: TrainConfig) -> dict[str, Any]:
+        sources = settings.imitation.teacher, settings.start
+        return parameters_for(name, *(source for source in sources if source is not None))
+
+    made = resolve(
+        name if inner is task else "",
+        source,
+        algorithm,
+        {**layers, "": given},
+        needs if isinstance(task, str) else lambda settings: {},
     )
-
-
-def for_task(
-    config: TrainConfig, task: str | QuadrupedEnv, env: Mapping[str, Any] | None = None
-) -> TrainConfig:
-    """Returns the settings with a task and its parameters; prints a line if they are for another
-    task.
-
-    A task by its id gets the parameters that the teacher and the policy to start from need, unless
-    they are passed.
-    """
-    name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
-    if config.task not in (None, name):
-        echo(f"mqe: the settings are for {config.task!r}; training {name!r} with them")
-    given = merge(config.env, merge(parameters_of(task), env or {}))
-    if isinstance(task, str):
-        sources = (
-            source for source in (config.imitation.teacher, config.start) if source is not None
-        )
-        given = merge(parameters_for(name, *sources), given)
-    return override(config, {"task": name, "env": given})
+    if made.task not in (None, name) and name:
+        echo(f"mqe: the settings are for {made.task!r}; training {name!r} with them")
+    return override(made, {"task": name or made.task})

@@ -15,11 +15,12 @@ from mqe_jax.core.limits import Positive, Seed
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import PathText, check_arguments, fail, to_mapping
 from mqe_jax.envs.registry import task_id
+from mqe_jax.presets import Layers
 from mqe_jax.runs import build
 from mqe_jax.runs.measuring import measure
-from mqe_jax.runs.presets import base_config
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
+from mqe_jax.study.runs import Cell
 from mqe_jax.study.sweep import Job, Measurement, Sweep, load_part
 from mqe_jax.train.config import TrainConfig
 
@@ -83,11 +84,11 @@ def sweep(
     for task in settings.tasks:
         task_id(task)
 
-    def config_of(task: str, algorithm: str) -> TrainConfig:
-        name = settings.config and settings.config.replace("{task}", task)
-        return build.for_task(
-            base_config(task, name, None if algorithm == "default" else algorithm), task
-        )
+    def config_of(cell: Cell, layers: Layers) -> TrainConfig:
+        named = {"config": settings.config and settings.config.replace("{task}", cell.task)}
+        if cell.algorithm != "default":
+            named["algorithm"] = cell.algorithm
+        return build.settings(cell.task, named, layers=layers)
 
     def stop() -> bool:
         return time_limit is not None and time.monotonic() - began > 60.0 * time_limit

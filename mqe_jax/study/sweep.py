@@ -31,6 +31,7 @@ from mqe_jax.core.settings import (
     to_mapping,
 )
 from mqe_jax.core.types import Cast
+from mqe_jax.presets import Layers
 from mqe_jax.study.runs import PLAIN, Cell, is_finished, read_curve
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -63,8 +64,7 @@ class Sweep:
     """Settings file or shipped name, in which {task} stands for the task's id; none uses that of
     `mqe train`."""
     settings: Mapping[str, Any] = FrozenMapping()
-    """Settings that override the file's in every run; {task} in `start`, `opponents` and `mates`
-    stands for the task's id."""
+    """Settings that override the file's in every run, in which {task} stands for the task's id."""
     variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
     """Named overrides of the settings, such as scratch: {env: {control: position}}; the name is a
     cell's `variant`."""
@@ -84,6 +84,19 @@ class Sweep:
                     values,
                     "a mapping of settings, under a name of letters and digits",
                 )
+        named = {f"variants.{name}": values for name, values in self.variants.items()}
+        for name, values in {"settings": self.settings, **named}.items():
+            for key in {"task", "seed"} & values.keys():
+                fail(
+                    f"{name}.{key}",
+                    values[key],
+                    f"left out: the sweep's {key}s are in its list `{key}s`",
+                )
+
+    def layers(self, cell: Cell) -> Layers:
+        """Returns the changes of the settings of a cell, the lowest first."""
+        variant = {f"variants.{cell.variant}": self.variants[cell.variant]}
+        return for_task({"settings": self.settings, **variant}, cell.task)
 
 
 @settings_class
@@ -189,7 +202,7 @@ def match_names(names: Iterable[str], patterns: Sequence[str], example: str) -> 
 def plan(
     sweep: Sweep,
     folder: Path,
-    config_of: Callable[[str, str], TrainConfig],
+    config_of: Callable[[Cell, Layers], TrainConfig],
     cells: Sequence[str] = (),
     seeds: Sequence[int] = (),
     check: Callable[[TrainConfig, int], object] = lambda config, seeds: None,
@@ -197,8 +210,8 @@ def plan(
     """Returns the remaining jobs, in the order of training, of the cells that `select` returns for
     `cells`.
 
-    `seeds` are some of the sweep's, all if empty. `config_of(task, algorithm)` gives the settings
-    that those of the sweep override. `check(config, seeds)` raises an InputError for settings with
+    `seeds` are some of the sweep's, all if empty. `config_of(cell, layers)` returns the settings of
+    a cell, with the sweep's changes. `check(config, seeds)` raises an InputError for settings with
     which so many seeds could not start; no cell is trained before. Seeds whose newest checkpoints
     differ are trained in separate jobs.
     """
@@ -206,11 +219,7 @@ def plan(
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
     jobs = []
     for cell in select(sweep, cells):
-        config = _override(config_of(cell.task, cell.algorithm), "settings", sweep.settings)
-        config = _override(config, f"variants.{cell.variant}", sweep.variants[cell.variant])
-        named = {name: getattr(config, name) for name in ("start", "opponents", "mates")}
-        if "{task}" in str(named):
-            config = override(config, for_task(named, cell.task))
+        config = config_of(cell, sweep.layers(cell))
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not is_finished(_run(folder, cell, seed))]
         size = sweep.seeds_together or len(sweep.seeds)
@@ -239,23 +248,6 @@ def for_task(values: Any, task: str) -> Any:
     if isinstance(values, list | tuple):
         return [for_task(value, task) for value in values]
     return values.replace("{task}", task) if isinstance(values, str) else values
-
-
-def _override(config: TrainConfig, name: str, changes: Mapping[str, Any]) -> TrainConfig:
-    """Returns settings with those of the mapping `name` in a sweep file; its errors have this
-    prefix.
-    """
-    for key in ("task", "seed"):
-        if key in changes:
-            fail(
-                f"{name}.{key}",
-                changes[key],
-                f"left out: the sweep's {key}s are in its list `{key}s`",
-            )
-    try:
-        return override(config, changes)
-    except InputError as error:
-        raise InputError(f"{name}.{error}") from None
 
 
 def _job(folder: Path, cell: Cell, config: TrainConfig, seeds: Sequence[int]) -> Job:

@@ -1,0 +1,198 @@
+"""Settings of trainings: `resolve` stacks shipped files, algorithms and changes.
+
+It imports no JAX, so that `mqe train` shows its flags at once.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.settings import (
+    FrozenMapping,
+    Parameters,
+    PathText,
+    check,
+    fail,
+    load_yaml,
+    merge,
+    nested,
+    override,
+)
+from mqe_jax.envs.registry import ALIASES, SHIPPED, TASKS
+from mqe_jax.train.config import TrainConfig
+
+CONFIG_FOLDER = Path(__file__).parent / "configs"
+
+Layers = Mapping[str, Mapping[str, Any]]
+"""Changes of settings, named as in `override`, by the name that errors give them; the last ones
+count."""
+
+
+def resolve(
+    task: str,
+    config: str | Path | TrainConfig | None = None,
+    algorithm: str | None = None,
+    layers: Mapping[str, Mapping[str, Any]] = FrozenMapping(),
+    needs: Callable[[TrainConfig], Mapping[str, Any]] = lambda config: {},
+) -> TrainConfig:
+    """Returns the settings with which a task is trained: a stack of layers, the lowest first.
+
+    1. The defaults of `TrainConfig`.
+    2. The task parameters that `needs` returns for the other layers' settings: those of the
+       policies that they name.
+    3. The settings of a file or a shipped name. The default is paper/ALGORITHM for an algorithm,
+       else tuned/TASK if it exists, else league for a match and paper/mappo for other tasks.
+    4. What defines the algorithm.
+    5. `onboard.yaml`, if a layer sets the task parameter `senses` and none sets `group`.
+    6. `layers`.
+
+    A `TrainConfig` stands for 1 to 5. A parameter in a layer's `env` leaves the `train_env` of the
+    layers below.
+
+    Raises:
+        InputError: for a file, an algorithm or a value that is not allowed, or for sensors above
+            the settings whose `group` is `policy`.
+    """
+    task = ALIASES.get(task, task)
+    if isinstance(config, TrainConfig):
+        below = [_Layer.of("", vars(config))]
+    else:
+        usual = default_name(task) if algorithm is None else f"paper/{algorithm}"
+        below = _layers_of(task, usual if config is None else config)
+    if algorithm is not None:
+        below.append(_Layer.of("", preset(algorithm)))
+    above = [_Layer.of(f"{name}." if name else "", values) for name, values in layers.items()]
+    if _select_onboard([*below, *above]):
+        below.append(_Layer.of("", _parts("onboard")))
+    settings = _stack(TrainConfig(), [*below, *above])
+    needed = needs(settings)
+    return _stack(TrainConfig(env=needed), [*below, *above]) if needed else settings
+
+
+class _Layer(NamedTuple):
+    """Changes of the settings below."""
+
+    prefix: str
+    """What its errors begin with."""
+    values: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, prefix: str, values: Mapping[str, Any]) -> "_Layer":
+        """Returns a layer whose dotted names are nested ones."""
+        try:
+            values = nested(values)
+            check("env", values.get("env", {}), Parameters)
+        except InputError as error:
+            raise InputError(f"{prefix}{error}") from None
+        return cls(prefix, values)
+
+    @property
+    def env(self) -> Mapping[str, Any]:
+        """The task parameters."""
+        return self.values.get("env", {})
+
+
+def _stack(config: TrainConfig, layers: list[_Layer]) -> TrainConfig:
+    for layer in layers:
+        train_env = FrozenMapping(_without(config.train_env, layer.env))
+        try:
+            config = override(replace(config, train_env=train_env), layer.values)
+        except InputError as error:
+            raise InputError(f"{layer.prefix}{error}") from None
+    return config
+
+
+def _without(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns nested values without those that others have too."""
+    kept: dict[str, Any] = {}
+    for name, value in merge({}, values).items():
+        if name not in others:
+            kept[name] = value
+        elif isinstance(value, Mapping) and isinstance(others[name], Mapping):
+            kept[name] = _without(value, others[name])
+    return kept
+
+
+def _select_onboard(layers: list[_Layer]) -> bool:
+    """Returns whether layers set sensors and no group of observations.
+
+    InputError if the group is `policy` in a layer below all those with sensors.
+    """
+    sensing = [place for place, layer in enumerate(layers) if _has_sensors(layer.env)]
+    if not sensing or not _has_sensors(functools.reduce(merge, (layer.env for layer in layers))):
+        return False
+    grouped = [place for place, layer in enumerate(layers) if "group" in layer.values]
+    if not grouped:
+        return True
+    top = max(grouped)
+    if layers[top].values["group"] == "policy" and top < min(sensing):
+        fail("group", "policy", "onboard, to read the sensors of env.senses, or set beside them")
+    return False
+
+
+def _has_sensors(env: Mapping[str, Any]) -> bool:
+    return env.get("senses", "full") not in ("full", (), [])
+
+
+def _layers_of(task: str, config: str | Path) -> list[_Layer]:
+    """Returns the layers of a shipped name or a file."""
+    shipped = ["demo", "league", "sizes"]
+    for file in ("paper", "tuned"):
+        shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
+    name = str(check("config", config, PathText))
+    if name == "demo":
+        return [_Layer.of("", _parts(name))]
+    if name in shipped:
+        below = _layers_of(task, default_name(task)) if name == "sizes" else []
+        file, _, part = name.partition("/")
+        parts = [_parts(file)["common"], _parts(file).get(part or task, {})]
+        return below + [_Layer.of("", values) for values in parts]
+    path = Path(name)
+    allowed = f"a YAML file, or one of {', '.join(shipped)}"
+    if path.suffix not in (".yaml", ".yml") and path.parent == Path("."):
+        raise InputError(
+            f"config: unknown name {name!r}{nearest(name, shipped)}; allowed: {allowed}"
+        )
+    if not path.is_file():
+        raise InputError(f"config: no file {name!r}; allowed: {allowed}")
+    return [_Layer.of(f"{path}: ", load_yaml(path))]
+
+
+def preset(algorithm: str) -> dict[str, Any]:
+    """Returns the settings that define an algorithm, for `override`; InputError for an unknown
+    name.
+    """
+    algorithms = {name: changes for name, changes in _parts("paper").items() if name != "common"}
+    if check("algorithm", algorithm, str) not in algorithms:
+        fail(
+            "algorithm",
+            algorithm,
+            f"one of {', '.join(algorithms)}{nearest(algorithm, algorithms)}",
+        )
+    return algorithms[algorithm]
+
+
+def default_name(task: str) -> str:
+    """Returns the name of the settings with which a task is trained by default."""
+    if task in _parts("tuned"):
+        return f"tuned/{task}"
+    return "league" if _is_match(task) else "paper/mappo"
+
+
+def _is_match(task: str) -> bool:
+    if task in SHIPPED:
+        return len(SHIPPED[task].teams) > 1
+    from mqe_jax.envs.match import Match
+
+    return task in TASKS and issubclass(TASKS[task], Match)
+
+
+@functools.cache
+def _parts(file: str) -> dict[str, Any]:
+    """Returns a shipped file of settings: its parts, of which `common` are those of all, or
+    settings.
+    """
+    return load_yaml(CONFIG_FOLDER / f"{file}.yaml")
