@@ -30,10 +30,10 @@ SMALL = (
 """Flags of a training that ends within seconds."""
 
 LEG = "".join(
-    f'<body pos="0 0 -.01"><joint name="{{robot}}j{i}"/><geom size=".02"/>' for i in range(12)
+    f'<body pos="0 0 -.01"><joint name="{{robot}}/j{i}"/><geom size=".02"/>' for i in range(12)
 )
 ROBOT = (
-    '<body name="{robot}" pos="1 {y} .3"><freejoint/><geom type="box" size=".2 .1 .06" '
+    '<body name="{robot}/trunk" pos="1 {y} .3"><freejoint/><geom type="box" size=".2 .1 .06" '
     'rgba="{rgba}"/>' + LEG + "</body>" * 12 + "</body>"
 )
 XML = f"""<mujoco><worldbody>
@@ -44,7 +44,8 @@ XML = f"""<mujoco><worldbody>
 <body name="left" mocap="true" pos="2 1.4 .25"><geom type="box" size=".05 1 .25" group="1"/></body>
 <body name="right" mocap="true" pos="2 -1.4 .25">
 <geom type="box" size=".05 1 .25" group="1"/></body>
-{ROBOT.format(robot="a", y=-0.5, rgba="0 0 1 1")}{ROBOT.format(robot="b", y=0.5, rgba="0 1 0 1")}
+{ROBOT.format(robot="robot0", y=-0.5, rgba="0 0 1 1")}
+{ROBOT.format(robot="robot1", y=0.5, rgba="0 1 0 1")}
 </worldbody></mujoco>"""
 
 

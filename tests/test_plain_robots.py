@@ -64,7 +64,9 @@ def armature(motors: Motors, torque: np.ndarray, joint: int, speeds: np.ndarray)
 def test_motors_are_those_of_a_plain_implementation(name: str) -> None:
     robot = robots.get(name)
     scene = compile_scene(
-        Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1, robot=robot)
+        Scene(
+            Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1, robots=(robot,)
+        )
     )
     motors = scene.motors
     random = np.random.default_rng(0)
@@ -209,7 +211,9 @@ def test_blocks_follow_each_other_along_the_track() -> None:
 def test_a_compiled_robot_has_the_constants_of_its_data(name: str) -> None:
     robot = robots.get(name)
     track = Track(blocks=(Plane(4.0),), walled=False, num_robots=2)
-    scene = compile_scene(Scene(track, num_robots=2, robot=robot, friction=0.7, torque_robots=1))
+    scene = compile_scene(
+        Scene(track, num_robots=2, robots=(robot,) * 2, friction=0.7, torque_robots=1)
+    )
     model = scene.model
     kp = robot.kp
     kd = robot.kd

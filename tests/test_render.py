@@ -15,6 +15,7 @@ from viewer import Driven, session
 
 from mqe_jax import cli
 from mqe_jax.envs import TASKS
+from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.policies import load_policy
 from mqe_jax.sensors import marks as sensed
 from mqe_jax.train.folder import CONFIG_FILE
@@ -65,9 +66,9 @@ def test_success_is_settled_from_its_last_change_on(env: Any, episode: recording
 def test_robots_are_found_and_the_gates_walls_end_at_the_side_walls(
     env: Any, episode: recording.Episode
 ) -> None:
-    assert [env.mj_model.body(body).name for body in geometry.robot_bases(env.mj_model)] == [
-        "a",
-        "b",
+    assert [env.mj_model.body(body).name for body in trunk_bodies(env.mj_model)] == [
+        "robot0/trunk",
+        "robot1/trunk",
     ]
     drawn = geometry.rendering_model(env.mj_model, episode)
     low, high = geometry.extent(drawn, episode)
@@ -81,9 +82,7 @@ def test_the_side_view_follows_the_first_robot(env: Any, episode: recording.Epis
     data = mujoco.MjData(env.mj_model)
     camera = cameras.cameras(model, episode, "side", 1.5)[-1]
     geometry.pose(model, data, episode, len(episode) - 1)
-    assert camera.lookat[:2] == pytest.approx(
-        data.xpos[geometry.robot_bases(model)[0]][:2], abs=0.1
-    )
+    assert camera.lookat[:2] == pytest.approx(data.xpos[trunk_bodies(model)[0]][:2], abs=0.1)
     refuses(r"view: unknown name .*side", cameras.cameras, model, episode, "sid", 1.5)
 
 
@@ -196,9 +195,7 @@ def test_rendering_models_have_the_physics_models_bodies_and_contacts(task: str)
 @pytest.mark.parametrize("task", TWELVE)
 def test_team_colours_are_those_of_the_agents(task: str) -> None:
     env = made(task)
-    shown = [
-        geometry.robot_color(env.mj_model, body)[:3] for body in geometry.robot_bases(env.mj_model)
-    ]
+    shown = [geometry.robot_color(env.mj_model, body)[:3] for body in trunk_bodies(env.mj_model)]
     warm = [red > blue for red, _, blue in shown]
     robots = range(len(shown))
     expected = (

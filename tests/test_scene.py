@@ -16,6 +16,7 @@ from mujoco.batch import Batch
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import VectorEnv, make
+from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.physics import robots
 from mqe_jax.physics.engines import c
 from mqe_jax.physics.kinematics import poses
@@ -34,7 +35,8 @@ PLANE = Track(blocks=(Plane(4.0),), walled=False, num_robots=1)
 
 
 def compiled(robot: Robot, num_robots: int = 1, contacts: str = "full") -> CompiledScene:
-    return compile_scene(Scene(PLANE, num_robots=num_robots, robot=robot, contacts=contacts))
+    each = (robot,) * num_robots
+    return compile_scene(Scene(PLANE, num_robots=num_robots, robots=each, contacts=contacts))
 
 
 def tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
@@ -212,6 +214,27 @@ def test_wrong_data_is_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"Robot\.collision: duplicate names foot"):
         dataclasses.replace(GO1, collision=(*GO1.collision, GO1.collision[-1]))
     refuses(r"unknown part 'tail'", CollisionShape, "tail", sphere(0.02))
+
+
+def test_a_scene_has_one_kind_of_robot() -> None:
+    go2 = robots.get("go2")
+    assert compiled(go2, 2).robot is go2
+    two = Scene(PLANE, num_robots=2, robots=(GO1, go2))
+    refuses(r"Scene\.robots: two kinds, go1, go2; all must be one robot", compile_scene, two)
+    refuses(r"Scene\.robots: 1 robots; expected 2, num_robots", Scene, PLANE, robots=(GO1,))
+
+
+def test_the_parameter_robot_says_which_robots_a_task_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = Scene(PLANE, num_robots=1, robots=(GO1,))
+    monkeypatch.setattr(Go1Plane, "scene", lambda self: own)
+    refuses(r"scene: Scene\.robots is not empty", make, "go1plane", impl="c", num_agents=1)
+
+
+def test_a_mirror_exchanges_the_values_of_left_and_right_joints() -> None:
+    values = jnp.arange(1.0, 13.0)
+    reflected = dict(zip(GO1.joint_names, GO1.mirror.reflect(values), strict=True))
+    assert GO1.num_joints == 12
+    assert (reflected["FL_hip"], reflected["FL_thigh"], reflected["RR_calf"]) == (-4.0, 5.0, 9.0)
 
 
 def test_missing_walk_weights_say_how_to_make_them() -> None:

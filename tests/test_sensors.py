@@ -18,7 +18,7 @@ from mqe_jax.envs import State, VectorEnv, make
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import ObservationLayout, entities
 from mqe_jax.physics.robots.go1 import GO1
-from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
+from mqe_jax.physics.robots.robot import MIRROR
 from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.detections import Detections
 from mqe_jax.sensors.lidar import Lidar
@@ -156,7 +156,7 @@ def test_sensors_of_the_second_team_are_mirrored_as_its_frame(task: str) -> None
     speeds = rng.normal(size=12)
 
     def image(x):
-        return x[MIRRORED_JOINTS] * MIRRORED_SIGNS if reflect else x
+        return MIRROR.reflect(x) if reflect else x
 
     spin = np.array([0.3, -0.4, 0.5])
     sign = np.array([-1, 1, -1]) if reflect else np.ones(3)

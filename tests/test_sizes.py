@@ -14,11 +14,12 @@ import pytest
 from mqe_jax.envs import Moment, VectorEnv, make
 from mqe_jax.physics.appearance import ROBOT_COLORS, UNNUMBERED
 from mqe_jax.physics.collision import MAX_ROBOTS, robot_bits
+from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.scripted.cooperative import plan_sheep_hard
 from mqe_jax.train.policy import check_policy
-from mqe_jax.viz.geometry import robot_bases, robot_color
+from mqe_jax.viz.geometry import robot_color
 from tests.inputs import refuses
 from tests.states import initial, observation, placed, terms_of, with_object
 
@@ -111,13 +112,13 @@ def test_a_scene_of_any_size_has_room_and_buffers(
 @pytest.mark.parametrize(("task", "size"), [(GATE, 4), (GATE, 8), (FOOTBALL, 4), (FOOTBALL, 10)])
 def test_robots_are_told_apart_by_colours_and_numbers(task: str, size: int) -> None:
     model = sized(task, size).mj_model
-    colors = [robot_color(model, trunk) for trunk in robot_bases(model)]
+    colors = [robot_color(model, trunk) for trunk in trunk_bodies(model)]
     teams = size if size <= UNNUMBERED or task == GATE else 2
     assert (
         len(set(colors)) == teams
         and [colors.count(color) for color in colors] == [size // teams] * size
     )
-    parts = [model.body_geomnum[trunk] for trunk in robot_bases(model)]
+    parts = [model.body_geomnum[trunk] for trunk in trunk_bodies(model)]
     assert (len(set(parts)) > 1) == (size > UNNUMBERED)  # digits have different numbers of segments
     assert len(set(ROBOT_COLORS)) == len(ROBOT_COLORS) == MAX_ROBOTS
 

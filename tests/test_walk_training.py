@@ -16,7 +16,7 @@ from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.physics.robots.robot import JOINT_NAMES, MIRRORED_JOINTS, MIRRORED_SIGNS
+from mqe_jax.physics.robots.robot import JOINT_NAMES, MIRROR
 from mqe_jax.skills import agile
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.networks import EnvDims
@@ -238,7 +238,9 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
         other[Y_AND_ROTATIONS] *= -1.0
         left = observation(joints, gravity, commands, 0.15)
         right = observation(mirrored, gravity * [1, -1, 1], other, 0.65)
-        np.testing.assert_allclose(WALK_FORM.reflect(jnp.tile(left, 30))[:70], right, atol=1e-5)
+        np.testing.assert_allclose(
+            WALK_FORM.mirror.reflect(jnp.tile(left, 30))[:70], right, atol=1e-5
+        )
 
 
 def test_descending_the_loss_makes_a_policy_symmetric() -> None:
@@ -329,19 +331,17 @@ def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
             now = sensed(step)
             action = sensed(step + 9).joint_position
             if mirror:
-
-                def flip(x):
-                    return x[MIRRORED_JOINTS] * MIRRORED_SIGNS
-
                 gravity = now.gravity_b * jnp.array([1.0, -1.0, 1.0])
-                position = flip(now.joint_position - GO1.default_joints) + GO1.default_joints
-                now = Proprioception(gravity, position, flip(now.joint_velocity))
-                action = flip(action)
+                position = (
+                    MIRROR.reflect(now.joint_position - GO1.default_joints) + GO1.default_joints
+                )
+                now = Proprioception(gravity, position, MIRROR.reflect(now.joint_velocity))
+                action = MIRROR.reflect(action)
             rows.append(agile.frame(GO1, now, action))
         velocity = jnp.array([1.0, 0.5, -2.0]) * (side if mirror else 1.0)
         return jnp.concatenate([*rows, agile.now(jnp.float32(0.7 if mirror else 0.2), velocity)])
 
-    np.testing.assert_allclose(AGILE_FORM.reflect(inputs(False)), inputs(True), atol=1e-5)
+    np.testing.assert_allclose(AGILE_FORM.mirror.reflect(inputs(False)), inputs(True), atol=1e-5)
     flipped = trainee.foot_phases(jnp.float32(0.7), jnp.array([1.0, 0.0, 0.0]))
     straight = trainee.foot_phases(jnp.float32(0.2), jnp.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(flipped, straight[jnp.array([1, 0, 3, 2])], atol=1e-6)

@@ -8,7 +8,7 @@ import dataclasses
 from typing import Any
 
 from mqe_jax import skills
-from mqe_jax.core.errors import warn
+from mqe_jax.core.errors import InputError, warn
 from mqe_jax.envs.task import Task
 from mqe_jax.physics.scene import Scene
 from mqe_jax.skills.control import Controller
@@ -17,6 +17,10 @@ from mqe_jax.skills.control import Controller
 def make_scene(task: Task[Any, Any]) -> Scene:
     """Returns the task's scene with the robot, physics and sensors of its parameters."""
     scene = task.scene()
+    if scene.robots:
+        raise InputError(
+            "scene: Scene.robots is not empty; the parameter robot says which robots a task has"
+        )
     params = task.params
     # NPC robots follow joint targets in every mode.
     by_torque = (
@@ -28,7 +32,7 @@ def make_scene(task: Task[Any, Any]) -> Scene:
     )
     return dataclasses.replace(
         scene,
-        robot=task.robot,
+        robots=(task.robot,) * scene.num_robots,
         contacts=params.contacts,
         friction=params.friction,
         joint_mechanics=params.joint_mechanics,

@@ -19,7 +19,6 @@ from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entiti
 from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
 from mqe_jax.physics.robots.index import RobotState
-from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS
 
 
 class Match(QuadrupedEnv[S, P]):
@@ -159,10 +158,11 @@ class Match(QuadrupedEnv[S, P]):
         blocks = super().observe_group(name, state, robot_state)
         if not self.reflected or name != "proprioception":
             return blocks
-        image = {"gravity": blocks["gravity"] * np.array([1.0, -1.0, 1.0], np.float32)}
-        image |= {
-            x: blocks[x][:, MIRRORED_JOINTS] * MIRRORED_SIGNS
-            for x in ("joint_position", "joint_velocity")
+        reflect = self.robot.mirror.reflect
+        image = {
+            "gravity": blocks["gravity"] * np.array([1.0, -1.0, 1.0], np.float32),
+            "joint_position": reflect(blocks["joint_position"]),
+            "joint_velocity": reflect(blocks["joint_velocity"]),
         }
         return {x: jnp.where(self.team_of[:, None] == 1, image[x], blocks[x]) for x in blocks}
 
@@ -173,7 +173,7 @@ class Match(QuadrupedEnv[S, P]):
         if self.control == "command":
             mirrored = action * self.controller.skill.column("mirror", self.controller.commands)
         else:
-            mirrored = action[:, MIRRORED_JOINTS] * MIRRORED_SIGNS
+            mirrored = self.robot.mirror.reflect(action)
         return jnp.where(self.team_of[:, None] == 1, mirrored, action)
 
     def zero_sum(self, own: jax.Array) -> jax.Array:

@@ -122,14 +122,15 @@ def one_hot(agents: int, meaning: str = "agent's id") -> Block:
 GATE = Block("gate", 2, "centre of the gap, m")
 
 
-PROPRIOCEPTION = ObservationLayout(
-    (
-        Block("gravity", 3, "unit vector in the trunk's frame"),
-        Block("joint_position", 12, "rad, minus default"),
-        Block("joint_velocity", 12, "rad/s"),
+def proprioception_layout(joints: int) -> ObservationLayout:
+    """Returns the layout of what the sensors of a robot with a number of joints measure."""
+    return ObservationLayout(
+        (
+            Block("gravity", 3, "unit vector in the trunk's frame"),
+            Block("joint_position", joints, "rad, minus default"),
+            Block("joint_velocity", joints, "rad/s"),
+        )
     )
-)
-"""What an agent's own sensors measure."""
 
 
 def team_blocks(agents: int) -> tuple[Block, ...]:

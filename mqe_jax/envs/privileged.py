@@ -2,6 +2,7 @@
 distillation.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -14,14 +15,17 @@ from mqe_jax.envs.state import State
 from mqe_jax.physics.robots.index import RobotIndex, RobotState
 from mqe_jax.physics.robots.robot import Robot
 
-_ROBOT = (
-    Block("position", 3, "m"),
-    Block("quaternion", 4, "wxyz"),
-    Block("linear_velocity", 3, "m/s, world"),
-    Block("angular_velocity", 3, "rad/s, body"),
-    Block("joint_position", 12, "rad, minus default"),
-    Block("joint_velocity", 12, "rad/s"),
-)
+
+def _robot_blocks(robot: Robot, number: int) -> list[Block]:
+    parts = (
+        Block("position", 3, "m"),
+        Block("quaternion", 4, "wxyz"),
+        Block("linear_velocity", 3, "m/s, world"),
+        Block("angular_velocity", 3, "rad/s, body"),
+        Block("joint_position", robot.num_joints, "rad, minus default"),
+        Block("joint_velocity", robot.num_joints, "rad/s"),
+    )
+    return [dataclasses.replace(part, name=f"robot{number}/{part.name}") for part in parts]
 
 
 class PrivilegedObservation:
@@ -53,11 +57,7 @@ class PrivilegedObservation:
             np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1)
         )
         blocks = (
-            *(
-                Block(f"robot{i}/{part.name}", part.width, part.meaning)
-                for i in range(count)
-                for part in _ROBOT
-            ),
+            *(block for number in range(count) for block in _robot_blocks(robot, number)),
             Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
             Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
             Block("anchors", 2 * num_anchors, "x, y of each, m"),

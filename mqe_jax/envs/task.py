@@ -14,7 +14,7 @@ import numpy as np
 
 from mqe_jax.core.returned import weights_of
 from mqe_jax.core.settings import to_mapping
-from mqe_jax.envs.observation import PROPRIOCEPTION, ObservationLayout, box
+from mqe_jax.envs.observation import ObservationLayout, box, proprioception_layout
 from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.reward import fade, weigh
 from mqe_jax.envs.sensing import Sensing
@@ -214,7 +214,11 @@ class Task(Sensing, Generic[S, P]):
         """
         sensed = {ONBOARD: ObservationLayout(self.suite.blocks)} if self.params.senses else {}
         sized = {ENTITIES: entity_layout(self.sized_layout)} if self.variable_num_agents else {}
-        return {"proprioception": PROPRIOCEPTION, **sensed, **sized}
+        return {
+            "proprioception": proprioception_layout(self.robot.num_joints),
+            **sensed,
+            **sized,
+        }
 
     @property
     def group_sizes(self) -> dict[str, int]:

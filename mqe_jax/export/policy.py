@@ -35,17 +35,13 @@ from mqe_jax.core.types import AnyTrained
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.physics.robots.robot import NUM_JOINTS
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import Skill
 from mqe_jax.train.policy import check_policy
 
-SENSED: dict[str, tuple[int, ...]] = {
-    "gravity": (3,),
-    "joint_position": (NUM_JOINTS,),
-    "joint_velocity": (NUM_JOINTS,),
-}
-"""Inputs of a skill that are its robot's `Proprioception`, in this order, with their shapes."""
+SENSED = ("gravity", "joint_position", "joint_velocity")
+"""Inputs of a skill that are its robot's `Proprioception`, in this order."""
 
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)
@@ -77,13 +73,19 @@ def input_shapes(policy: Trained, env: QuadrupedEnv) -> dict[str, tuple[int, ...
     robots: dict[str, tuple[int, ...]] = {"obs": (policy.needs.dims.observation,)}
     if env.control == "command":
         skill, _ = skill_of(env)
-        robots |= SENSED | {
+        robots |= sensed_shapes(env.robot) | {
             name: x.shape for name, x in name_arrays(skill.name, skill.init_memory()).items()
         }
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
     return shapes | {
         name: x.shape for name, x in name_arrays("memory", policy.initial_memory()).items()
     }
+
+
+def sensed_shapes(robot: Robot) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of the inputs `SENSED` by name."""
+    joints = (robot.num_joints,)
+    return dict(zip(SENSED, ((3,), joints, joints), strict=True))
 
 
 def policy_step(

@@ -32,7 +32,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.observation import finite
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, skill_of
+from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, sensed_shapes, skill_of
 from mqe_jax.export.translate import Function
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.sensors.suite import ONBOARD
@@ -187,7 +187,7 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     memory = name_arrays(skill.name, skill.init_memory())
     shapes = {
         "command": (len(skill.commands),),
-        **SENSED,
+        **sensed_shapes(env.robot),
         **{name: x.shape for name, x in memory.items()},
     }
 

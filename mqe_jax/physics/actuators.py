@@ -14,7 +14,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import linear_layers, read_tensors
 from mqe_jax.physics.engines import Engine
 from mqe_jax.physics.robots.index import RobotIndex, scatter
-from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.physics.robots.robot import Robot
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -69,7 +69,7 @@ class NetworkActuators:
 
     def init_memory(self) -> tuple[jax.Array, jax.Array]:
         """Returns the recurrent state after a reset."""
-        past = jnp.zeros((2, self.index.num_robots, NUM_JOINTS))
+        past = jnp.zeros((2, *self.index.joint_qpos.shape))
         return past, past
 
     def step(

@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 
 from mqe_jax.core.errors import InputError, one_line
-from mqe_jax.physics import robots
 from mqe_jax.physics.appearance import UNNUMBERED
 from mqe_jax.physics.appearance.grounds import add_light
 from mqe_jax.physics.collision import MAX_ROBOTS
 from mqe_jax.physics.objects import Object
 from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import RobotIndex, add_sensors, index_robots, prefix
 from mqe_jax.physics.robots.motors import Motors
 from mqe_jax.physics.robots.robot import Robot
@@ -31,8 +31,8 @@ class Scene:
     """Ground, walls and spawn poses."""
     num_robots: int = 2
     """Number of robots R."""
-    robot: Robot = dataclasses.field(default_factory=lambda: robots.get("go1"))
-    """Robot type shared by all R robots."""
+    robots: tuple[Robot, ...] = ()
+    """Robot of each; all are Go1 if empty. A task leaves it empty for its parameter `robot`."""
     contacts: str = "full"
     """Set of the robots' collision geoms, one of `mqe_jax.physics.robots.robot.CONTACTS`."""
     objects: Mapping[str, Object] = dataclasses.field(default_factory=dict)
@@ -65,6 +65,10 @@ class Scene:
             raise InputError(
                 f"Scene.num_robots: {self.num_robots} must be between 1 and {MAX_ROBOTS}"
             )
+        if self.robots and len(self.robots) != self.num_robots:
+            raise InputError(
+                f"Scene.robots: {len(self.robots)} robots; expected {self.num_robots}, num_robots"
+            )
         if self.colors and len(self.colors) != self.num_robots:
             raise InputError(
                 f"Scene.colors: {self.colors} must have a colour for each of {self.num_robots} "
@@ -91,6 +95,7 @@ class CompiledScene:
     """A compiled scene."""
 
     scene: Scene
+    robot: Robot  # of all R robots
     model: mujoco.MjModel  # of the physics, without visual geoms
     index: RobotIndex
     objects: Mapping[str, ObjectIndex]
@@ -143,9 +148,10 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
     )
     spec.add_numeric(name="max_contact_points", size=1, data=[scene.max_contacts])
     layout = build_terrain(spec, scene.track, visual=visual)
-    for number in range(scene.num_robots):
+    robots = _robots_of(scene)
+    for number, robot in enumerate(robots):
         body = build_robot(
-            scene.robot,
+            robot,
             number,
             contacts=scene.contacts,
             visual=visual,
@@ -158,12 +164,16 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
         spec.attach(body, prefix=prefix(number), frame=spec.worldbody.add_frame())
     for name, item in scene.objects.items():
         _add_object(spec, name, item, visual)
-    add_sensors(spec, scene.robot, scene.num_robots, feet=scene.foot_sensors)
+    add_sensors(spec, robots, feet=scene.foot_sensors)
     for edit in scene.edits:
         edit(spec)
     if visual:
         add_light(spec, (scene.track.start + scene.track.length / 2, 0, 8))
     return spec, layout
+
+
+def _robots_of(scene: Scene) -> tuple[Robot, ...]:
+    return scene.robots or (GO1,) * scene.num_robots
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> None:
@@ -194,6 +204,8 @@ def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> N
 def compile_scene(scene: Scene) -> CompiledScene:
     """Compiles a scene for the physics and indexes it by name.
 
+    InputError for robots of two kinds: all tables have a row for each robot, of equal widths.
+
     Example:
         ```python
         from mqe_jax.physics.scene import Scene, compile_scene
@@ -203,16 +215,22 @@ def compile_scene(scene: Scene) -> CompiledScene:
         print(compiled.model.nq)  # 38: two robots of 19
         ```
     """
+    kinds = set(_robots_of(scene))
+    if len(kinds) > 1:
+        names = ", ".join(sorted(kind.name for kind in kinds))
+        raise InputError(f"Scene.robots: two kinds, {names}; all must be one robot")
+    robot = kinds.pop()
     model, layout = build_model(scene, visual=False)
     moving = [wall for wall in layout.walls if wall.anchor is not None]
     index = index_robots(
-        model, scene.robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors
+        model, robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors
     )
     return CompiledScene(
         scene=scene,
+        robot=robot,
         model=model,
         index=index,
-        motors=Motors.of(scene.robot, index, scene.timestep),
+        motors=Motors.of(robot, index, scene.timestep),
         objects=_index_objects(model, scene.objects),
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),

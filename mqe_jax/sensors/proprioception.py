@@ -10,7 +10,6 @@ import numpy as np
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.limits import Degrees, Distance
 from mqe_jax.core.settings import settings_class
-from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
 from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.marks import Marks, marks
 from mqe_jax.sensors.planar import turn
@@ -40,11 +39,12 @@ class Proprioception(Sensor):
     """Standard deviation of its yaw after 1 s, degrees; it grows with the square root of time."""
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
+        joints = scene.compiled.robot.num_joints
         return (
             Block("gravity", 3, "unit vector in the trunk's frame"),
             Block("angular_velocity", 3, "of the trunk in its own frame, rad/s"),
-            Block("joint_position", NUM_JOINTS, "rad, minus default"),
-            Block("joint_velocity", NUM_JOINTS, "rad/s"),
+            Block("joint_position", joints, "rad, minus default"),
+            Block("joint_velocity", joints, "rad/s"),
             Block("action", scene.action_size, "last action"),
             Block(
                 "odometry",
@@ -68,8 +68,10 @@ class Proprioception(Sensor):
         # of y; rotations change the signs of the other two
         side = np.where(np.arange(3) == 1, mirror, 1.0)
 
+        robot = scene.compiled.robot
+
         def joints(x):
-            return jnp.where(mirror < 0, x[:, MIRRORED_JOINTS] * MIRRORED_SIGNS, x)
+            return jnp.where(mirror < 0, robot.mirror.reflect(x), x)
 
         estimate, last, started = memory
         chance = jax.random.normal(key, (scene.num_agents, 3))  # of position and yaw
@@ -85,9 +87,7 @@ class Proprioception(Sensor):
         blocks = {
             "gravity": robots.projected_gravity * side,
             "angular_velocity": robots.angular_velocity_b * side * mirror,
-            "joint_position": joints(
-                robots.joint_position - scene.compiled.scene.robot.default_joints
-            ),
+            "joint_position": joints(robots.joint_position - robot.default_joints),
             "joint_velocity": joints(robots.joint_velocity),
             "action": snapshot.action,
             "odometry": jnp.concatenate([estimate[:, :2], jnp.cos(yaw), jnp.sin(yaw)], axis=-1),

@@ -178,7 +178,7 @@ class SensedScene:
         every = jnp.concatenate(
             [_planar(robots.position_w, robots.quaternion), *self._entities(data, anchors)]
         )
-        radius = float(np.hypot(*self.compiled.scene.robot.leg_root))  # at which the hips are
+        radius = float(np.hypot(*self.compiled.robot.leg_root))  # at which the hips are
         circles = dict.fromkeys(range(self.num_robots), radius)
         circles |= {
             row: shape.radius for row, shape in self.outlines.items() if isinstance(shape, Circle)

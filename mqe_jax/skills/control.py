@@ -26,7 +26,7 @@ from jax.core import Tracer
 from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.settings import fail
 from mqe_jax.physics.robots.index import Proprioception, scatter
-from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Skill
 
 MODES = ("command", "position", "torque")
@@ -148,7 +148,7 @@ class Controller(Commander):
     @property
     def action_size(self) -> int:
         """Length of one agent's action."""
-        return len(self.commands) if self.mode == "command" else NUM_JOINTS
+        return len(self.commands) if self.mode == "command" else self.robot.num_joints
 
     @property
     def neutral(self) -> np.ndarray:

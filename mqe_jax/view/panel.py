@@ -7,10 +7,11 @@ import mujoco
 import numpy as np
 
 from mqe_jax.physics.appearance import ROBOT_COLOR_NAMES, ROBOT_COLORS, UNNUMBERED
+from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.view.markup import bars, legend, observation_table, paragraph, table
 from mqe_jax.view.menu import DEFAULT, Entry, Menu
 from mqe_jax.view.session import DRIVEN, Session
-from mqe_jax.viz.geometry import robot_bases, robot_color
+from mqe_jax.viz.geometry import robot_color
 
 # Label, direction in fractions of the maximum command (vx, vy, yaw rate), key that increments the
 # command. W, A, S, D, Q, E and the arrow keys are bound to the browser's camera.
@@ -356,7 +357,7 @@ def robot_labels(model: mujoco.MjModel) -> list[str]:
     """Returns `robot 1 (blue)`, ... for all robots of a rendering model, without colours if they
     bear numbers.
     """
-    shown = np.array([robot_color(model, trunk) for trunk in robot_bases(model)])
+    shown = np.array([robot_color(model, trunk) for trunk in trunk_bodies(model)])
     if len(shown) > UNNUMBERED:
         return [f"robot {i + 1}" for i in range(len(shown))]
     apart = np.linalg.norm(

@@ -10,13 +10,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GOAL_SITE, HIDDEN_GROUP
+from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.viz.geometry import (
     body_boxes,
     moving_bodies,
     pose_boxes,
     pose_frames,
-    robot_bases,
     robot_color,
     shown_bases,
 )
@@ -112,7 +112,7 @@ def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
     """Returns labels and the different colours, 0 to 255, of their robots: teams as in `env.teams`,
     then others.
     """
-    bases = robot_bases(env.mj_model)
+    bases = trunk_bodies(env.mj_model)
     colors = [
         tuple(round(255 * part) for part in robot_color(env.mj_model, body)[:3]) for body in bases
     ]

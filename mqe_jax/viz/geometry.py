@@ -8,31 +8,18 @@ import numpy as np
 
 from mqe_jax.envs.sizes import HIGH, OUTSIDE
 from mqe_jax.physics.appearance import GROUND_GROUP, HIDDEN_GROUP
+from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.viz.recording import Episode
 
 COLLISION_GROUP = HIDDEN_GROUP
 _SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of a box's corners
 
 
-def robot_bases(model: mujoco.MjModel) -> list[int]:
-    """Returns the ids of the robots' trunks: bodies with a free joint and at least twelve hinges
-    below it.
-    """
-    bases = []
-    hinges = model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)
-    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
-        body = int(model.jnt_bodyid[joint])
-        inside = model.body_rootid[model.jnt_bodyid] == model.body_rootid[body]
-        if np.count_nonzero(hinges & inside) >= 12:
-            bases.append(body)
-    return bases
-
-
 def shown_bases(model: mujoco.MjModel) -> list[int]:
     """Returns the ids of the trunks of visible robots; in a rendering model, of those that take
     part.
     """
-    return [body for body in robot_bases(model) if _drawn(model, body)]
+    return [body for body in trunk_bodies(model) if _drawn(model, body)]
 
 
 def _drawn(model: mujoco.MjModel, body: int) -> bool:
@@ -57,7 +44,7 @@ def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
         for body in range(model.nbody)
         if model.body_mocapid[body] >= 0 and moved[model.body_mocapid[body]]
     ]
-    robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
+    robots = {int(model.body_rootid[body]) for body in trunk_bodies(model)}
     translations = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     for joint in range(model.njnt):
         body = int(model.jnt_bodyid[joint])
@@ -137,7 +124,7 @@ def scenery_geoms(model: mujoco.MjModel) -> list[int]:
     """Returns the ids of the visible geoms that are neither ground, with what is painted on it, nor
     part of a robot.
     """
-    robots = {int(model.body_rootid[body]) for body in robot_bases(model)}
+    robots = {int(model.body_rootid[body]) for body in trunk_bodies(model)}
     return [
         geom
         for geom in range(model.ngeom)
@@ -169,7 +156,7 @@ def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
     """
     model = copy.deepcopy(model)
     data = next(pose_frames(model, episode, [0]))
-    _hide(model, [body for body in robot_bases(model) if data.xpos[body, 2] > HIGH])
+    _hide(model, [body for body in trunk_bodies(model) if data.xpos[body, 2] > HIGH])
     box = int(mujoco.mjtGeom.mjGEOM_BOX)
     shown = [geom for geom in scenery_geoms(model) if int(model.geom_type[geom]) == box]
     fixed = [geom for geom in shown if int(model.geom_bodyid[geom]) == 0]

@@ -30,7 +30,7 @@ from mqe_jax.core.limits import Horizon, NonNegative
 from mqe_jax.core.settings import FileName, fail, settings_class
 from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.physics import robots
-from mqe_jax.physics.robots.robot import MIRRORED_JOINTS, MIRRORED_SIGNS, NUM_JOINTS
+from mqe_jax.physics.robots.robot import MIRROR, NUM_JOINTS, Mirror
 from mqe_jax.skills import agile
 from mqe_jax.skills.weights import Networks
 from mqe_jax.train import nn
@@ -43,26 +43,20 @@ _CRITIC = (512, 256, 128)
 # full float32 products over 2100 numbers would take most of an update on a GPU
 _PRECISION = "tensorfloat32"
 
-Reflect = tuple[np.ndarray, np.ndarray]
-"""Source and sign of each number of a mirrored vector."""
+
+def _join(*blocks: Mirror) -> Mirror:
+    """Returns the mirror of consecutive blocks."""
+    starts = np.cumsum([0, *(len(block.source) for block in blocks)])[:-1]
+    sources = [block.source + start for block, start in zip(blocks, starts, strict=True)]
+    return Mirror(np.concatenate(sources), np.concatenate([block.sign for block in blocks]))
 
 
-def _mirror(*blocks: Reflect) -> Reflect:
-    """Joins the mirrors of consecutive blocks."""
-    starts = np.cumsum([0, *(len(source) for source, _ in blocks)])
-    source = np.concatenate(
-        [source + start for (source, _), start in zip(blocks, starts[:-1], strict=True)]
-    )
-    return source, np.concatenate([sign for _, sign in blocks])
-
-
-def _signs(*signs: float) -> Reflect:
-    return np.arange(len(signs)), np.array(signs, np.float32)
+def _signs(*signs: float) -> Mirror:
+    return Mirror(np.arange(len(signs)), np.array(signs, np.float32))
 
 
 _GRAVITY = _signs(1.0, -1.0, 1.0)
-_JOINTS = (MIRRORED_JOINTS, MIRRORED_SIGNS)
-_FEET = np.array([1, 0, 3, 2]), np.ones(4, np.float32)
+_FEET = Mirror(np.array([1, 0, 3, 2]), np.ones(4, np.float32))
 _COMMANDS = _signs(*(command.mirror for command in walk_policy.COMMANDS))
 
 
@@ -78,7 +72,7 @@ class Form:
     infer: Callable[..., tuple[jax.Array, Any]]
     """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an
     adaptation network."""
-    mirror: Reflect  # of an input
+    mirror: Mirror  # of an input
 
     @property
     def past(self) -> int:
@@ -96,16 +90,12 @@ class Form:
             else jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
         )
 
-    def reflect(self, inputs: jax.Array) -> jax.Array:
-        """Mirrors inputs (..., n)."""
-        return inputs[..., self.mirror[0]] * self.mirror[1]
-
     def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
         """Returns the mean square difference () of actions of mirrored inputs (B, n) from mirrored
         actions (B, 12).
         """
-        other, _ = self.infer(params, self.reflect(inputs), precision=_PRECISION)
-        return jnp.mean(jnp.square(other - mean[..., MIRRORED_JOINTS] * MIRRORED_SIGNS))
+        other, _ = self.infer(params, self.mirror.reflect(inputs), precision=_PRECISION)
+        return jnp.mean(jnp.square(other - MIRROR.reflect(mean)))
 
 
 WALK_FORM = Form(
@@ -113,15 +103,15 @@ WALK_FORM = Form(
     np.arange(HISTORY),
     OBSERVATION_SIZE,
     walk_policy.infer,
-    _mirror(*[_mirror(_GRAVITY, _COMMANDS, _JOINTS, _JOINTS, _JOINTS, _JOINTS, _FEET)] * HISTORY),
+    _join(*[_join(_GRAVITY, _COMMANDS, MIRROR, MIRROR, MIRROR, MIRROR, _FEET)] * HISTORY),
 )
 AGILE_FORM = Form(
     agile.NETWORKS,
     agile.LENGTH - 1 - np.array(agile.OFFSETS),
     agile.FRAME_SIZE,
     lambda params, inputs, precision: (agile.infer(params, inputs, precision=precision), None),
-    _mirror(
-        *[_mirror(_GRAVITY, _JOINTS, _JOINTS, _JOINTS)] * len(agile.OFFSETS),
+    _join(
+        *[_join(_GRAVITY, MIRROR, MIRROR, MIRROR)] * len(agile.OFFSETS),
         _signs(*(command.mirror for command in agile.COMMANDS)),
         _signs(-1.0, -1.0),  # the clock: the other pair of feet
     ),

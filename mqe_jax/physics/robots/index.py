@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.physics.robots.robot import JOINT_NAMES, NUM_LEGS, Robot
+from mqe_jax.physics.robots.robot import NUM_LEGS, Robot
 from mqe_jax.physics.rotation import quaternion_to_euler, rotate_inverse
 
 
@@ -59,18 +59,29 @@ def prefix(number: int) -> str:
     return f"robot{number}/"
 
 
+def trunk_bodies(model: mujoco.MjModel) -> list[int]:
+    """Returns the body ids of the robots' trunks in a scene's model, in the order of the robots."""
+    found: list[int] = []
+    while True:
+        name = f"{prefix(len(found))}trunk"
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+        if body < 0:
+            return found
+        found.append(body)
+
+
 def _geom_names(robot: Robot, part: str) -> list[str]:
     return [name for shape in robot.shapes() if shape.part == part for name in shape.geom_names]
 
 
-def add_sensors(spec: mujoco.MjSpec, robot: Robot, num_robots: int, *, feet: bool = False) -> None:
+def add_sensors(spec: mujoco.MjSpec, robots: Sequence[Robot], *, feet: bool = False) -> None:
     """Adds sensors of the strongest contact force on the trunks (and feet), which all engines
     support.
     """
     force_bits = 1 << 1
     strongest = 2
-    names = _geom_names(robot, "trunk") + (_geom_names(robot, "foot") if feet else [])
-    for number in range(num_robots):
+    for number, robot in enumerate(robots):
+        names = _geom_names(robot, "trunk") + (_geom_names(robot, "foot") if feet else [])
         for name in names:
             spec.add_sensor(
                 name=f"{prefix(number)}{name}_force",
@@ -91,7 +102,7 @@ def index_robots(
 ) -> RobotIndex:
     """Builds the index tables of a compiled model's robots by looking up names."""
     numbers = range(num_robots)
-    body_names = ["trunk", *JOINT_NAMES]
+    body_names = ["trunk", *robot.joint_names]
     geom_names = [name for shape in robot.shapes(contacts) for name in shape.geom_names]
     foot_names = _geom_names(robot, "foot")
     bases = [model.joint(prefix(i) + "base") for i in numbers]
@@ -105,9 +116,9 @@ def index_robots(
     return RobotIndex(
         base_qpos=np.array([base.qposadr[0] + np.arange(7) for base in bases], np.int32),
         base_qvel=np.array([base.dofadr[0] + np.arange(6) for base in bases], np.int32),
-        joint_qpos=table(lambda name: model.joint(name).qposadr[0], JOINT_NAMES),
-        joint_qvel=table(lambda name: model.joint(name).dofadr[0], JOINT_NAMES),
-        actuator=table(lambda name: model.actuator(name).id, JOINT_NAMES),
+        joint_qpos=table(lambda name: model.joint(name).qposadr[0], robot.joint_names),
+        joint_qvel=table(lambda name: model.joint(name).dofadr[0], robot.joint_names),
+        actuator=table(lambda name: model.actuator(name).id, robot.joint_names),
         trunk_body=table(lambda name: model.body(name).id, ["trunk"])[:, 0],
         bodies=table(lambda name: model.body(name).id, body_names),
         geoms=table(lambda name: model.geom(name).id, geom_names),

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,6 @@ JOINTS = ("hip", "thigh", "calf")
 NUM_LEGS = len(LEGS)
 NUM_JOINTS = NUM_LEGS * len(JOINTS)
 JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
-# Reflection of left and right: a joint's counterpart, and the sign of its value, which hips change.
-MIRRORED_JOINTS = np.arange(NUM_JOINTS).reshape(NUM_LEGS, -1)[[1, 0, 3, 2]].ravel()
-MIRRORED_SIGNS = np.tile(np.array([-1.0, 1.0, 1.0], np.float32), NUM_LEGS)
 LINKS = ("trunk", *JOINTS)
 # Body parts of collision shapes.
 PARTS = ("trunk", "hip", "thigh", "calf", "foot")
@@ -34,6 +31,26 @@ CONTACTS: dict[str, tuple[str, ...]] = {"full": PARTS, "minimal": ("trunk", "foo
 
 Vector = tuple[float, float, float]
 Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
+
+
+class Mirror(NamedTuple):
+    """The reflection of left and right of n values, such as those of the joints."""
+
+    source: np.ndarray
+    """Each value's counterpart on the other side (n,)."""
+    sign: np.ndarray
+    """Factor of the counterpart (n,), -1 or 1; -1 for hips."""
+
+    def reflect(self, values: jax.Array) -> jax.Array:
+        """Returns reflected values (..., n)."""
+        return values[..., self.source] * self.sign
+
+
+MIRROR = Mirror(
+    source=np.arange(NUM_JOINTS).reshape(NUM_LEGS, -1)[[1, 0, 3, 2]].ravel(),
+    sign=np.tile(np.array([-1.0, 1.0, 1.0], np.float32), NUM_LEGS),
+)
+"""The reflection of a quadruped's joints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,7 +211,7 @@ class WalkSettings:
 class Robot:
     """A quadruped; make a variant with `dataclasses.replace`.
 
-    Arrays (12,) are in the order of `JOINT_NAMES`.
+    Arrays (12,) are in the order of `joint_names`.
 
     Example:
         ```python
@@ -264,8 +281,10 @@ class Robot:
     def __post_init__(self) -> None:
         for name in (field.name for field in dataclasses.fields(self) if field.type is np.ndarray):
             array = np.array(getattr(self, name), float)
-            if array.shape != (NUM_JOINTS,):
-                raise InputError(f"Robot.{name}: shape {array.shape}; expected ({NUM_JOINTS},)")
+            if array.shape != (self.num_joints,):
+                raise InputError(
+                    f"Robot.{name}: shape {array.shape}; expected ({self.num_joints},)"
+                )
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         if not np.all(
@@ -284,6 +303,21 @@ class Robot:
         parts = [shape.part for shape in self.collision]
         if parts.count("foot") != 1 or "trunk" not in parts:
             raise InputError("Robot.collision: needs one foot shape and at least one trunk shape")
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of all arrays."""
+        return JOINT_NAMES
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints J."""
+        return len(self.joint_names)
+
+    @property
+    def mirror(self) -> Mirror:
+        """The reflection of left and right."""
+        return MIRROR
 
     def joint_targets(self, action: jax.Array, scale: float = 1.0) -> jax.Array:
         """Returns joint targets (..., 12), rad: default + `scale` x the robot's scale x action
