@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
     from mqe_jax.policies import load_policy
     from mqe_jax.runs.build import make_learner
-    from mqe_jax.runs.exploiting import double_oracle, exploitability
+    from mqe_jax.runs.exploiting import exploitability
     from mqe_jax.runs.learning import Run, learn, learn_seeds, load_run
     from mqe_jax.runs.playing import Clip, evaluate, render, tournament
     from mqe_jax.runs.sweeping import sweep
@@ -40,7 +40,6 @@ __all__ = [
     "TrainConfig",
     "VectorEnv",
     "bench",
-    "double_oracle",
     "evaluate",
     "evaluate_skill",
     "exploitability",
@@ -65,7 +64,6 @@ _HOMES = {
     "Result": "train.evaluate",
     "TrainConfig": "train.config",
     "bench": "runs.throughput",
-    "double_oracle": "runs.exploiting",
     "evaluate_skill": "walk.evaluation",
     "exploitability": "runs.exploiting",
     "load_policy": "policies",

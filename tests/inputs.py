@@ -171,12 +171,11 @@ TARGETS = {
     "report": ["a"],
     "tournament": ["go1tug", "idle", "random", "-o", "cup"],
     "exploit": ["go1tug", "idle"],
-    "oracle": ["go1tug", "go1tug"],
 }
 """Positional and needed arguments of each command."""
 
 
-LONG = ("view", "walk train", "walk eval", "tournament", "exploit", "oracle")
+LONG = ("view", "walk train", "walk eval", "tournament", "exploit")
 """Commands that run for long where a text happens to be allowed; they get numbers only, which never
 are."""
 

@@ -25,14 +25,14 @@ from mqe_jax.core.types import Observations
 from mqe_jax.export.robot_graph import verify_robot
 from mqe_jax.export.robot_team import RobotTeam, open_team
 from mqe_jax.export.task import readings_function
-from mqe_jax.policies.mixture import Trained
 from mqe_jax.runs.build import make_env
+from mqe_jax.train.policy import TrainedPolicy
 
 
 class Compared:
     """A team of processes, each of whose actions is compared with that of the policy in JAX."""
 
-    def __init__(self, team: RobotTeam, policy: Trained, seed: int) -> None:
+    def __init__(self, team: RobotTeam, policy: TrainedPolicy, seed: int) -> None:
         self.task = team.task
         self.agents = team.agents
         self.groups = team.groups

@@ -171,8 +171,6 @@ def test_an_output_is_checked_first(
         ["exploit", "go1tug", "nobody", "-o", "new/exploit"],
         ["exploit", "go1tug", "idle", "--config", "nobody", "-o", "new/exploit"],
         ["exploit", "go1gate", "idle", "-o", "new/exploit"],
-        ["oracle", "go1tug", "go1tug", "idle", "-o", "new/oracle"],
-        ["oracle", "go1tug", "go1tug", "--episodes", "3", "-o", "new/oracle"],
         ["play-site", "nobody", "-o", "new/site"],
         ["play-site", "go1gate", "--libraries", ".", "-o", "new/site"],
         ["demo", "--run-dir", "new/demo", "--config", "nobody"],

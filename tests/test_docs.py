@@ -168,7 +168,6 @@ WALKERS = {
 # Functions whose examples take minutes, with arguments that make them small.
 LONG: dict[str, dict[str, Any]] = {
     "exploitability": {**EXPLOIT, "seeds": [0]},
-    "double_oracle": EXPLOIT,
     "train_skill": {"config": override(AGILE, WALKERS)},
     "evaluate_skill": {"episodes": 4},
 }

@@ -1,9 +1,7 @@
 """Exported policies: equal outputs in onnxruntime and in JAX, and refused exports."""
 
-import dataclasses
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -16,7 +14,6 @@ from mqe_jax import cli, load_policy, make
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.policies import zoo
-from mqe_jax.policies.mixture import Mixture
 from mqe_jax.skills import SKILLS
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
@@ -233,47 +230,6 @@ def test_a_policy_that_sees_sensors_is_exported_and_senses_on_the_page(tmp_path:
         "sees the group 'proprioception'; the page has 'policy' and 'onboard'",
         entries,
         [str(tmp_path)],
-    )
-
-
-def mixture_of(env: Any) -> Mixture:
-    """A mixture of policies without and with a recurrent state."""
-    one = new_policy(env, "position", hidden_sizes=[16], recurrent=False, gru_size=8)
-    other = new_policy(env, "position", hidden_sizes=[16], recurrent=True, gru_size=8)
-    third = dataclasses.replace(
-        one, params=jax.tree.map(lambda x: jnp.asarray(-np.asarray(x)), one.params)
-    )
-    return Mixture((one, other, third), (0.5, 0.2, 0.3))
-
-
-def test_the_graph_of_a_mixture_has_all_members() -> None:
-    env = make("go1plane", impl="c", num_envs=1, control="position")
-    policy = mixture_of(env)
-    assert input_shapes(policy, env)["memory_member"] == ()
-    assert export_error(policy, env) < 1e-4
-    inputs, outputs = record_actions(policy, env, 8)
-    assert {*inputs["memory_member"].tolist()} == {0, 1, 2, 3}
-    assert max(errors(to_onnx(policy, env), inputs, outputs).values()) < 1e-4
-
-
-def test_the_page_draws_a_member_by_its_noise() -> None:
-    env = make("go1plane", impl="c", num_envs=1, control="position")
-    policy = mixture_of(env)
-    act, sizes = policy_function(policy, SimpleNamespace(env=env))  # pyright: ignore[reportArgumentType]
-    assert sizes["noise"] == (1 + 3 * env.num_agents * env.action_size,)
-    inputs = {name: np.zeros((4, *shape), np.float32) for name, shape in sizes.items()}
-    inputs["noise"][:, 0] = [-1.0, 0.1, 1.0, 1.0]  # the median of the weights is 0
-    inputs["memory_member"][3] = 2.0
-    inputs["obs"] += 0.3
-    found = jax.vmap(act)(inputs)
-    assert found["next_memory_member"].tolist() == [1, 2, 3, 2]
-    means = [each.act(inputs["obs"][0], each.initial_memory())[0] for each in policy.members]
-    np.testing.assert_allclose(
-        found["action"], np.stack([means[i] for i in (0, 1, 2, 1)]), atol=1e-5
-    )
-    assert (
-        max(errors(translate.translate(act, sizes, "test"), inputs, jax.device_get(found)).values())
-        < 1e-4
     )
 
 

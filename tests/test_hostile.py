@@ -33,7 +33,6 @@ from mqe_jax.envs.replay import Recording, load_recording, replay, save_recordin
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
 from mqe_jax.policies import all_agents, zoo
-from mqe_jax.policies.mixture import Mixture, save_mixture
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league import games, tournament
 from mqe_jax.selfplay.opponents import Mirror, versus
@@ -288,19 +287,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         (None, {"control": "c"}),
     ),
     ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
-    ("mixture: ", lambda x, v: save_mixture("folder", v), (None, 3, Mixture)),
-    ("members: ", lambda x, v: Mixture(v, (1.0,)), (None, 3, (), ("a",), (load_policy,) * 5)),
-    (
-        "weights",
-        lambda x, v: Mixture((load_policy("go1tug"),), v),
-        (None, 3, (), (0.5,), (NAN,), (0.5, 0.5)),
-    ),
-    (
-        "num_envs: ",
-        lambda x, v: Mixture((load_policy("go1tug"),), (1.0,)).initial_memory(v),
-        (0, NAN, "x"),
-    ),
-    ("policy: ", lambda x, v: zoo.ship(v, zoo.card("go1tug")), (None, 3, Mixture)),
+    ("policy: ", lambda x, v: zoo.ship(v, zoo.card("go1tug")), (None, 3, TrainedPolicy)),
     (
         "folder: ",
         lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v),
@@ -319,16 +306,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         "episodes: ",
         lambda x, v: mqe_jax.exploitability("go1tug", "idle", "a", episodes=v),
         (None, 3, 0, "x"),
-    ),
-    (
-        "polic",
-        lambda x, v: mqe_jax.double_oracle("go1tug", v, "a"),
-        (None, 3, [], ["x"], ["go1tug"] * 2, ["idle"]),
-    ),
-    (
-        "rounds: ",
-        lambda x, v: mqe_jax.double_oracle("go1tug", ["go1tug"], "a", rounds=v),
-        (None, 0, "x"),
     ),
     ("scripted: ", lambda x, v: register_task(TASKS["go1gate"], v), (3, "x")),
     ("policy: ", lambda x, v: register_scripted("go1gate", "mine", v), (None, 3, "x")),

@@ -16,7 +16,7 @@ import yaml
 from mqe_jax import cli
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
-from mqe_jax.runs import exploiting, measuring, playing, pooling, sweeping
+from mqe_jax.runs import exploiting, measuring, playing, sweeping
 from mqe_jax.study import sweep as sweeps
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -197,11 +197,8 @@ class Started(Exception):
 @pytest.mark.parametrize(
     ("part", "tasks"),
     [
-        ("pools", ["go1gate"]),
-        *(
-            pytest.param(part, ["*"], marks=pytest.mark.soak)
-            for part in ("pools", "oracle", "exploitability")
-        ),
+        ("exploitability", ["go1tug"]),
+        pytest.param("exploitability", ["*"], marks=pytest.mark.soak),
     ],
 )
 def test_published_trainings_can_start(
@@ -242,42 +239,4 @@ def test_a_measurement_that_trains_has_a_folder(
     assert json.loads((place / "result.json").read_text())["result"] == {
         **found,
         "folder": str(place / "runs"),
-    }
-
-
-def test_a_team_trains_on_with_mates_and_is_mixed_with_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Any] = []
-
-    def train(file: Path, folder: Path, impl: str) -> Any:
-        plan = sweeps.load_sweep(file)
-        asked.append((plan.tasks, plan.algorithms, plan.seeds, dict(plan.settings), impl))
-        return {"left": {"jobs": []}}
-
-    def mix(task: str, policies: list[str], **options: Any) -> Any:
-        asked.append((task, policies, options))
-        return SimpleNamespace(to_dict=lambda: {"task": task, "policies": policies})
-
-    monkeypatch.setattr(sweeping, "sweep", train)
-    monkeypatch.setattr(pooling, "tournament", mix)
-    options: dict[str, Any] = {
-        "settings": {"num_envs": 4},
-        "total_steps": 48,
-        "impl": "c",
-        "episodes": 2,
-    }
-    result = pooling.pool_of_mates("go1gate", "before", ["a", "b"], ["new"], tmp_path, **options)
-    settings = {"num_envs": 4, "start": "before", "mates": ("a", "b"), "total_steps": 48}
-    policies = [str(tmp_path / "runs" / "go1gate" / "default" / "seed0"), "before", "new"]
-    assert asked[0][:3] == (("go1gate",), ("default",), (0,)) and asked[0][4] == "c"
-    assert {
-        name: tuple(x) if isinstance(x, list) else x for name, x in asked[0][3].items()
-    } == settings
-    assert asked[1] == ("go1gate", policies, {"impl": "c", "episodes": 2})
-    assert result == {
-        "start": "before",
-        "mates": ["a", "b"],
-        "task": "go1gate",
-        "policies": policies,
     }

@@ -21,7 +21,7 @@ from mqe_jax.train.normalize import RunningStatistics, ValueStatistics, value_in
 from mqe_jax.train.optim import AdamState
 from mqe_jax.train.rollout import ObservationNormalizer
 from tests import training as probes
-from tests.training import Probe
+from tests.training import Probe, assert_same
 
 T = 6
 N = 4
@@ -152,7 +152,6 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
         final_obs=normal(T, N, A, size[0]),
         final_privileged_obs=normal(T, N, size[1]),
         active=jnp.ones((T, N, A), bool),
-        learners=jnp.ones((T, N, A), bool),
         action=normal(T, N, A, D),
         log_prob=-1.0 + 0.2 * normal(T, N, A, D),
         reward=normal(T, N, A),
@@ -474,3 +473,48 @@ def test_the_learning_rate_follows_the_kl_divergence_within_its_bounds() -> None
     for kl, before, after in (*rows, (1.0, 1.2e-5, 1e-5), (0.0, 9e-3, 1e-2)):
         rate = stages._adapt(jnp.float32(before), jnp.float32(kl), 0.01)
         assert float(rate) == pytest.approx(after), (kl, before)
+
+
+@pytest.mark.parametrize("name", [*SETTINGS, "mat"])
+def test_an_agent_that_takes_no_part_counts_nowhere_in_an_update(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it sees, does and gets, statistics, parameters and metrics stay the same; an active
+    one changes them.
+    """
+    config = config_of("joint" if name == "mat" else name)
+    if name == "mat":
+        settings = {"ratio": "agent", "value": "agent"}
+        config = override(
+            config,
+            {"ppo": settings, "network": {"name": "mat", "width": 4}, "imitation.teacher": None},
+        )
+    if config.ppo.ratio == "agent" and name != "mat":
+        config = override(
+            config, {"imitation.teacher": "scripted", "normalization.observations": True}
+        )
+    random = np.random.default_rng(5)
+    (env, state), data = drawn(random, config, 1)
+    part = data.active.at[:, 0, 1].set(False)
+    data = data._replace(active=part)
+    other = {}
+    for field in ("obs", "final_obs", "action", "log_prob", "reward"):
+        x = getattr(data, field)
+        other[field] = x.at[:, 0, 1].set(
+            jnp.asarray(random.normal(size=x[:, 0, 1].shape), jnp.float32)
+        )
+    now: list[Transition] = []
+    monkeypatch.setattr(
+        learning, "rollout", lambda *_, **__: (state.rollout, now[0], {"ended": {"episodes": 0.0}})
+    )
+
+    @jax.jit
+    def update(state: Any, data: Transition) -> Any:
+        now[:] = [data]
+        after, metrics = learner_of(env, config).update(state)
+        return dataclasses.replace(after, rollout=None), metrics
+
+    plain = update(state, data)
+    assert_same(plain, update(state, data._replace(**other)))
+    _, metrics = update(state, data._replace(active=jnp.ones_like(part)))
+    assert metrics["loss/value"] != plain[1]["loss/value"]

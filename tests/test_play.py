@@ -222,7 +222,7 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     )
     # they meet, each with its own skill
     assert list(entry.policies) == ["shipped", "1-go1wrestling-late", "scripted"]
-    policy = zoo.heaviest("go1wrestling")
+    policy = zoo.load("go1wrestling")
     env = {"ring_radius": 1.5, "randomization.push": 1.0, "randomization.friction": [0.5, 1.0]}
     config = dataclasses.replace(policy.config, env=env)
     (tmp_path / "small").mkdir()

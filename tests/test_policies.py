@@ -30,6 +30,8 @@ from mqe_jax.policies.scripted.matches import plan_tug
 from mqe_jax.runs.build import players
 from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import SKILLS, Command, Skill
+from mqe_jax.train.checkpoint import read_metadata, save_tree
+from mqe_jax.train.config import load_config
 from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
@@ -218,6 +220,31 @@ def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:
     with pytest.raises(NonFiniteError, match="holds NaN or infinite"):
         huge = jax.tree.map(lambda x: 1e6 * jnp.ones_like(x), policy.params)
         save_policy(tmp_path, dataclasses.replace(policy, params=huge), half=True)
+
+
+def test_files_of_version_0_3_load_or_are_refused_in_one_line(tmp_path: Path) -> None:
+    policy = load_policy("go1gate")
+    file = save_policy(tmp_path, policy)
+    metadata = read_metadata(file, kind="policy")
+    arrays = {"params": policy.params, "normalizer": policy.normalizer}
+
+    def stored(mates: list[str], **more: Any) -> None:
+        changed = {**metadata, **more, "config": {**metadata["config"], "mates": mates}}
+        save_tree(file, arrays, changed, kind="policy")
+
+    stored([])
+    assert load_policy(file).config == policy.config
+    stored(["idle"])
+    refuses(
+        r"safetensors: .*mates: \['idle'\] .* version 0.4 has no such setting", load_policy, file
+    )
+    stored([], members=[{}, {}])
+    refuses("safetensors: holds a mixture of policies", load_policy, file)
+    settings = tmp_path / "config.yaml"
+    settings.write_text("{mates: [], num_envs: 8}")
+    assert load_config(settings).num_envs == 8
+    settings.write_text("mates: [idle]")
+    refuses(r"config.yaml: mates: \['idle'\] .* version 0.4", load_config, settings)
 
 
 SPEED = COMMANDS[0].gain  # m/s per unit of forward action

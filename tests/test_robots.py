@@ -1,6 +1,5 @@
 """Robots as processes: exported graphs of one robot act as the policy of the team does in JAX."""
 
-import dataclasses
 import importlib.util
 import json
 import subprocess
@@ -18,7 +17,6 @@ from mqe_jax import cli, make
 from mqe_jax.core.settings import build
 from mqe_jax.core.types import Observations
 from mqe_jax.export.task import normal_numbers
-from mqe_jax.policies.mixture import Mixture
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import running_init
@@ -157,9 +155,6 @@ def test_what_is_no_file_of_a_robot_is_refused(
 
     refuses("none.onnx: cannot be read", opened, tmp_path / "none.onnx")
     refuses("damaged, or not an ONNX graph", opened, files["run"])
-    mixture = Mixture((policy, dataclasses.replace(policy)), (0.5, 0.5))
-    env = make("go1gate", impl="c", num_envs=1, **SENSES)
-    refuses("a mixture draws one member for all its robots", robot_onnx, mixture, env)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     refuses(r"needs onnxruntime \(pip install 'mqe-jax\[export\]'\)", opened, files["mean"])
 

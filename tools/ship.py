@@ -16,7 +16,8 @@ from mqe_jax import evaluate
 from mqe_jax.core.settings import build
 from mqe_jax.envs import TASKS
 from mqe_jax.envs.match import Match
-from mqe_jax.policies import load_policy, mixture, zoo
+from mqe_jax.policies import load_policy, zoo
+from mqe_jax.train.policy import save_policy
 
 DIGITS = 4
 
@@ -64,7 +65,7 @@ if __name__ == "__main__":
     given = vars(parser.parse_args())
     policy = load_policy(given.pop("run"))
     with TemporaryDirectory() as folder:
-        rounded = str(mixture.save(folder, policy, half=True))
+        rounded = str(save_policy(folder, policy, half=True))
         given |= measure(
             rounded, policy.task, given.pop("episodes"), given["mode"] == "deterministic"
         )

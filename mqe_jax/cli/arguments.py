@@ -49,7 +49,6 @@ COMMANDS: dict[str, Any] = {
     "report": study.Report,
     "tournament": study.Tournament,
     "exploit": exploit.Exploit,
-    "oracle": exploit.Oracle,
 }
 """Arguments by command; what it does instead, if they depend on others."""
 

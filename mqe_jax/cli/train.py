@@ -127,10 +127,9 @@ def parse_train(arguments: Sequence[str]) -> Train:
         changes["network.name"] = chosen.network
     if chosen.group is not None:
         changes["group"] = chosen.group
-    for flag, name in {"--opponent": "opponents", "--mate": "mates"}.items():
+    if any(word.split("=")[0] == "--opponent" for word in others):
         # tyro would append to those of the file
-        if any(word.split("=")[0] == flag for word in others):
-            changes[name] = ()
+        changes["opponents"] = ()
     settings = resolve(task, source.config, source.algorithm, {"": changes})
     default = Train(target=tyro.MISSING, settings=settings, source=source)
     return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=MARKERS)

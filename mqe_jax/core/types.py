@@ -98,9 +98,7 @@ AnyBatch = Annotated[
     Any, _having(f"{_ENV} num_envs", "a batch, such as VectorEnv(mqe_jax.make(task), 64)")
 ]
 AnyPolicy = Annotated[Any, _having("task agents act initial_memory", _POLICY)]
-AnyTrained = Annotated[
-    Any, _having("needs config act initial_memory", "a trained policy or a mixture of such")
-]
+AnyTrained = Annotated[Any, _having("needs config act initial_memory", "a trained policy")]
 PolicyOrAct = Annotated[Any, _having("act initial_memory", _ACT, callables=True)]
 
 Teams = tuple[tuple[int, ...], ...]
@@ -137,7 +135,6 @@ class VectorEnv(Protocol):
     | `step` | (N,) | steps in the episode; set by `stagger_episodes` |
     | `assistance` | (N,) | set by `curriculum.assistance` (`replace_fields`) |
     | `active` | (N, A) bool | agents that take part; others enter no statistics, loss or result |
-    | `learners` | (N, A) bool | active agents for which the policy acts and learns |
     | `groups`, `final_groups` | (N, A, O_g) by name | further observations |
     """
 
@@ -378,7 +375,6 @@ class Transition(NamedTuple):
     log_prob: jax.Array  # log-probabilities of the actions (N, A, D)
     reward: jax.Array  # rewards (N, A)
     active: jax.Array  # which agents took part (N, A) bool
-    learners: jax.Array  # active agents from whose samples the policy learns (N, A) bool
     terminated: jax.Array  # whether the episode terminated (N,) bool
     done: jax.Array  # whether it was terminated or truncated (N,) bool
     # actions of the teacher, as the environment would get them (N, A, D); empty without one
@@ -400,6 +396,6 @@ class Batch(NamedTuple):
     target: jax.Array  # value targets, normalised (L, C, V)
     old_value: jax.Array  # normalised values at collection (L, C, V)
     active: jax.Array  # which agents took part (L, C, A) bool
-    learners: jax.Array  # active agents from whose samples the policy learns (L, C, A) bool
+    learners: jax.Array  # active agents from whose samples the loss learns (L, C, A) bool
     # the first D' entries of the teacher's actions, unscaled (L, C, A, D'); empty without one
     teacher_action: Any = ()

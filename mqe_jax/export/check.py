@@ -14,7 +14,7 @@ from mqe_jax.core.types import observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
-from mqe_jax.policies.mixture import Mixture, Trained
+from mqe_jax.train.policy import TrainedPolicy
 
 STEPS = 100
 """Environment steps over which a graph is compared with JAX."""
@@ -27,7 +27,7 @@ too: ONNX has no signed zero at +-pi."""
 Arrays = dict[str, np.ndarray]
 
 
-def verify_policy(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
+def verify_policy(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above
     `LARGEST_ERROR`.
     """
@@ -63,7 +63,7 @@ def check_errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays, where
     return error
 
 
-def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
+def record_actions(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
     """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and
     idle opponents.
     """
@@ -96,8 +96,6 @@ def record_actions(policy: Trained, env: QuadrupedEnv, steps: int) -> tuple[Arra
         inputs, outputs, state = advance(state, memory)
         rows.append(jax.device_get((inputs, outputs)))
         memory = {name: outputs[f"next_{name}"] for name in memory}
-        if isinstance(policy, Mixture):  # whose members take turns
-            memory["memory_member"] = jnp.float32(i % (len(policy.members) + 1))
         if state.terminated or state.truncated:
             state, memory = start(jax.random.PRNGKey(i + 1))
     return jax.tree.map(lambda *x: np.stack(x), *rows)

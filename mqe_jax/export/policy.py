@@ -15,9 +15,7 @@ Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vecto
 frame, `joint_position` and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: those of
 the skill, of the walk policy `walk_history` (N, A, 30, 70), `walk_action`, `walk_previous_action`
 (N, A, 12) and `walk_gait` (N, A), and those of the network: `memory` if it is one array, else
-`memory_NAME`. A mixture's graph has those of all members, and `memory_member` (N,), the number of
-the member that acts, from 1. Draw it by the weights at an episode's start; 0 is the heaviest
-member.
+`memory_NAME`.
 """
 
 import functools
@@ -36,16 +34,15 @@ from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
-from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import Skill
-from mqe_jax.train.policy import check_policy
+from mqe_jax.train.policy import TrainedPolicy, check_policy
 
 SENSED = ("gravity", "joint_position", "joint_velocity")
 """Inputs of a skill that are its robot's `Proprioception`, in this order."""
 
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)
-def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
+def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of a policy with its mean actions; its task defines control mode, robot and
     walk policy.
 
@@ -68,7 +65,7 @@ def to_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
     )
 
 
-def input_shapes(policy: Trained, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
+def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
     robots: dict[str, tuple[int, ...]] = {"obs": (policy.needs.dims.observation,)}
     if env.control == "command":
@@ -89,7 +86,7 @@ def sensed_shapes(robot: Robot) -> dict[str, tuple[int, ...]]:
 
 
 def policy_step(
-    policy: Trained, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]
+    policy: TrainedPolicy, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]
 ) -> dict[str, jax.Array]:
     """Returns the outputs of one step of one environment by name, the function that the graph maps
     over N.
@@ -153,7 +150,7 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
     return {"inputs": of(model.graph.input), "outputs": of(model.graph.output)}
 
 
-def properties(policy: Trained, env: QuadrupedEnv) -> dict[str, str]:
+def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
     """Returns the metadata of a policy's graph."""
     seen = {"policy": env.observation_layout, **env.groups}[policy.needs.group]
     layout = [[block.name, block.width, block.meaning] for block in seen.blocks]

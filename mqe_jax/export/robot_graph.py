@@ -25,12 +25,11 @@ from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors
 from mqe_jax.export.policy import properties
 from mqe_jax.export.task import readings_function
 from mqe_jax.export.translate import translate
-from mqe_jax.policies.mixture import Mixture, Trained
-from mqe_jax.train.policy import check_policy
+from mqe_jax.train.policy import TrainedPolicy, check_policy
 
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)
-def robot_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
+def robot_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of any robot of a policy's team; its actions are means if those of the
     policy are.
 
@@ -47,7 +46,7 @@ def robot_onnx(policy: Trained, env: QuadrupedEnv) -> onnx.ModelProto:
     return translate(act, sizes, f"{env.name.replace('-', '_')}_robot", about)
 
 
-def verify_robot(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
+def verify_robot(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
     """Returns the graph of `robot_onnx` and its largest error against JAX in `STEPS` steps.
 
     Raises:
@@ -65,18 +64,12 @@ def verify_robot(policy: Trained, env: QuadrupedEnv) -> tuple[onnx.ModelProto, f
     return model, check_errors(model, inputs, outputs, f"{STEPS} steps of {env.name}")
 
 
-def _one_robot(policy: Trained) -> Trained:
+def _one_robot(policy: TrainedPolicy) -> TrainedPolicy:
     """Returns the policy of a team of one, which acts as each robot of a team whose robots do not
     see each other.
     """
     if policy.agents == 1:
         return policy
-    if isinstance(policy, Mixture):
-        fail(
-            "policy",
-            policy,
-            "one without members (--per-robot): a mixture draws one member for all its robots",
-        )
     needs = dataclasses.replace(policy.needs, dims=policy.dims._replace(agents=1, values=1))
     try:
         return dataclasses.replace(policy, needs=needs)
@@ -84,7 +77,7 @@ def _one_robot(policy: Trained) -> Trained:
         fail("policy", policy, "one whose robots share a network (--per-robot)")
 
 
-def _record(policy: Trained, env: QuadrupedEnv) -> tuple[Arrays, Arrays, float]:
+def _record(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[Arrays, Arrays, float]:
     """Returns inputs and outputs of a robot's function by name, leading axis robots and steps.
 
     The third value is the largest difference of its actions from those that the policy computes for

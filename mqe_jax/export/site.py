@@ -32,11 +32,10 @@ from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, 
 from mqe_jax.export.translate import Function
 from mqe_jax.physics import robots
 from mqe_jax.policies import load_policy, parameters_for, zoo
-from mqe_jax.policies.mixture import Trained
 from mqe_jax.policies.translated import together, translate
 from mqe_jax.sensors.suite import ONBOARD
 from mqe_jax.skills.agile import AgileSkill
-from mqe_jax.train.policy import Policy
+from mqe_jax.train.policy import Policy, TrainedPolicy
 
 PAGE = Path(__file__).parent / "page"
 """Files of the page."""
@@ -168,7 +167,9 @@ def entries(sources: Sequence[str]) -> list[Entry]:
     return [entry for *_, entry in found]
 
 
-def _source(source: str, playable: Sequence[str]) -> tuple[str, dict[str, Any], dict[str, Trained]]:
+def _source(
+    source: str, playable: Sequence[str]
+) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
     """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a
     source stands for.
     """

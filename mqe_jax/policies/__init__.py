@@ -21,14 +21,20 @@ from mqe_jax.core.settings import PathText, check, check_arguments, fail
 from mqe_jax.core.types import AnyEnvironment, Memory, Observations, PolicyOrAct, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_SCRIPTED, TASKS
-from mqe_jax.policies import mixture, zoo
-from mqe_jax.policies.mixture import Trained
+from mqe_jax.policies import zoo
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.translated import together, translate
 from mqe_jax.policies.zoo import population
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.needs import Needs
-from mqe_jax.train.policy import Composed, Policy, TrainedPolicy, check_obs, check_policy
+from mqe_jax.train.policy import (
+    Composed,
+    Policy,
+    TrainedPolicy,
+    check_obs,
+    check_policy,
+    read_policy,
+)
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and
@@ -192,7 +198,7 @@ def load_policy(
             or a shipped policy's card says so.
 
     Returns:
-        A `TrainedPolicy` or a `Mixture` for a shipped one or a path, else a `SimplePolicy`.
+        A `TrainedPolicy` for a shipped one or a path, else a `SimplePolicy`.
 
     Raises:
         InputError: for an unknown name, a file that cannot be read, a policy of another task, or a
@@ -213,7 +219,7 @@ def load_policy(
         allowed = f"{', '.join((*NAMES, *further, *zoo.names()))}, a run folder, or a policy file"
         raise InputError(f"policy: unknown {str(source)!r}{hint}; allowed: {allowed}")
     else:
-        policy = mixture.read(source)
+        policy = read_policy(source)
     policy = policy.acting(True) if deterministic else policy
     return policy if env is None else translate(policy, env, given)
 
@@ -229,7 +235,7 @@ def load_as(field: str, source: Any, env: QuadrupedEnv, *, deterministic: bool =
             policy: Any = load_policy(source, env, deterministic=deterministic)
         else:
             policy = check("policy", source, PolicyOrAct)
-            if isinstance(policy, Trained):
+            if isinstance(policy, TrainedPolicy):
                 policy = translate(
                     policy.acting(True) if deterministic else policy, env, repr(policy)
                 )

@@ -15,10 +15,9 @@ import jax.numpy as jnp
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import Memory, Observations
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.policies.mixture import Trained
 from mqe_jax.skills import SKILLS
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import Composed, Policy, check_policy
+from mqe_jax.train.policy import Composed, Policy, TrainedPolicy, check_policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +26,7 @@ class Translated(Composed):
     `here`.
     """
 
-    policy: Trained
+    policy: TrainedPolicy
     own: Commander = dataclasses.field(repr=False)
     here: Commander = dataclasses.field(repr=False)
     sensed: slice | None = None
@@ -84,7 +83,7 @@ class Silent(Composed):
         ), memory
 
 
-def translate(policy: Trained, env: QuadrupedEnv, name: str) -> Policy:
+def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
     """Returns a trained policy as it acts in a task: itself, or of several skills with its own one,
     or silent.
 

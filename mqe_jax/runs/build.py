@@ -32,7 +32,6 @@ from mqe_jax.presets import resolve
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
 from mqe_jax.selfplay.league.sides import BothSides
-from mqe_jax.selfplay.mates import Mates
 from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.sensors.suite import ONBOARD, sensors_of
 from mqe_jax.train import learner
@@ -74,7 +73,7 @@ def prepare(
         made = settings(task, config, env=env)
     elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
         made = settings(task, config)
-        theirs = {"env": env, "opponents": made.opponents, "mates": made.mates}
+        theirs = {"env": env, "opponents": made.opponents}
         theirs |= {"demonstrator": made.curriculum.demonstrator}
         for name, value in theirs.items():
             if value:
@@ -200,10 +199,9 @@ def environments(
         if len(both.teams) > 1
         else []
     )
-    mates = [load_as("mate", name, both) for name in config.mates]
     shown = config.imitation.teacher
     teacher = None if shown is None else load_as("imitation.teacher", shown, both)
-    groups = {config.group, *groups_of(*others, *mates, teacher)}
+    groups = {config.group, *groups_of(*others, teacher)}
     demonstrator = config.curriculum.demonstrator
 
     def batch(num_envs: int) -> Any:
@@ -233,9 +231,6 @@ def environments(
     league = None
     if len(both.teams) < 2:
         env = batch(config.num_envs)
-        if mates:
-            env = Mates(env, mates)
-            eval_env = eval_env and Mates(eval_env, mates)
     elif opponents:
         matches = batch(config.num_envs)
         league = League(BothSides(matches) if config.both_sides else matches, opponents, config)
@@ -281,12 +276,6 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
             "opponents",
             list(config.opponents),
             f"empty: {env.name} is not a match; it has one team",
-        )
-    if len(env.teams) > 1 and config.mates:
-        fail(
-            "mates",
-            list(config.mates),
-            f"empty: {env.name} is a match, whose opponents are `opponents`",
         )
     if config.both_sides and not config.opponents:
         fail("both_sides", True, "false without opponents")

@@ -25,8 +25,6 @@ MEASURES = {
     "evaluate": "mqe_jax.runs.playing:evaluate",
     "tournament": "mqe_jax.runs.playing:tournament",
     "exploitability": "mqe_jax.runs.exploiting:exploitability",
-    "double_oracle": "mqe_jax.runs.exploiting:double_oracle",
-    "pool_of_mates": "mqe_jax.runs.pooling:pool_of_mates",
 }
 """Functions by the name in `measure`. Those with an argument `folder` get the measurement's
 folder."""

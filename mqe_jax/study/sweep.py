@@ -106,8 +106,7 @@ class Measurement:
     """
 
     measure: str
-    """What is called: evaluate, tournament, exploitability or double_oracle, as in `mqe_jax`, or
-    pool_of_mates."""
+    """What is called: evaluate, tournament or exploitability, as in `mqe_jax`."""
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     arguments: Mapping[str, Any] = FrozenMapping()

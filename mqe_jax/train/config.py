@@ -1,5 +1,6 @@
 """Settings of a training run: typed, validated, nested classes that YAML files and flags mirror."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,7 +35,6 @@ from mqe_jax.core.settings import (
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
-_MATE = tyro.conf.arg(name="mate", metavar="NAME|RUN|FILE")
 
 
 @settings_class
@@ -220,11 +220,6 @@ class TrainConfig:
     forward. In training also newest (the policy itself), older (a member of the league's pool,
     preferably one that is hard to beat) or uniform (any member). Opponents share the environments
     equally. Without any, both teams of each match learn."""
-    mates: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, _MATE] = ()
-    """Pool of mates in a task of one team, in training and its evaluations: what `opponents`
-    accept, except newest, older and uniform. Each has an equal share of the environments, in which
-    it acts for one robot and the policy learns as the others. In one more share the policy acts for
-    the whole team."""
     both_sides: bool = False
     """Whether the policy plays its opponents as the task's team 1 in half of the environments, in
     evaluations too."""
@@ -301,6 +296,20 @@ class TrainConfig:
         return -(-self.total_steps // self.steps_per_update)
 
 
+RETIRED: Mapping[str, Any] = FrozenMapping({"mates": []})
+"""Settings that earlier versions wrote into files, with their defaults as files hold them."""
+
+
+def without_retired(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a file without those of `RETIRED`; InputError if one has another
+    value than its default.
+    """
+    for name, default in RETIRED.items():
+        if values.get(name, default) != default:
+            fail(name, values[name], f"{default!r}: version 0.4 has no such setting")
+    return {name: value for name, value in values.items() if name not in RETIRED}
+
+
 def load_config(path: str | Path) -> TrainConfig:
     """Reads settings from a YAML file; InputError naming the file, for invalid content.
 
@@ -316,6 +325,6 @@ def load_config(path: str | Path) -> TrainConfig:
     """
     values = load_yaml(path)
     try:
-        return override(TrainConfig(), values)
+        return override(TrainConfig(), without_retired(values))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

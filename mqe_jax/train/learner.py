@@ -179,7 +179,7 @@ def make_learner(
         if config.normalization.observations:
             some = jnp.any(transitions.active, axis=-1)
             obs_normalizer = ObservationNormalizer(
-                running_update(obs_normalizer.obs, transitions.obs, transitions.learners, features),
+                running_update(obs_normalizer.obs, transitions.obs, transitions.active, features),
                 running_update(obs_normalizer.privileged, transitions.privileged_obs, some),
             )
         new_state = TrainState(
@@ -273,7 +273,7 @@ def _prepare(
     value_normalizer = state.value_normalizer
     value, next_value = value_denormalize(value_normalizer, pair)
     advantage, target = stages.advantages(now, transitions, value, next_value)
-    counted = stages.value_mask(transitions.learners)
+    counted = stages.value_mask(transitions.active)
     if config.normalization.values:
         value_normalizer = value_update(
             value_normalizer, target, counted, config.normalization.value_decay
@@ -297,6 +297,6 @@ def _prepare(
         target=chunks(value_normalize(value_normalizer, target), steps),
         old_value=chunks(pair[0], steps),
         active=chunks(active, steps),
-        learners=chunks(transitions.learners, steps),
+        learners=chunks(transitions.active, steps),
     )
     return batch, value_normalizer, metrics

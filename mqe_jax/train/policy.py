@@ -24,14 +24,13 @@ from mqe_jax.core.types import (
     Memory,
     Observations,
     Params,
-    PyTree,
     RandomKey,
     VectorEnv,
     shapes_of,
     teams_of,
 )
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
-from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.needs import Needs, needs_of
 from mqe_jax.train.networks import EnvDims, NetworkSettings
@@ -339,10 +338,21 @@ def save_policy(
         InputError: for a folder that cannot be written.
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
-    return write_policy(run_dir, name, *file_content(policy, half))
+    if Path(name).name != name:
+        fail("name", name, "the name of a file, without a folder")
+    path = Path(run_dir) / name
+    arrays, metadata = _file_content(policy, half)
+    if wrong := nonfinite(arrays):
+        raise NonFiniteError(
+            f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers"
+        )
+    check_locks(path)
+    check_folder(path.parent)
+    save_tree(path, arrays, metadata, kind="policy")
+    return path
 
 
-def file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+def _file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns the arrays and the metadata of a policy's file."""
     params = policy.params
     if half:
@@ -354,23 +364,6 @@ def file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], dic
     return {"params": params, "normalizer": policy.normalizer}, metadata
 
 
-def write_policy(
-    folder: str | Path, name: str, arrays: PyTree, metadata: Mapping[str, Any]
-) -> Path:
-    """Writes the content of a policy's file; errors as `save_policy`."""
-    if Path(name).name != name:
-        fail("name", name, "the name of a file, without a folder")
-    path = Path(folder) / name
-    if wrong := nonfinite(arrays):
-        raise NonFiniteError(
-            f"{path}: not written, because {wrong[0]} holds NaN or infinite numbers"
-        )
-    check_locks(path)
-    check_folder(path.parent)
-    save_tree(path, arrays, metadata, kind="policy")
-    return path
-
-
 @single
 def read_policy(run: str | Path) -> TrainedPolicy:
     """Reads the policy of a run folder, or a policy file; parameters stored as float16 become
@@ -380,31 +373,18 @@ def read_policy(run: str | Path) -> TrainedPolicy:
         InputError: in one line naming the file, if it is missing, damaged, of another format or
             non-finite.
     """
-    path = policy_path(run)
+    path = Path(check("policy", run, PathText))
+    path = path / POLICY_FILE if path.is_dir() else path
     metadata = read_metadata(path, kind="policy")
     if "members" in metadata:
-        raise InputError(f"{path}: holds a mixture of policies; a single policy is needed")
-    return policy_in(path, metadata)
-
-
-def policy_path(run: str | Path) -> Path:
-    """Returns the policy file of a run folder, or a policy file itself."""
-    path = Path(check("policy", run, PathText))
-    return path / POLICY_FILE if path.is_dir() else path
-
-
-def policy_in(path: Path, metadata: dict[str, Any], part: str = "") -> TrainedPolicy:
-    """Returns the policy of a file with its metadata, its arrays below the path name `part`; errors
-    as there.
-    """
+        raise InputError(f"{path}: holds a mixture of policies, which version 0.4 does not read")
     try:
         needs = build(Needs, metadata.pop("needs"))
-        config = build(TrainConfig, metadata.pop("config"))
+        config = build(TrainConfig, without_retired(metadata.pop("config")))
         deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
-    except (KeyError, TypeError, InputError) as error:
+    except (KeyError, TypeError, AttributeError, InputError) as error:
         raise InputError(f"{path}: its settings cannot be read ({error})") from None
-    tree = load_tree(
-        path, _template(needs.dims, config.network), kind="policy", half=True, part=part
-    ).tree
+    template = _template(needs.dims, config.network)
+    tree = load_tree(path, template, kind="policy", half=True).tree
     return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)

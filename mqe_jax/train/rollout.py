@@ -67,15 +67,6 @@ def active_of(state: Any) -> jax.Array:
     return jnp.ones(state.reward.shape, bool) if active is None else active
 
 
-def learners_of(state: Any) -> jax.Array:
-    """Returns from which agents of an environment's state the policy learns (N, A) bool: all active
-    ones by default.
-    """
-    active = active_of(state)
-    learners = getattr(state, "learners", None)
-    return active if learners is None else active & learners
-
-
 def mean_of_team(reward: jax.Array, active: jax.Array) -> jax.Array:
     """Returns the mean over the active agents: (..., A) -> (...); 0 without any."""
     count = jnp.sum(active.astype(jnp.float32), axis=-1)
@@ -150,7 +141,6 @@ def rollout(
             log_prob=log_prob,
             reward=after.reward,
             active=active,
-            learners=learners_of(before),
             terminated=after.terminated,
             done=done,
             teacher_action=label,

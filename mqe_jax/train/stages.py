@@ -55,7 +55,7 @@ class Stages:
         config = self.config
         active = transitions.active
         reward = jnp.where(active, transitions.reward, jnp.zeros_like(transitions.reward))
-        counted = self.value_mask(transitions.learners)
+        counted = self.value_mask(transitions.active)
         if config.ppo.value == "joint":
             reward = mean_of_team(reward, active)[..., None]
         advantage, target = gae(

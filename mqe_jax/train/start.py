@@ -17,7 +17,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import fail, is_settings, leaves, override, to_mapping
 from mqe_jax.core.types import Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
-from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import NAMED, TrainedPolicy, check_policy, read_policy
@@ -116,7 +116,7 @@ def first_state(
         or not 0 <= seconds < math.inf
     ):
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
-    check_same(run, before, config)
+    check_same(run, without_retired(before), config)
     if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
         fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
     whole = metadata.get("environments", True)

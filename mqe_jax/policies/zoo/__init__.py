@@ -12,11 +12,9 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Episodes, Fraction, NonNegative
 from mqe_jax.core.settings import PathText, build, check_arguments, settings_class, to_mapping
 from mqe_jax.core.types import AnyTrained
-from mqe_jax.policies import mixture
-from mqe_jax.policies.mixture import Mixture, Trained
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.evaluate import Rate
-from mqe_jax.train.policy import NAMED, TrainedPolicy
+from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
 
 FOLDER = Path(__file__).parent
 
@@ -82,25 +80,17 @@ def card(task: str) -> Card:
     return build(Card, read_metadata(file_of(task), kind="policy")["card"])
 
 
-def load(task: str) -> Trained:
+def load(task: str) -> TrainedPolicy:
     """Returns a task's shipped policy, which acts as its card declares; errors as `card`."""
-    return mixture.read(file_of(task)).acting(card(task).mode == "deterministic")
+    return read_policy(file_of(task)).acting(card(task).mode == "deterministic")
 
 
 @check_arguments(policy=AnyTrained, about=Card, folder=PathText)
-def ship(policy: Trained, about: Card, folder: Path = FOLDER) -> Path:
+def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
     """Writes a policy with its card, its parameters as float16; returns the file."""
     metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
     shipped = dataclasses.replace(policy.acting(about.mode == "deterministic"), metadata=metadata)
-    return mixture.save(folder, shipped, file_of(policy.task).name, half=True)
+    return save_policy(folder, shipped, file_of(policy.task).name, half=True)
 
 
-def heaviest(task: str) -> TrainedPolicy:
-    """Returns a task's shipped policy, of a mixture the member with the largest weight; errors as
-    `card`.
-    """
-    policy = load(task)
-    return policy.heaviest if isinstance(policy, Mixture) else policy
-
-
-NAMED.update({name: functools.partial(heaviest, name) for name in names()})
+NAMED.update({name: functools.partial(load, name) for name in names()})

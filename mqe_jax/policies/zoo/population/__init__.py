@@ -18,7 +18,7 @@ from annotated_types import MaxLen
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import read_json, write_atomically
 from mqe_jax.core.settings import check, fail
-from mqe_jax.policies.mixture import Trained, save
+from mqe_jax.train.policy import TrainedPolicy, save_policy
 
 FOLDER = Path(__file__).parent
 MEMBERS = 5
@@ -94,7 +94,7 @@ def add(
     version: str,
     task: str,
     member: str,
-    policy: Trained | None = None,
+    policy: TrainedPolicy | None = None,
     folder: str | Path | None = None,
 ) -> None:
     """Adds a member to a new population: a policy, its parameters as float16, or without one the
@@ -120,7 +120,7 @@ def add(
     if member in own or len(own) == MEMBERS:
         fail("member", member, f"a new one, of at most {MEMBERS}: {', '.join(own)}")
     if policy is not None:
-        file = save(folder, policy, f"{version}-{task}-{member}.safetensors", half=True)
+        file = save_policy(folder, policy, f"{version}-{task}-{member}.safetensors", half=True)
         if (size := file.stat().st_size) > BYTES:
             file.unlink()
             fail("policy", f"{size} bytes", f"at most {BYTES}")
