@@ -22,7 +22,7 @@ from mqe_jax.core.settings import (
     override,
 )
 from mqe_jax.envs.registry import ALIASES, SHIPPED, TASKS
-from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.config import TrainConfig, read_settings
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
 
@@ -158,7 +158,7 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
         )
     if not path.is_file():
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
-    return [_Layer.of(f"{path}: ", load_yaml(path))]
+    return [_Layer.of(f"{path}: ", read_settings(path))]
 
 
 def preset(algorithm: str) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from mqe_jax.policies import BothTeams, SimplePolicy, load_policy, parameters_fo
 from mqe_jax.policies.scripted import find_scripted
 from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.policies.scripted.matches import plan_tug
+from mqe_jax.presets import resolve
 from mqe_jax.runs.build import players
 from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import SKILLS, Command, Skill
@@ -242,9 +243,10 @@ def test_files_of_version_0_3_load_or_are_refused_in_one_line(tmp_path: Path) ->
     refuses("safetensors: holds a mixture of policies", load_policy, file)
     settings = tmp_path / "config.yaml"
     settings.write_text("{mates: [], num_envs: 8}")
-    assert load_config(settings).num_envs == 8
+    assert load_config(settings).num_envs == resolve("go1gate", settings).num_envs == 8
     settings.write_text("mates: [idle]")
     refuses(r"config.yaml: mates: \['idle'\] .* version 0.4", load_config, settings)
+    refuses(r"config.yaml: mates: \['idle'\] .* version 0.4", resolve, "go1gate", settings)
 
 
 SPEED = COMMANDS[0].gain  # m/s per unit of forward action

@@ -323,8 +323,19 @@ def load_config(path: str | Path) -> TrainConfig:
         config = load_config("own.yaml")
         ```
     """
+    values = read_settings(path)
+    try:
+        return override(TrainConfig(), values)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def read_settings(path: str | Path) -> dict[str, Any]:
+    """Returns the names and values of a YAML file without those of `RETIRED`; InputError naming the
+    file, if it cannot be read or as `without_retired`.
+    """
     values = load_yaml(path)
     try:
-        return override(TrainConfig(), without_retired(values))
+        return without_retired(values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
