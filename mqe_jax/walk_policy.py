@@ -1,7 +1,7 @@
-"""The walk policy: velocity and gait commands to joint targets, for one robot (walk-these-ways,
-arXiv 2212.03238).
+"""The walk policy: velocity and gait commands to joint targets, for one robot.
 
-A feed-forward network takes as input the last 30 observations of 70 numbers:
+It is that of walk-these-ways (arXiv 2212.03238). A feed-forward network takes as input the last 30
+observations of 70 numbers:
 
 | block | size | content |
 |---|---|---|
@@ -13,9 +13,10 @@ A feed-forward network takes as input the last 30 observations of 70 numbers:
 | action before it | 12 | |
 | clock | 4 | sine of each foot's phase, FL FR RL RR |
 
-adaptation 2100-256-128-2 gives a latent; body (2100 + 2)-512-256-128-12 gives the action, clipped
-to +-10; the joint target is default + scale * action, both the robot's. ELU between layers. Matrix
-products are in float32; in an environment's step in TF32 on an NVIDIA GPU.
+Its adaptation part, 2100-256-128-2, gives a latent. Its body, (2100 + 2)-512-256-128-12, gives the
+action, clipped to +-10. The joint target is default + scale * action, both the robot's. ELU is
+between layers. Matrix products are in float32, but in TF32 in an environment's step on an NVIDIA
+GPU.
 
 These 2100 numbers contain every action twice, constant commands 30 times, and in most gaits one
 clock four times. `RestrictedWalkPolicy` computes the same actions from about two thirds of them,
@@ -38,18 +39,15 @@ from mqe_jax.skills.weights import ASSETS, Networks, Params, layers  # noqa: F40
 
 HISTORY = 30
 OBSERVATION_SIZE = 70
-_BLOCKS = (
-    "gravity",
-    "commands",
-    "joint_position",
-    "joint_velocity",
-    "action",
-    "previous_action",
-    "clock",
-)
-_COLUMNS = dict(
-    zip(_BLOCKS, np.split(np.arange(OBSERVATION_SIZE), [3, 18, 30, 42, 54, 66]), strict=True)
-)
+_COLUMNS = {
+    "gravity": np.arange(0, 3),
+    "commands": np.arange(3, 18),
+    "joint_position": np.arange(18, 30),
+    "joint_velocity": np.arange(30, 42),
+    "action": np.arange(42, 54),
+    "previous_action": np.arange(54, 66),
+    "clock": np.arange(66, 70),
+}
 """Positions of each block in an observation."""
 LATENT_SIZE = 2
 ADAPTATION_SIZES = (HISTORY * OBSERVATION_SIZE, 256, 128, LATENT_SIZE)
@@ -61,9 +59,7 @@ save_params = NETWORKS.save
 STEP = 0.02  # s, one policy step
 ACTION_CLIP = 10.0
 JOINT_VELOCITY_SCALE = 0.05
-# of the networks' matrix products in an environment's step; float32 on a CPU
-PRECISION = "tensorfloat32"
-
+PRECISION = "tensorfloat32"  # of matrix products in an environment's step; float32 on a CPU
 
 COMMANDS = (
     Command("vx", "m/s forward", gain=2.0, limit=1.0, scale=2.0, trained=(-1.2, 1.2)),
@@ -100,8 +96,10 @@ class WalkMemory:
     """Recurrent state of one robot's walk policy."""
 
     history: jax.Array
-    """Last observations, oldest first (30, 70), or their rows (H,), see `RestrictedWalkPolicy`;
-    zeros after a reset."""
+    """Last observations, oldest first (30, 70); zeros after a reset.
+
+    `RestrictedWalkPolicy` holds their rows (H,).
+    """
     action: jax.Array
     """Last action (12,)."""
     previous_action: jax.Array
@@ -122,9 +120,9 @@ def foot_phases(gait: jax.Array, commands: jax.Array) -> jax.Array:
     """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above."""
     duration = commands[8]
     raw = jnp.mod(gait + jnp.stack(_shifts(commands)), 1.0)
-    return jnp.where(
-        raw < duration, 0.5 * raw / duration, 0.5 + 0.5 * (raw - duration) / (1.0 - duration)
-    )
+    stance = 0.5 * raw / duration
+    swing = 0.5 + 0.5 * (raw - duration) / (1.0 - duration)
+    return jnp.where(raw < duration, stance, swing)
 
 
 def advance_gait(gait: jax.Array, commands: jax.Array) -> jax.Array:
@@ -233,12 +231,13 @@ class RestrictedWalkPolicy(WalkPolicy):
         super().__init__(robot)
         changing = np.unique(self.index(varied))
         default = self.default_commands(gait)
-        # half cycles after the first foot
-        halves = 2 * (np.array(_shifts(default)) - _shifts(default)[0])
-        alike = (
-            default[8] == 0.5 and not (halves % 1).any() and not {5, 6, 7, 8} & {*changing.tolist()}
-        )
-        clock = _COLUMNS["clock"][: 1 if alike else None]
+        shifts = np.array(_shifts(default))
+        halves = 2 * (shifts - shifts[0])  # half cycles after the first foot
+        steady = default[8] == 0.5 and not {5, 6, 7, 8} & {*changing.tolist()}
+        alike = steady and not (halves % 1).any()
+        clock = _COLUMNS["clock"]
+        if alike:
+            clock = clock[:1]
         sensed = [_COLUMNS[name] for name in ("gravity", "joint_position", "joint_velocity")]
         self._kept = np.concatenate(
             [_COLUMNS["commands"][changing], *sensed, clock, _COLUMNS["action"]]
@@ -251,8 +250,7 @@ class RestrictedWalkPolicy(WalkPolicy):
         self._observation[self._kept, 1:] = np.eye(len(self._kept))
         if alike:
             self._observation[_COLUMNS["clock"], -NUM_JOINTS - 1] = (-1) ** halves
-        # the rows, and the last action of the row before
-        least = HISTORY * self._width + NUM_JOINTS
+        least = HISTORY * self._width + NUM_JOINTS  # the rows, and the last action before them
         self._size = least + -least % 16  # 64 bytes: products of aligned rows are faster
 
     def init_memory(self) -> WalkMemory:
@@ -260,7 +258,7 @@ class RestrictedWalkPolicy(WalkPolicy):
 
     def _append(self, history: jax.Array, observation: jax.Array) -> jax.Array:
         extended = jnp.concatenate([history, jnp.ones(1), observation[self._kept]])[self._width :]
-        # Written once, not for each of its readers; on a CPU that is slower.
+        # Written once instead of once for each of its readers; on a CPU that is slower.
         return jax.lax.platform_dependent(
             extended, cpu=lambda x: x, default=jax.lax.optimization_barrier
         )
@@ -269,8 +267,7 @@ class RestrictedWalkPolicy(WalkPolicy):
         return self.fold_history(super().load_params(path))
 
     def fold_history(self, params: Params) -> Params:
-        """Returns weights that compute from histories of rows what `params` compute from 30
-        observations.
+        """Returns weights that compute the actions of `params` from histories of rows.
 
         In the first layers, the weights of both occurrences of an action are added. Those of
         constant commands, times their values, become the weight of the row's one. Those of equal
@@ -285,8 +282,6 @@ class RestrictedWalkPolicy(WalkPolicy):
             rows[:, 1:] = window @ self._observation
             rows[:, :-1, -NUM_JOINTS:] += window[..., _COLUMNS["previous_action"]]
             history = rows.reshape(len(weight), -1)[:, -self._size :]
-            chain["0"] = {
-                **chain["0"],
-                "weight": jax.device_put(np.concatenate([history, rest], axis=1)),
-            }
+            folded = jax.device_put(np.concatenate([history, rest], axis=1))
+            chain["0"] = {**chain["0"], "weight": folded}
         return params

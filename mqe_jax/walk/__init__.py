@@ -1,3 +1,4 @@
-"""Training and evaluation of the walk policy: environment, rewards, PPO, scenarios, conversion of
-weights.
+"""Training and evaluation of skills that walk.
+
+Environment, rewards, settings of PPO, scenarios, conversion of weights.
 """

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP
-# half-lengths of the box in the trunk's frame on which shoves act, m
-SHOVED = np.array([0.25, 0.08, 0.06])
+SHOVED = np.array([0.25, 0.08, 0.06])  # half-lengths of the box of the trunk to shove, m
 _UP = np.array([0.0, 0.0, 1.0], np.float32)
 _NOISE = 7919  # folded into a state's key for the noise of its observations
 
@@ -67,18 +66,18 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         impl: str = "auto",
         num_envs: int = 4096,
     ) -> None:
-        self.task = task = task or WalkTask()
+        self.task = task or WalkTask()
         self.trainee = trainees.make(skill, robot)
         self.name = skill  # pyright: ignore[reportAttributeAccessIssue]
         self.skill = self.trainee.skill
-        lagged = dataclasses.replace(RANDOMIZATION, action_lag=task.action_lag)
+        lagged = dataclasses.replace(RANDOMIZATION, action_lag=self.task.action_lag)
         params = WalkParams(
             robot=robot.name,
             skill=skill,
-            episode_length=task.episode_length,
-            solver_iterations=task.solver_iterations,
-            randomization=lagged if task.randomize else Randomization(),
-            walk=task,
+            episode_length=self.task.episode_length,
+            solver_iterations=self.task.solver_iterations,
+            randomization=lagged if self.task.randomize else Randomization(),
+            walk=self.task,
         )
         super().__init__(params, impl=impl, control="position", num_envs=num_envs)
         self.skill.check_period(self.compiled.scene.timestep, self.physics.num_substeps)
@@ -94,8 +93,10 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1)
 
     def spawn(self, key: jax.Array) -> jax.Array:
-        """Samples the pose; fixed specs (evaluation) start along +x, so that the slope's direction
-        is the heading's.
+        """Samples the robot's pose.
+
+        In evaluations, which never resample commands, it starts along +x. The slope's direction
+        is then that of the heading.
         """
         yaw_key, height_key = jax.random.split(key)
         turn = jnp.pi if self.task.command_period > 0 else 0.0
@@ -151,16 +152,13 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return super().advance(dataclasses.replace(state, data=data, task=walk), action)
 
     def _shove(self, state: State[WalkState], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Returns force and torque of the shove in this step (6,), and the steps until it ends
-        ().
-        """
+        """Returns a step's force and torque of the shove (6,), and the steps until it ends ()."""
         walk = state.task
         if not self.task.shove:
             return walk.shove, walk.shove_steps
         when_key, angle_key, up_key, size_key, length_key, point_key = jax.random.split(key, 6)
-        begins = (walk.shove_steps == 0) & jax.random.bernoulli(
-            when_key, DT / self.task.shove_period
-        )
+        shoved = jax.random.bernoulli(when_key, DT / self.task.shove_period)
+        begins = (walk.shove_steps == 0) & shoved
         angle = jax.random.uniform(angle_key, (), maxval=2 * jnp.pi)
         up = jax.random.uniform(up_key, (), minval=-0.3, maxval=0.3)
         size = walk.spec.shove * jax.random.uniform(size_key, ())
@@ -176,16 +174,14 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return shove, jnp.maximum(steps - 1, 0)
 
     def external_forces(self, state: State[WalkState]) -> jax.Array:
-        """Returns the slope's change of gravity on all bodies, and force and shove on the trunk
-        (nbody, 6).
+        """Returns the external forces and torques on all bodies (nbody, 6).
+
+        The slope changes gravity on all bodies. Force and shove act on the trunk.
         """
         trunk = int(self.index.trunk_body[0])
         walk = state.task
-        mass = (
-            jnp.asarray(self.compiled.model.body_mass, jnp.float32)
-            .at[trunk]
-            .add(state.randomized.payload[0])
-        )
+        mass = jnp.asarray(self.compiled.model.body_mass, jnp.float32)
+        mass = mass.at[trunk].add(state.randomized.payload[0])
         turn = gravity_w(walk.slope) - jnp.array([0.0, 0.0, -GRAVITY])
         yaw = quaternion_to_euler(state.data.qpos[self.index.base_qpos[0, 3:]])[2]
         along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
@@ -196,25 +192,21 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
 
     def step_task(self, before: Moment[WalkState], after: Moment[WalkState]) -> WalkState:
         task = self.task
-        (_, mean_error) = self._errors(before, after)
+        walk = after.state.task
+        _, mean_error = self._errors(before, after)
         if not task.command_period:
-            return dataclasses.replace(after.state.task, mean_error=mean_error)
+            return dataclasses.replace(walk, mean_error=mean_error)
         renewed = after.state.step % round(task.command_period / DT) == 0
-        fresh = sample_spec(
-            jax.random.split(before.state.key, 6)[4], task, self.trainee, after.state.assistance
-        )
-        spec = jax.tree.map(
-            lambda new, old: jnp.where(renewed, new, old), fresh, after.state.task.spec
-        )
-        return dataclasses.replace(
-            after.state.task, spec=spec, mean_error=jnp.where(renewed, 0.0, mean_error)
-        )
+        key = jax.random.split(before.state.key, 6)[4]
+        fresh = sample_spec(key, task, self.trainee, after.state.assistance)
+        spec = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), fresh, walk.spec)
+        return dataclasses.replace(walk, spec=spec, mean_error=jnp.where(renewed, 0.0, mean_error))
 
     def _errors(
         self, before: Moment[WalkState], after: Moment[WalkState]
     ) -> tuple[jax.Array, jax.Array]:
         """Returns the velocity error of a step, and the mean error after it (3,)."""
-        (velocity, rate) = heading_velocity(after.robots)
+        velocity, rate = heading_velocity(after.robots)
         walk = before.state.task
         error = jnp.append(velocity, rate) - walk.spec.commands[:3]
         return error, walk.mean_error + 0.04 * (error - walk.mean_error)
@@ -222,8 +214,9 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
     def score(
         self, before: Moment[WalkState], after: Moment[WalkState], collision: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Returns (sum of positive terms) x exp(sum of negative ones), times the step, and what is
-        logged.
+        """Returns the reward, and what is logged.
+
+        The reward is (sum of positive terms) x exp(sum of the others) x the time of a step.
         """
         walk = before.state.task
         random = after.state.randomized
@@ -270,9 +263,8 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         if self.task.randomize:
             keys = jax.random.split(jax.random.fold_in(state.key, _NOISE), 3)
             parts = zip(sensed, (0.02, 0.005, 0.5), keys, strict=True)
-            sensed = Proprioception(
-                *(x + size * jax.random.normal(key, x.shape) for x, size, key in parts)
-            )
+            noisy = [x + size * jax.random.normal(key, x.shape) for x, size, key in parts]
+            sensed = Proprioception(*noisy)
         return {"skill": self._skill_observation(state.task, sensed)[None]}
 
     def _sense(self, state: State[WalkState], robot_state: RobotState) -> Proprioception:
@@ -301,12 +293,9 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return jnp.concatenate(list(self._privileged(state, robot_state).values()))
 
     def _privileged(self, state: State[WalkState], robot_state: RobotState) -> dict[str, jax.Array]:
-        """Returns the scaled blocks of the critic's observation; the last two are
-        `LATENT_TARGET`.
-        """
+        """Returns the scaled blocks of the critic's observation, `LATENT_TARGET` last."""
         walk = state.task
         random = state.randomized
-        task = self.task
         quaternion = robot_state.quaternion[0]
         height = robot_state.position_w[0, 2:]
         feet = rotate(
@@ -314,12 +303,11 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
             foot_positions(self.robot, robot_state.joint_position[0]),
         )
         phases = self.trainee.foot_phases(walk.gait, walk.spec.commands)
-        shove = (
-            {"shove": walk.shove * jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])}
-            if task.shove
-            else {}
-        )
-        lag = {"action_lag": random.action_lag[None].astype(jnp.float32)} if task.action_lag else {}
+        optional = {}
+        if self.task.shove:
+            optional["shove"] = walk.shove * jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
+        if self.task.action_lag:
+            optional["action_lag"] = random.action_lag[None].astype(jnp.float32)
         return {
             "skill": self._skill_observation(walk, self._sense(state, robot_state)),
             "linear_velocity": 2.0 * rotate_inverse(quaternion, robot_state.linear_velocity_w[0]),
@@ -331,8 +319,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
             "foot_force": jnp.tanh(self.foot_force(state.data) / 50.0),
             "mean_error": 2.0 * walk.mean_error,
             "force": walk.force / 20.0,
-            **shove,
-            **lag,
+            **optional,
             "slope": walk.slope * 4.0,
             "center_of_mass": random.center_of_mass[0] * 20.0,
             "motor_strength": (random.motor_strength - 1.0) * 5.0,
@@ -346,13 +333,12 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         return GRAVITY * float(self.compiled.model.body_mass.sum())
 
     def power(self, state: State[WalkState]) -> jax.Array:
-        """Returns the mechanical power of the joints (), W, each joint's as a magnitude."""
+        """Returns the mechanical power of the joints (), W: the sum of their magnitudes."""
         robot = self.robot
         robot_state = self.read(state.data)
         velocity = robot_state.joint_velocity[0]
-        torque = robot.kp * (
-            robot.joint_targets(state.task.actions[0]) - robot_state.joint_position[0]
-        )
+        error = robot.joint_targets(state.task.actions[0]) - robot_state.joint_position[0]
+        torque = robot.kp * error
         torque = jnp.clip(torque - robot.kd * velocity, -robot.torque_limit, robot.torque_limit)
         return jnp.sum(jnp.abs(torque * velocity))
 
@@ -362,8 +348,9 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
 
 
 def gravity_w(slope: jax.Array) -> jax.Array:
-    """Returns gravity (3,), m/s^2, in the frame of ground inclined by `slope` (2,), rad, along x
-    and y.
+    """Returns gravity (3,), m/s^2, in the frame of an inclined ground.
+
+    `slope` (2,), rad, is the ground's inclination along x and y.
     """
     angle = jnp.linalg.norm(slope + 1e-12)
     along = slope / jnp.maximum(angle, 1e-9)
@@ -371,8 +358,9 @@ def gravity_w(slope: jax.Array) -> jax.Array:
 
 
 def heading_velocity(robot_state: RobotState) -> tuple[jax.Array, jax.Array]:
-    """Returns the first robot's velocity along its heading and to its left (2,), m/s, and yaw rate
-    (), rad/s.
+    """Returns the first robot's velocity along its heading and to its left (2,), and its yaw rate.
+
+    In m/s and rad/s.
     """
     velocity = rotate_inverse(robot_state.quaternion[0], robot_state.linear_velocity_w[0])
     return velocity[:2], robot_state.angular_velocity_b[0, 2]

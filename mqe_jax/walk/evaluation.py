@@ -1,6 +1,4 @@
-"""Evaluation of a skill: tracking, falls, pushes, shoves, slopes, forces, standing, gait
-frequency.
-"""
+"""Evaluation of a skill: tracking, falls, disturbances, standing, gait frequency."""
 
 import dataclasses
 import functools
@@ -28,25 +26,33 @@ from mqe_jax.walk.env import WalkEnv, heading_velocity
 from mqe_jax.walk.task import EpisodeSpec, WalkTask
 
 WARM_UP = 1.0  # s at the start of an episode excluded from the errors
+_AXES = ("vx", "vy", "yaw")  # of an error
 
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
     """Settings of one evaluation scenario."""
 
-    duration: float = 20.0  # duration of an episode, s
+    duration: float = 20.0
+    """Duration of an episode, s."""
     velocity: tuple[float, float, float] | None = None
-    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples them uniformly from
-    `Trainee.evaluation_range`."""
-    period: float = 0.0  # interval at which commands are sampled anew, s; 0 keeps them
-    gait: str = "trot"  # name of the gait
-    frequency: float = 3.0  # commanded gait frequency, Hz
-    slope: float = 0.0  # inclination of the ground along x, rad
-    # sustained force along and to the left of the heading, N
+    """Commanded vx, vy, yaw rate, m/s and rad/s; None samples `Trainee.evaluation_range`."""
+    period: float = 0.0
+    """Interval at which commands are sampled again, s; 0 keeps them."""
+    gait: str = "trot"
+    """Name of the gait."""
+    frequency: float = 3.0
+    """Commanded gait frequency, Hz."""
+    slope: float = 0.0
+    """Inclination of the ground along x, rad."""
     force: tuple[float, float] = (0.0, 0.0)
-    push: float = 0.0  # instantaneous change of velocity every 5 s, m/s
-    shove: float = 0.0  # maximum force of shoves, N, of 0.2 to 1 s every 5 s on average
-    skills: tuple[str, ...] = ("walk", "agile")  # skills that it fits
+    """Sustained force along and to the left of the heading, N."""
+    push: float = 0.0
+    """Instantaneous change of velocity every 5 s, m/s."""
+    shove: float = 0.0
+    """Maximum force of shoves, N, of 0.2 to 1 s, every 5 s on average."""
+    skills: tuple[str, ...] = ("walk", "agile")
+    """Skills that the scenario fits."""
 
 
 SCENARIOS = {
@@ -72,9 +78,7 @@ SCENARIOS = {
 
 
 def make_env(skill: str, robot: Robot, impl: str, episodes: int) -> WalkEnv:
-    """Returns the evaluation environment: no randomisation; commands and disturbances are those of
-    a scenario.
-    """
+    """Returns the evaluation environment: without randomisation, disturbed as a scenario says."""
     task = WalkTask(
         randomize=False, command_period=0.0, push_period=5.0, episode_length=1e6, shove=1.0
     )
@@ -84,16 +88,17 @@ def make_env(skill: str, robot: Robot, impl: str, episodes: int) -> WalkEnv:
 def sample_velocities(
     trainee: trainees.Trainee, scenario: Scenario, key: jax.Array, episodes: int
 ) -> jax.Array:
-    """Samples commanded velocities (episodes, 3); those beyond the skill's `turn` again."""
+    """Samples commanded velocities (episodes, 3), again if they are beyond the skill's `turn`."""
     if scenario.velocity is not None:
         return jnp.broadcast_to(jnp.asarray(scenario.velocity), (episodes, 3))
     low, high = jnp.asarray(trainee.evaluation_range, jnp.float32).T
-    turn = trainee.skill.turn or math.inf
     velocity = jax.random.uniform(key, (episodes, 3), minval=low, maxval=high)
-    for _ in range(20 if math.isfinite(turn) else 0):
+    if not trainee.skill.turn:
+        return velocity
+    for _ in range(20):
         key, again = jax.random.split(key)
         other = jax.random.uniform(again, (episodes, 3), minval=low, maxval=high)
-        beyond = jnp.abs(velocity[:, 0] * velocity[:, 2]) > turn
+        beyond = jnp.abs(velocity[:, 0] * velocity[:, 2]) > trainee.skill.turn
         velocity = jnp.where(beyond[:, None], other, velocity)
     return velocity
 
@@ -101,9 +106,7 @@ def sample_velocities(
 def sample_specs(
     env: WalkEnv, scenario: Scenario, key: jax.Array, episodes: int
 ) -> tuple[EpisodeSpec, jax.Array]:
-    """Samples the specs of all episodes, leading axis N, and the commands after each change (K, N,
-    15).
-    """
+    """Samples the specs of N episodes, and the commands after each of K changes (K, N, 15)."""
     count = math.ceil(scenario.duration / scenario.period) if scenario.period else 1
     keys = [key, *jax.random.split(key, count)[1:]]
     velocities = jnp.stack(
@@ -117,7 +120,7 @@ def sample_specs(
             [velocities, jnp.broadcast_to(rest, (count, episodes, len(rest)))], axis=-1
         )
 
-    def full(values):
+    def full(values: float | tuple[float, float]) -> jax.Array:
         return jnp.broadcast_to(jnp.asarray(values, jnp.float32), (episodes, *np.shape(values)))
 
     spec = EpisodeSpec(
@@ -161,30 +164,25 @@ def measure(
     counted = alive.copy()
     counted[np.arange(steps) % change < warm] = False
 
-    def mean(x):
+    def mean(x: np.ndarray) -> float:
         return float((x * counted).sum(dtype=float) / max(counted.sum(), 1))
 
-    axes = dict(zip(("vx", "vy", "yaw"), np.moveaxis(errors, -1, 0), strict=True))
     upright = alive[-1]
-    figures = {
-        **{f"rms_{name}": mean(np.square(error)) ** 0.5 for name, error in axes.items()},
-        **{f"bias_{name}": mean(error) for name, error in axes.items()},
-        **{
-            f"cycle_{name}": value
-            for name, value in _cycles(errors, alive, np.asarray(commands), change).items()
-        },
-        "fall_rate": float(1.0 - upright.mean()),
-    }
-    pace = (
-        np.linalg.norm(np.diff(position, axis=0, prepend=position[:1]), axis=-1) / walk_policy.STEP
-    )
+    figures = {}
+    cycles = _cycles(errors, alive, np.asarray(commands), change)
+    for axis, name in enumerate(_AXES):
+        error = errors[..., axis]
+        figures[f"rms_{name}"] = mean(np.square(error)) ** 0.5
+        figures[f"bias_{name}"] = mean(error)
+        figures[f"cycle_{name}"] = cycles[axis]
+    figures["fall_rate"] = float(1.0 - upright.mean())
+    moved = np.diff(position, axis=0, prepend=position[:1])
+    pace = np.linalg.norm(moved, axis=-1) / walk_policy.STEP
     if mean(pace) > 0.05:
         figures["cost_of_transport"] = mean(power) / (env.weight * mean(pace))
     if upright.any():
-        travelled = np.linalg.norm(
-            position[min(steps, warm + 500) - 1] - position[warm - 1], axis=-1
-        )[upright]
-        figures["drift"] = float(travelled.mean())
+        travelled = position[min(steps, warm + 500) - 1] - position[warm - 1]
+        figures["drift"] = float(np.linalg.norm(travelled, axis=-1)[upright].mean())
         if isinstance(env.trainee, trainees.Walk):
             figures["step_frequency"] = _frequency(height[warm:][:, upright])
     return figures
@@ -199,32 +197,26 @@ def _run(
     commands: jax.Array,
     numbers: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    """Returns what `measure` needs of each step; `numbers` are those of the commands in each
-    step.
-    """
+    """Returns what `measure` needs of each step; `numbers` are those of each step's commands."""
     width = len(env.skill.commands)
 
     def one(state: Any, memory: Any, commands: jax.Array) -> Any:
         spec = dataclasses.replace(state.task.spec, commands=commands)
         state = dataclasses.replace(state, task=dataclasses.replace(state.task, spec=spec))
-        robot_state = env.read(state.data)
-        sensed = Proprioception(
-            state.obs[0, :3], robot_state.joint_position[0], robot_state.joint_velocity[0]
-        )
+        now = env.read(state.data)
+        sensed = Proprioception(state.obs[0, :3], now.joint_position[0], now.joint_velocity[0])
         _, memory = env.skill.targets(params, memory, commands[:width], sensed)
         state = env.with_observations(env.advance(state, memory.action[None]))
-        robot_state = env.read(state.data)
-        quaternion = robot_state.quaternion[0]
-        feet = foot_positions(env.robot, robot_state.joint_position[0])
-        height = (
-            rotate(jnp.broadcast_to(quaternion, (4, 4)), feet)[:, 2] + robot_state.position_w[0, 2]
-        )
-        velocity, yaw_rate = heading_velocity(robot_state)
+        after = env.read(state.data)
+        turn = jnp.broadcast_to(after.quaternion[0], (4, 4))
+        feet = rotate(turn, foot_positions(env.robot, after.joint_position[0]))
+        height = feet[:, 2] + after.position_w[0, 2]
+        velocity, yaw_rate = heading_velocity(after)
         errors = jnp.append(velocity[:2], yaw_rate) - commands[:3]
         return (
             state,
             memory,
-            (errors, robot_state.position_w[0, :2], height, state.terminated, env.power(state)),
+            (errors, after.position_w[0, :2], height, state.terminated, env.power(state)),
         )
 
     def advance(carry: Any, number: jax.Array) -> Any:
@@ -232,17 +224,18 @@ def _run(
         state, memory, record = jax.vmap(one)(state, memory, commands[number])
         return (state, memory), record
 
-    state = jax.vmap(lambda key, spec: env.with_observations(env.with_spec(env.begin(key), spec)))(
-        keys, specs
-    )
+    def first(key: jax.Array, spec: EpisodeSpec) -> Any:
+        return env.with_observations(env.with_spec(env.begin(key), spec))
+
+    state = jax.vmap(first)(keys, specs)
     memory = jax.vmap(lambda _: env.skill.init_memory())(keys)
     return jax.lax.scan(advance, (state, memory), numbers)[1]
 
 
 def _cycles(
     errors: np.ndarray, alive: np.ndarray, commands: np.ndarray, change: int
-) -> dict[str, float]:
-    """Returns the root mean squares of the errors (T, N, 3) averaged over a gait cycle.
+) -> list[float]:
+    """Returns the root mean squares (3,) of the errors (T, N, 3) averaged over a gait cycle.
 
     Cycles begin at least `WARM_UP` after a change of the commands (K, N, 15), which is every
     `change` steps, and end before the next one and before a fall.
@@ -260,7 +253,7 @@ def _cycles(
     whole &= alive[last, columns]
     means = (sums[last + 1, columns] - sums[:-1]) / length[..., None]
     rms = np.sqrt((np.square(means) * whole[..., None]).sum((0, 1)) / max(whole.sum(), 1))
-    return dict(zip(("vx", "vy", "yaw"), map(float, rms), strict=True))
+    return rms.tolist()
 
 
 def _frequency(height: np.ndarray) -> float:
@@ -287,7 +280,7 @@ def evaluate_skill(
     scenarios: Sequence[str] | None = None,
     report: Callable[[str, dict[str, float]], None] | None = None,
 ) -> dict[str, Any]:
-    """Evaluates a skill: command tracking, disturbances, falls, energy; as `mqe skill eval`.
+    """Evaluates a skill: command tracking, disturbances, falls, energy, as `mqe skill eval`.
 
     Example:
         ```python
@@ -320,13 +313,13 @@ def evaluate_skill(
         results[name] = measure(env, params, SCENARIOS[name], episodes, seed)
         if report is not None:
             report(name, results[name])
-    top = results.get("flat", {})
+    flat = results.get("flat", {})
     keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
     return {
         "skill": skill,
         "robot": body.name,
         "impl": env.impl,
         "episodes": episodes,
-        **{key: top[key] for key in keys if key in top},
+        **{key: flat[key] for key in keys if key in flat},
         "scenarios": results,
     }

@@ -1,12 +1,12 @@
-"""The walking skills as networks of the trainer: a history of observations, and a critic of the
-privileged one.
+"""The walking skills as networks of the trainer, with a critic of the privileged observation.
 
-The memory is the newest rows of the history but the last one. The trainer stores it at the first
-step of each chunk only, and `evaluate` builds the histories of the chunk's steps.
+A skill sees a history of observations. The memory is the newest rows of it, without the last one.
+The trainer stores the memory at the first step of each chunk only, and `evaluate` builds the
+histories of the chunk's steps.
 
-The walk policy's history is 30 observations; its body receives the adaptation network's output
-without gradient, and that network is trained by regression on `LATENT_TARGET`. The agile skill's is
-9 frames, of which its network sees five, beside the newest commands and clock.
+The walk policy's history is 30 observations. Its body receives the adaptation network's output
+without gradient. Regression on `LATENT_TARGET` trains the adaptation network. The agile skill's
+history is 9 frames. Its network sees five of them, the newest commands and the clock.
 
 The left-right symmetry of a quadruped is a loss: a mirrored observation deserves the mirrored
 action. Mirroring exchanges left and right legs and reverses y, roll, yaw and the hip joints. The
@@ -64,15 +64,16 @@ _COMMANDS = _signs(*(command.mirror for command in walk_policy.COMMANDS))
 class Form:
     """What is specific to the network of a skill."""
 
-    networks: Networks  # its networks and their files
-    # rows of the history that it sees, from the oldest on; the last one is the newest
+    networks: Networks
+    """The skill's networks and their files."""
     rows: np.ndarray
-    # numbers of an observation that a row has; the others are only of the newest observation
+    """Rows of the history that the network sees, from the oldest to the newest."""
     row_size: int
+    """Numbers of an observation in a row; only the newest observation has the others too."""
     infer: Callable[..., tuple[jax.Array, Any]]
-    """From weights and inputs (..., n) to actions (..., 12), and the latents if it has an
-    adaptation network."""
-    mirror: Mirror  # of an input
+    """From weights and inputs (..., n) to actions (..., 12), and latents or None."""
+    mirror: Mirror
+    """Mirror of an input."""
 
     @property
     def past(self) -> int:
@@ -80,37 +81,40 @@ class Form:
         return int(self.rows[-1])
 
     def inputs(self, history: jax.Array, obs: jax.Array) -> jax.Array:
-        """Returns inputs (..., n) of rows (..., H, row_size) that the network sees and observations
-        (..., O).
+        """Returns the network's inputs (..., n).
+
+        `history` are the rows that it sees (..., H, row_size), `obs` the observations (..., O).
         """
         flat = history.reshape(*history.shape[:-2], -1)
-        return (
-            flat
-            if self.row_size == obs.shape[-1]
-            else jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
-        )
+        if self.row_size == obs.shape[-1]:
+            return flat
+        return jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
 
     def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
-        """Returns the mean square difference () of actions of mirrored inputs (B, n) from mirrored
-        actions (B, 12).
+        """Returns the mean square error () of mirrored inputs' actions against mirrored actions.
+
+        `inputs` are (B, n), the actions `mean` (B, 12).
         """
         other, _ = self.infer(params, self.mirror.reflect(inputs), precision=_PRECISION)
         return jnp.mean(jnp.square(other - MIRROR.reflect(mean)))
 
 
 WALK_FORM = Form(
-    walk_policy.NETWORKS,
-    np.arange(HISTORY),
-    OBSERVATION_SIZE,
-    walk_policy.infer,
-    _join(*[_join(_GRAVITY, _COMMANDS, MIRROR, MIRROR, MIRROR, MIRROR, _FEET)] * HISTORY),
+    networks=walk_policy.NETWORKS,
+    rows=np.arange(HISTORY),
+    row_size=OBSERVATION_SIZE,
+    infer=walk_policy.infer,
+    mirror=_join(*[_join(_GRAVITY, _COMMANDS, MIRROR, MIRROR, MIRROR, MIRROR, _FEET)] * HISTORY),
 )
 AGILE_FORM = Form(
-    agile.NETWORKS,
-    agile.LENGTH - 1 - np.array(agile.OFFSETS),
-    agile.FRAME_SIZE,
-    lambda params, inputs, precision: (agile.infer(params, inputs, precision=precision), None),
-    _join(
+    networks=agile.NETWORKS,
+    rows=agile.LENGTH - 1 - np.array(agile.OFFSETS),
+    row_size=agile.FRAME_SIZE,
+    infer=lambda params, inputs, precision: (
+        agile.infer(params, inputs, precision=precision),
+        None,
+    ),
+    mirror=_join(
         *[_join(_GRAVITY, MIRROR, MIRROR, MIRROR)] * len(agile.OFFSETS),
         _signs(*(command.mirror for command in agile.COMMANDS)),
         _signs(-1.0, -1.0),  # the clock: the other pair of feet
@@ -162,11 +166,10 @@ class AgileNetwork(HistorySettings):
 
 
 def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.ndarray) -> jax.Array:
-    """Returns H rows of the histories of a chunk's steps (L, C, H, O); rows before an episode's
-    start are zero.
+    """Returns H rows of the histories of a chunk's steps (L, C, H, O).
 
-    `memory` are the rows before the chunk (C, T, O), `obs` its rows (L, C, O), `kept` the rows to
-    return, of T + 1.
+    Rows before an episode's start are zero. `memory` are the rows before the chunk (C, T, O), `obs`
+    its rows (L, C, O), `kept` the rows to return, of T + 1.
     """
     steps, count = is_first.shape
     before = jnp.moveaxis(memory, 1, 0)
@@ -203,11 +206,9 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         inputs = form.inputs(history[..., form.rows, :], obs[..., 0, :])
         mean, _ = form.infer(params["policy"], inputs, precision=_PRECISION)
         log_std = settings.bounded_log_std(params["log_std"])
-        action = (
-            mean
-            if key is None
-            else mean + jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
-        )
+        action = mean
+        if key is not None:
+            action += jnp.exp(log_std) * devices.normal(key, mean.shape, mean.dtype)
         return (
             action[..., None, :],
             log_prob(action, mean, log_std)[..., None, :],
@@ -234,9 +235,8 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         active: Mask = None,
     ) -> ChunkResult:
         obs = obs[..., 0, :]
-        inputs = form.inputs(
-            windows(memory.actor, is_first, obs[..., : form.row_size], form.rows), obs
-        )
+        history = windows(memory.actor, is_first, obs[..., : form.row_size], form.rows)
+        inputs = form.inputs(history, obs)
         mean, latent = form.infer(params["policy"], inputs, precision=_PRECISION)
         log_std = jnp.broadcast_to(settings.bounded_log_std(params["log_std"]), mean.shape)
         losses = {}
@@ -244,9 +244,8 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
             error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
             losses["adaptation"] = settings.adaptation_coef * error
         if settings.symmetry_coef > 0:
-            losses["symmetry"] = settings.symmetry_coef * form.symmetry_loss(
-                params["policy"], inputs, mean
-            )
+            asymmetry = form.symmetry_loss(params["policy"], inputs, mean)
+            losses["symmetry"] = settings.symmetry_coef * asymmetry
         return ChunkResult(
             log_prob(action, mean[..., None, :], log_std[..., None, :]),
             entropy(log_std)[..., None],

@@ -1,6 +1,4 @@
-"""Reward terms of skills that walk, after walk-these-ways (Margolis and Agrawal, arXiv
-2212.03238).
-"""
+"""Reward terms of skills that walk, after walk-these-ways (arXiv 2212.03238)."""
 
 import functools
 
@@ -20,8 +18,7 @@ from mqe_jax.physics.rotation import (
 
 @settings_class
 class WalkRewards:
-    """Weights of the reward terms; the first four are positive terms, the others go into the
-    exponent.
+    """Weights of the reward terms: four positive terms, then those that go into the exponent.
 
     `limb_contact` counts legs whose thigh or calf touches the ground. On flat ground the knee
     touches first, so contact is inferred from the knee's height (`WalkSettings.min_knee_height`)
@@ -54,19 +51,21 @@ _BLUR = 0.07  # of a gait period: standard deviation of the smoothing of desired
 
 
 def desired_contact(phases: jax.Array) -> jax.Array:
-    """Returns the desired contact of each foot in [0, 1] from its phase (4,), smoothed at lift-off
-    and touch-down.
+    """Returns the desired contact of each foot in [0, 1] from its phase (4,).
+
+    Lift-off and touch-down are smoothed.
     """
 
-    def cdf(x):
+    def cdf(x: jax.Array) -> jax.Array:
         return jax.scipy.stats.norm.cdf(x, scale=_BLUR)
 
     return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
 
 
 def _closeness(error: jax.Array, half: float) -> jax.Array:
-    """Returns 1 at no error and 1/2 at an error (D,) of length `half`: steep near 0, with a
-    gradient far from it.
+    """Returns 1 at no error and 1/2 at an error (D,) of length `half`.
+
+    It is steep near 0 and has a gradient far from it.
     """
     return 1.0 / (1.0 + jnp.sum(jnp.square(error / half)))
 
@@ -135,8 +134,9 @@ def reward_terms(
     beyond = jnp.maximum(joint_position - robot.joint_upper + margin, 0)
     beyond += jnp.maximum(robot.joint_lower + margin - joint_position, 0)
     knees = rotate(turn, knee_positions(robot, joint_position))[:, 2] + height
-    on_ground = foot_force > 1.0
+    kneeling = jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
+    foot_speed_xy = jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1)
     return {
         "track_velocity": jnp.exp(-jnp.sum(jnp.square(error[:2] / (0.5 * tolerance)))),
         "track_mean_velocity": _closeness(mean_error[:2], 0.055 * tolerance),
@@ -148,17 +148,13 @@ def reward_terms(
         "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
         "raibert": jnp.sum(jnp.square(feet_heading - place)),
         "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
-        "foot_slip": jnp.sum(
-            jnp.where(on_ground, jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1), 0.0)
-        ),
+        "foot_slip": jnp.sum(jnp.where(foot_force > 1.0, foot_speed_xy, 0.0)),
         "smoothness": jnp.sum(jnp.square(target - previous_target)),
         "second_smoothness": jnp.sum(jnp.square(target - 2 * previous_target + earlier_target)),
         "torque": jnp.sum(jnp.square(torque)),
         "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
-        "limb_contact": jnp.sum(jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0).astype(
-            jnp.float32
-        ),
+        "limb_contact": jnp.sum(kneeling).astype(jnp.float32),
         "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
         "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
     }

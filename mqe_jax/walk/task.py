@@ -78,22 +78,20 @@ class EpisodeSpec:
     """Commands and disturbances sampled for one episode."""
 
     commands: jax.Array
-    """Commands of the walk policy (15,); those after the velocity describe the gait that the
-    rewards ask for."""
+    """Commands of the walk policy (15,): the velocity, then the gait that the rewards ask for."""
     slope: jax.Array
-    """Inclination of the ground along x and y (2,), rad; positive in x where the ground rises
-    towards +x."""
-    # sustained force on the trunk (2,), N, along its heading and to its left, horizontal
+    """Inclination of the ground along x and y (2,), rad; positive x rises towards +x."""
     force: jax.Array
-    push: jax.Array  # instantaneous change of the trunk's velocity at each push (), m/s
-    shove: jax.Array  # maximum force of a shove (), N
+    """Sustained horizontal force on the trunk along its heading and to its left (2,), N."""
+    push: jax.Array
+    """Instantaneous change of the trunk's velocity at each push (), m/s."""
+    shove: jax.Array
+    """Maximum force of a shove (), N."""
 
 
 @settings_class
 class WalkParams(TaskParams):
-    """Parameters of the walking environment: a `WalkTask`, and what the environment core needs to
-    know of it.
-    """
+    """Parameters of the walking environment: a `WalkTask` and what the base class needs of it."""
 
     num_agents: Few = 1
     spawn_noise: Distance = 0.0
@@ -116,35 +114,40 @@ class WalkParams(TaskParams):
 class WalkState:
     """The task's own state. Slopes, forces, pushes and shoves are scaled by 1 - `assistance`."""
 
-    spec: EpisodeSpec  # commands and disturbances
-    slope: jax.Array  # current slope, rate-limited towards the spec's (2,), rad
-    force: jax.Array  # current force, rate-limited towards the spec's (2,), N
-    # force (3,), N, and torque (3,), N m, of the current shove on the trunk, world frame (6,)
+    spec: EpisodeSpec
+    """Commands and disturbances."""
+    slope: jax.Array
+    """Current slope (2,), rad; its rate towards the spec's is limited."""
+    force: jax.Array
+    """Current force (2,), N; its rate towards the spec's is limited."""
     shove: jax.Array
-    shove_steps: jax.Array  # steps until the current shove ends () int32
-    actions: jax.Array  # the last three actions, newest first (3, 12)
-    gait: jax.Array  # phase of the gait cycle () in [0, 1)
-    # exponential mean of the velocity error (vx, vy, yaw rate) (3,), m/s and rad/s
+    """Force, N, and torque, N m, of the current shove on the trunk, world frame (6,)."""
+    shove_steps: jax.Array
+    """Steps until the current shove ends () int32."""
+    actions: jax.Array
+    """The last three actions, newest first (3, 12)."""
+    gait: jax.Array
+    """Phase of the gait cycle () in [0, 1)."""
     mean_error: jax.Array
+    """Exponential mean of the error of vx, vy and yaw rate (3,), m/s and rad/s."""
 
 
 def sample_spec(
     key: jax.Array, task: WalkTask, trainee: Trainee, assistance: jax.Array | float
 ) -> EpisodeSpec:
-    """Samples commands and disturbances."""
+    """Samples an episode's commands and disturbances."""
     keys = iter(jax.random.split(key, 24))
 
-    def uniform(low, high):
+    def uniform(low: float, high: float) -> jax.Array:
         return jax.random.uniform(next(keys), (), minval=low, maxval=high)
 
-    def chance(p):
+    def chance(p: float) -> jax.Array:
         return jax.random.bernoulli(next(keys), p)
 
     difficulty = 1.0 - assistance
     share = task.start + (1.0 - task.start) * difficulty
-    velocity = share * jnp.stack(
-        [uniform(*bounds) for bounds in trainee.skill.trained_ranges(VELOCITY)]
-    )
+    ranges = trainee.skill.trained_ranges(VELOCITY)
+    velocity = share * jnp.stack([uniform(low, high) for low, high in ranges])
     velocity = jnp.where(chance(0.25), velocity * jnp.array([1.0, 0.0, 0.0]), velocity)
     velocity = jnp.where(chance(0.1), jnp.zeros(3), velocity)
     if trainee.skill.turn is not None:

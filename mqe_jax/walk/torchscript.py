@@ -1,10 +1,10 @@
-"""Official TorchScript checkpoints of walk-these-ways, read without torch and without executing
-code from them.
+"""Official TorchScript checkpoints of walk-these-ways, read without torch.
 
-The archive is a zip file: `<name>/data.pkl` pickles the module tree, whose tensors refer to raw
-storages in `<name>/data/<key>`, and `<name>/code` holds the source of its classes. The unpickler
-below supports only tensors and containers; every module class becomes a plain object that keeps its
-attributes.
+No code from a checkpoint is executed. The archive is a zip file: `<name>/data.pkl` pickles the
+module tree, whose tensors refer to raw storages in `<name>/data/<key>`, and `<name>/code` holds the
+source of its classes. The unpickler supports only tensors and containers. Every module class
+becomes a plain object that keeps its attributes.
+
 """
 
 import io
@@ -85,17 +85,10 @@ class _Unpickler(_PurePython):
         stride: tuple[int, ...],
         *_: Any,
     ) -> np.ndarray:
-        last = (
-            offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True))
-            if all(size)
-            else offset
-        )
-        if (
-            offset < 0
-            or any(s < 0 for s in stride)
-            or any(n < 0 for n in size)
-            or last >= len(storage)
-        ):
+        last = offset
+        if all(size):
+            last += sum((n - 1) * s for n, s in zip(size, stride, strict=True))
+        if min(offset, *size, *stride) < 0 or last >= len(storage):
             raise ValueError("a tensor reaches beyond its storage")
         self._left -= 4 * math.prod(size)
         if self._left < 0:
@@ -111,20 +104,14 @@ class _Unpickler(_PurePython):
 
 @check_arguments(path=PathText)
 def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Returns the tensors of a scripted or traced `Sequential` by dotted name, float32, such as
-    0.weight.
+    """Returns the float32 tensors of a scripted or traced `Sequential` by names such as 0.weight.
 
-    InputError for another file, beyond the limits, or with anything but linear layers with an ELU
+    InputError for another file or one beyond the limits. The layers must be linear, with an ELU
     between each two.
     """
-    with archive(
-        Path(path), limits.WEIGHTS_BYTES, "a TorchScript Sequential of Linear and ELU layers"
-    ) as opened:
-        names = [
-            name
-            for name in opened.namelist()
-            if name.endswith("/data.pkl") and name.count("/") == 1
-        ]
+    kind = "a TorchScript Sequential of Linear and ELU layers"
+    with archive(Path(path), limits.WEIGHTS_BYTES, kind) as opened:
+        names = [name for name in opened.namelist() if re.fullmatch(r"[^/]*/data\.pkl", name)]
         if len(names) != 1:
             raise ValueError("no data.pkl in it")
         root = _Unpickler(opened.read(names[0]), opened, names[0].split("/")[0]).load()
@@ -133,10 +120,11 @@ def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         for index, (name, child) in enumerate(children.items()):
             if name != str(index):
                 raise ValueError(f"{name} is not expected")
-            parts = _parts(name, child, "activation.ELU" if index % 2 else "linear.Linear")
-            alphas = _NUMBER.findall(opened.read(child.source).decode()) if index % 2 else []
-            if wrong := [alpha for alpha in alphas if float(alpha) != 1]:
-                raise ValueError(f"{name} is an ELU with alpha {wrong[0]}, not 1")
+            if index % 2:
+                parts = _parts(name, child, "activation.ELU")
+                _check_alpha(name, opened.read(child.source).decode())
+            else:
+                parts = _parts(name, child, "linear.Linear")
             for part, value in parts.items():
                 if part not in ("weight", "bias") or not isinstance(value, np.ndarray):
                     raise ValueError(f"{name}.{part} is not expected")
@@ -146,18 +134,22 @@ def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         return state
 
 
+def _check_alpha(name: str, source: str) -> None:
+    for alpha in _NUMBER.findall(source):
+        if float(alpha) != 1:
+            raise ValueError(f"{name} is an ELU with alpha {alpha}, not 1")
+
+
 def _parts(name: str, module: Any, kind: str) -> dict[str, Any]:
-    """Returns the attributes of a module of `torch.nn.modules`, such as linear.Linear, without
-    torch's own.
+    """Returns the attributes of a module of `torch.nn.modules`, without torch's own.
+
+    `kind` names its class, such as linear.Linear.
     """
     found = getattr(module, "kind", type(module).__name__)
     if found != f"torch.nn.modules.{kind}":
         raise ValueError(f"{name} is a {found}, not a torch.nn.modules.{kind}")
-    return {
-        key: value
-        for key, value in vars(module).items()
-        if key not in ("training", "_is_full_backward_hook")
-    }
+    own = ("training", "_is_full_backward_hook")
+    return {key: value for key, value in vars(module).items() if key not in own}
 
 
 def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:

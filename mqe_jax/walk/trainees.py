@@ -1,6 +1,4 @@
-"""The skills that the walking task trains: their observations, their gaits, and the goals of their
-rewards.
-"""
+"""The skills that the walking task trains: observations, gaits, and goals of the rewards."""
 
 import abc
 from collections.abc import Callable
@@ -23,29 +21,28 @@ Chance = Callable[[float], jax.Array]
 
 
 class Trainee(abc.ABC):
-    """A skill as the walking environment trains it, by commands of the walk policy (15,): velocity
-    and gait.
-    """
+    """A skill as the walking environment trains it, by the commands of the walk policy (15,)."""
 
     skill: Skill
     observation_size: int
-    """Length of the skill's own observation of one step, from which its network gathers its
-    history."""
+    """Length of the skill's own observation of one step; its network gathers a history of them."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
 
     @property
     def evaluation_range(self) -> np.ndarray:
-        """Lowest and highest velocity command in evaluations (3, 2), m/s and rad/s: those of the
-        training.
+        """Lowest and highest velocity commands in evaluations (3, 2), m/s and rad/s.
+
+        Default: those of the training.
         """
         return self.skill.trained_ranges(VELOCITY)
 
     @abc.abstractmethod
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
-        """Returns commands (15,) with a velocity (3,); `uniform(low, high)` and `chance(p)` draw
-        random numbers.
+        """Samples commands (15,) with a velocity (3,).
+
+        `uniform(low, high)` and `chance(p)` draw random numbers.
         """
 
     @abc.abstractmethod
@@ -77,7 +74,7 @@ class Walk(Trainee):
         gait = jnp.asarray(gaits)[jnp.sum(uniform(0.0, 1.0) >= jnp.array(odds))]
         varied = chance(0.5)
 
-        def vary(low, high, default):
+        def vary(low: float, high: float, default: float) -> jax.Array:
             return jnp.where(varied, uniform(low, high), default)
 
         default = self.skill.default_commands()
@@ -133,7 +130,10 @@ TRAINEES: dict[str, type[Trainee]] = {"walk": Walk, "agile": Agile}
 
 
 def make(name: str, robot: Robot) -> Trainee:
-    """Returns a skill of a robot to train; InputError for the name of another one."""
+    """Returns a skill of a robot to train.
+
+    InputError for a name that is not in `TRAINEES`.
+    """
     if name not in TRAINEES:
         raise InputError(
             f"skill: {name!r} cannot be trained{nearest(name, TRAINEES)}; allowed: "

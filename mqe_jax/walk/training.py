@@ -1,5 +1,6 @@
-"""Training of skills by `mqe_jax.train`; settings as in walk-these-ways (arXiv 2212.03238) where
-known.
+"""Training of skills by `mqe_jax.train`.
+
+Settings are those of walk-these-ways (arXiv 2212.03238) where known.
 """
 
 from pathlib import Path
@@ -45,8 +46,10 @@ WALK = TrainConfig(
     checkpoint=Checkpointing(every=100, environments=False),
     loggers=(),
 )
-"""Settings for training walk weights from scratch; the assistance is the curriculum of slopes,
-forces and pushes."""
+"""Settings for training walk weights from scratch.
+
+The assistance is the curriculum of slopes, forces and pushes.
+"""
 
 AGILE = override(
     WALK,
@@ -58,14 +61,18 @@ AGILE = override(
         "curriculum.assistance_until": 0.5,
     },
 )
-"""Settings for training the agile skill from scratch; the assistance is the curriculum of commands
-and disturbances."""
+"""Settings for training the agile skill from scratch.
+
+The assistance is the curriculum of commands and disturbances.
+"""
 
 AGILE_TASK = WalkTask(
     start=0.5, tolerance=2.0, command_period=4.0, slope=0.15, shove=100.0, action_lag=1
 )
-"""The walking task of the agile skill: fast commands, shoves as in contact with robots and boxes,
-gentle slopes."""
+"""The walking task of the agile skill: fast commands, gentle slopes.
+
+Its shoves are as those of robots and boxes.
+"""
 
 SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {
     "walk": (WALK, WalkTask()),
@@ -88,7 +95,7 @@ def train_skill(
     impl: str = "auto",
     resume: bool = False,
 ) -> TrainState:
-    """Trains a skill's weights, as `mqe skill train`; returns the learner's last state.
+    """Trains a skill's weights, as `mqe skill train`, and returns the learner's last state.
 
     Example:
         ```python
@@ -97,7 +104,7 @@ def train_skill(
 
     Args:
         skill: one of `SETTINGS`.
-        run_dir: run folder, of which SKILL.safetensors (float16) is written at every checkpoint.
+        run_dir: run folder; every checkpoint writes SKILL.safetensors (float16) into it.
         config: settings. Default: those of `SETTINGS`.
         task: parameters of the walking task. Default: those of `SETTINGS`.
         robot: name of the robot.
@@ -112,26 +119,25 @@ def train_skill(
     """
     if skill not in SETTINGS:
         fail("skill", skill, " or ".join(SETTINGS))
+    default_config, default_task = SETTINGS[skill]
     body = robots.get(robot)
     run_dir = Path(run_dir)
-    config = config or SETTINGS[skill][0]
+    config = config or default_config
     if config.opponents:
         fail("opponents", list(config.opponents), "empty: walking is not a match")
     network = config.network
     if not isinstance(network, HistorySettings):
-        fail("network.name", network.name, SETTINGS[skill][0].network.name)
+        fail("network.name", network.name, default_config.network.name)
     if weights is not None:
         network.form.networks.load(body, weights)
         config = override(config, {"network.weights": str(Path(weights).resolve())})
-    env = WalkEnv(
-        body, task or SETTINGS[skill][1], skill=skill, impl=impl, num_envs=config.num_envs
-    )
+    env = WalkEnv(body, task or default_task, skill=skill, impl=impl, num_envs=config.num_envs)
     config = override(config, {"env": {"control": env.control, **to_mapping(env.params)}})
 
     def save(state: TrainState, row: dict[str, float]) -> None:
-        updates = int(row["updates"])
         if jax.process_index() > 0:
             return
+        updates = int(row["updates"])
         if updates % config.checkpoint.every == 0 or updates == config.num_updates:
             about = {"robot": body.name, "env_steps": int(row["env_steps"])}
             file = run_dir / f"{skill}.safetensors"
