@@ -36,9 +36,8 @@ def flock(
     velocity = slow_down(velocity, half)
     velocity += 2 * restlessness * jax.random.normal(key, position.shape)
     if len(position) > 1:
-        inward = (
-            jnp.mean(position, axis=0, where=None if there is None else there[:, None]) - position
-        )
+        taking_part = None if there is None else there[:, None]
+        inward = jnp.mean(position, axis=0, where=taking_part) - position
         velocity += restlessness / 1.5 * inward / jnp.maximum(_length(inward), 1e-6)
     away = position[:, None] - robots[None]
     nearness = jnp.maximum(_length(jnp.square(away)), 1e-3)
@@ -54,14 +53,14 @@ def slow_down(velocity: jax.Array, loss: float) -> jax.Array:
 
 
 def defend(position: jax.Array, yaw: jax.Array, ball: jax.Array, goal: jax.Array) -> jax.Array:
-    """Returns the walk commands vx, vy, yaw rate (3,), m/s and rad/s, of a robot that stays between
-    ball and goal.
+    """Returns the walk commands (3,) of a robot that stays between ball and goal.
 
-    p is the robot's position, g the goal, t = 0.6 ball + 0.4 g. wrap() maps an angle to [-pi, pi].
+    They are vx and vy, m/s, and the yaw rate, rad/s. p is the robot's position, g the goal,
+    t = 0.6 ball + 0.4 g. wrap() maps an angle to [-pi, pi].
 
-        yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3      (faces away from its
-        goal) vx       = clip(|t - g| - |p - g|, -0.5, 0.5)                       (as far from the
-        goal as t) vy       = -clip(distance of p to the left of the line g -> t, -0.5, 0.5)
+        yaw rate = clip(wrap(angle of (p - g) - yaw), -0.3, 0.3) / 0.3   (faces away from its goal)
+        vx = clip(|t - g| - |p - g|, -0.5, 0.5)                          (as far from g as t is)
+        vy = -clip(distance of p to the left of the line g -> t, -0.5, 0.5)
 
     Positions are (2,), m, the goal's is the midpoint of its line; yaw is in rad.
     Source: paper, section III, with the constants of the released system.

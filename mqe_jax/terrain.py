@@ -32,8 +32,9 @@ ROW = 1.0  # m, distance between those that start one behind the other
 
 
 def rows_of(robots: int, width: float) -> tuple[int, float]:
-    """Returns how many robots start side by side on a width, and how far the last row is behind the
-    first; m.
+    """Returns how many robots start side by side, and how far the last row is behind the first.
+
+    In metres.
     """
     rows = math.ceil(robots / max(int(width / LANE), 1))
     return math.ceil(robots / rows), ROW * (rows - 1)
@@ -99,8 +100,9 @@ class TerrainBlock:
     """Extent along x, m."""
 
     def layout(self, start: float, track: "Track", number: int) -> Layout:
-        """Returns the walls and poses of the block from x = `start`, m; `number` is its index in
-        the track.
+        """Returns the walls and poses of the block that begins at x = `start`, m.
+
+        `number` is its index in the track.
         """
         raise NotImplementedError(f"terrain block {type(self).__name__}: layout() is not defined")
 
@@ -111,8 +113,7 @@ class SpawnArea(TerrainBlock):
 
     length: float = 2.0
     spawn_x: float | None = None
-    """X of the spawn poses from the block's start, m; half its length if None. Of several rows, the
-    first."""
+    """X of the first row's spawn poses from the block's start, m; half its length if None."""
     spacing: float | None = None
     """Distance between neighbouring spawn poses, m; the track's width / robots in a row if None."""
     columns: int | None = None
@@ -123,17 +124,15 @@ class SpawnArea(TerrainBlock):
     def layout(self, start: float, track: "Track", number: int) -> Layout:
         x = start + (self.length / 2 if self.spawn_x is None else self.spawn_x)
         columns = self.columns or track.num_robots
-        spawn = []
         spacing = track.width / columns if self.spacing is None else self.spacing
+        spawn = []
         for row, first in enumerate(range(0, track.num_robots, columns)):
             count = min(columns, track.num_robots - first)
             spawn += [(x - row * ROW, (i - (count - 1) / 2) * spacing, 0.0) for i in range(count)]
-        back = (
-            (Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),)
-            if self.back_wall
-            else ()
-        )
-        return Layout(barriers=back, spawn=tuple(spawn))
+        barriers = ()
+        if self.back_wall:
+            barriers = (Barrier(f"back{number}", (start, 0.0), (1.0, 0.0), track.width),)
+        return Layout(barriers=barriers, spawn=tuple(spawn))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +169,6 @@ class Gate(TerrainBlock):
 
     def layout(self, start: float, track: "Track", number: int) -> Layout:
         gap = self.width
-        depth = self.depth
         height = track.wall_height
         if not 0 < gap < track.width:
             raise InputError(
@@ -181,18 +179,12 @@ class Gate(TerrainBlock):
         # Long enough to reach the side wall for every sampled gap position; the overhang is hidden
         # when rendering.
         reach = (track.width - gap) / 2 + self.random[1]
-        walls = tuple(
-            Wall(
-                f"gate{number}_{side}",
-                (0.0, sign * (gap + reach) / 2, height / 2),
-                (depth, reach, height),
-                anchor=0,
-            )
-            for side, sign in (("right", -1.0), ("left", 1.0))
-        )
-        return Layout(
-            walls=walls, anchors=(Anchor(f"gate{number}", center, self.random, self.kind),)
-        )
+        aside = (gap + reach) / 2
+        size = (self.depth, reach, height)
+        right = Wall(f"gate{number}_right", (0.0, -aside, height / 2), size, anchor=0)
+        left = Wall(f"gate{number}_left", (0.0, aside, height / 2), size, anchor=0)
+        anchor = Anchor(f"gate{number}", center, self.random, self.kind)
+        return Layout(walls=(right, left), anchors=(anchor,))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,8 +251,9 @@ class Track:
 
 
 def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> Layout:
-    """Adds a track's ground and walls to a scene, moving ones as mocap bodies `wall/<name>`;
-    returns the layout.
+    """Adds a track's ground and walls to a scene and returns their layout.
+
+    Walls that move are mocap bodies `wall/<name>`.
     """
     layout = track.layout()
     world = spec.worldbody
