@@ -1,6 +1,4 @@
-"""Pictures: frames, files, rendering models and cameras of clips; the viewer's simulation, choices
-and arguments.
-"""
+"""Pictures: frames, files, rendering models, cameras; the viewer's simulation and arguments."""
 
 import dataclasses
 from pathlib import Path
@@ -99,6 +97,15 @@ def test_clips_land_whole_without_gl(
     assert {".png": b"PNG", ".gif": b"GIF89", ".webp": b"WEBP", ".mp4": b"ftyp"}[suffix] in start
     errors = capsys.readouterr().err
     assert errors.count("\n") == 1 and "libegl1" in errors
+
+
+def test_an_image_from_above_is_of_the_time_that_the_caller_names(
+    env: Any, episode: Episode, tmp_path: Path
+) -> None:
+    for at in (0.0, 1.0):
+        file = tmp_path / f"{at}.png"
+        render.render_episode(env, episode, file, size=(160, 90), at=at, backend=None)
+    assert (tmp_path / "0.0.png").read_bytes() != (tmp_path / "1.0.png").read_bytes()
 
 
 def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -> None:

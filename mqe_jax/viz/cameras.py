@@ -1,7 +1,6 @@
-"""Cameras: fixed views of the whole scene or of all trajectories, and views that track robots and
-objects.
-"""
+"""Cameras: fixed views of a scene, and views that track robots and objects."""
 
+import itertools
 from dataclasses import replace
 
 import mujoco
@@ -13,41 +12,39 @@ from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, pose_frames, sh
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
-"""Names of the views. follow: tracks robots, objects and the goal from the direction in which they
-are seen best. near: the same, fixed. scene: fixed, whole scene. side: tracks the first robot from
-its side."""
+"""Names of the views.
+
+- follow: tracks robots, objects and the goal from the direction in which they are seen best.
+- near: the same, fixed.
+- scene: fixed, the whole scene.
+- side: tracks the first robot from its side.
+"""
 
 _MARGIN = np.array([0.4, 0.4, 0.25])  # around a robot's trunk, m
 _SMOOTHING = 0.6  # duration over which a following camera is averaged, s
 _SAMPLES = 24  # frames of an episode by which directions are compared
 _DISTANCES = (2.0, 16.0)  # of a camera that follows up to `_FEW` robots, m; further away from more
 _FEW = 8
+_AZIMUTHS = (90.0, 60.0, 30.0, 0.0, -30.0, 120.0)
 _ELEVATIONS = (-30.0, -38.0, -48.0, -60.0)
-_DIRECTIONS = [
-    (azimuth, elevation)
-    for azimuth in (90.0, 60.0, 30.0, 0.0, -30.0, 120.0)
-    for elevation in _ELEVATIONS
-]
 _BEHIND = 2.0  # m of distance that a camera may add to see the robots beside each other
 _HIDDEN = 12.0  # m of distance that a camera may add to see the targets all the time
 
 
 def default_camera(model: mujoco.MjModel, episode: Episode, aspect: float = 16 / 9) -> Camera:
-    """Returns a three-quarter view from behind and above that contains the track and all robot
-    trajectories.
-    """
+    """Returns a three-quarter view from behind and above of the track and all trajectories."""
     low, high = extent(model, episode)
-    corners = np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, high[2])]
-    )
+    ends = ((low[0], high[0]), (low[1], high[1]), (0, high[2]))
+    corners = np.array(list(itertools.product(*ends)))
     return fit(model, corners, Camera((0.0, 0.0, 0.0), 1.0), aspect, (1.5, 60.0))
 
 
 def cameras(
     model: mujoco.MjModel, episode: Episode, view: str, aspect: float = 16 / 9
 ) -> list[Camera]:
-    """Returns the camera of every frame of an episode, for a view of `VIEWS`; InputError for an
-    unknown view.
+    """Returns the camera of every frame of an episode, for a view of `VIEWS`.
+
+    InputError for an unknown view.
     """
     if known_name("view: unknown name", view, VIEWS) == "scene":
         return [default_camera(model, episode, aspect)] * len(episode)
@@ -84,18 +81,16 @@ def _direction(
     aspect: float,
     width: int,
 ) -> Camera:
-    """Returns a camera of the direction in which the targets are hidden least and never far
-    away.
-    """
+    """Returns a camera of the direction in which the targets are hidden least and close enough."""
     sample = np.unique(np.linspace(0, len(episode) - 1, _SAMPLES).astype(int))
     part = Episode(
-        *(x[sample] for x in (episode.qpos, episode.mocap_pos, episode.mocap_quat)), dt=episode.dt
+        episode.qpos[sample], episode.mocap_pos[sample], episode.mocap_quat[sample], dt=episode.dt
     )
+    few = [points[i] for i in sample]
     best = Camera((0.0, 0.0, 0.0), 1.0)
     least = np.inf
-    for azimuth, elevation in _DIRECTIONS:
+    for azimuth, elevation in itertools.product(_AZIMUTHS, _ELEVATIONS):
         camera = replace(best, azimuth=azimuth, elevation=elevation)
-        few = [points[i] for i in sample]
         views = _following(model, few, goals, camera, aspect, width)
         away = [
             np.linalg.norm(box - view.position, axis=-1).mean()
@@ -110,15 +105,12 @@ def _direction(
 
 
 def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> float:
-    """Returns how much robots are behind each other in the view of a camera, 0 to 1; `right` (3,)
-    is its direction.
-    """
+    """Returns how much robots are behind each other, 0 to 1, for a view whose right is `right`."""
     robots = shown_bases(model)
     values = []
     for data in pose_frames(model, episode, range(len(episode))):
-        apart = (data.xpos[robots][:, None] - data.xpos[robots])[np.triu_indices(len(robots), 1)][
-            :, :2
-        ]
+        place = data.xpos[robots, :2]
+        apart = (place[:, None] - place)[np.triu_indices(len(robots), 1)]
         across = np.abs(apart @ right[:2]) / np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         values.append(1.0 - across.mean() if len(across) else 0.0)
     return float(np.mean(values))
@@ -132,11 +124,12 @@ def _following(
     aspect: float,
     width: int,
 ) -> list[Camera]:
-    """Returns a camera for each frame that contains the targets of all frames at most `width` away,
-    and the goal.
+    """Returns a camera for each frame that contains the goal and the targets.
+
+    The targets are those of all frames at most `width` away.
     """
     views = []
-    (near, far) = _DISTANCES
+    near, far = _DISTANCES
     far *= max(1.0, float(np.sqrt(len(shown_bases(model)) / _FEW)))
     for index in range(len(points)):
         around = points[max(0, index - width) : index + width + 1]

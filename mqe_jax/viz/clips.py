@@ -26,9 +26,9 @@ def check_output(
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"output {str(path)!r}: the suffix must be one of {', '.join(SUFFIXES)}")
-    unused = (
-        {"fps": fps, "speed": None if speed == 1.0 else speed} if suffix == ".png" else {"at": at}
-    )
+    unused: dict[str, float | None] = {"at": at}
+    if suffix == ".png":
+        unused = {"fps": fps, "speed": None if speed == 1.0 else speed}
     for name, value in unused.items():
         if value is not None:
             fail(name, value, f"left out for a {suffix} file")
@@ -79,20 +79,10 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     # A subprocess instead of a fork of this process, in which JAX's threads might hold locks.
     program = import_module("imageio_ffmpeg").get_ffmpeg_exe()
     first = next(frames)
-    height, width = (n // 2 * 2 for n in first.shape[:2])
-    source = [
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        f"{width}x{height}",
-        "-r",
-        f"{fps:g}",
-        "-i",
-        "-",
-    ]
-    encoding = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    height = first.shape[0] // 2 * 2
+    width = first.shape[1] // 2 * 2
+    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps:g} -i -".split()
+    encoding = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart".split()
     command = [program, "-loglevel", "error", "-y", *source, *encoding, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stderr is not None
@@ -118,9 +108,8 @@ def _write_images(path: Path, images: list[Image.Image], suffix: str, fps: float
     # The slowest method, 6, takes twenty times as long for a file that is no smaller.
     options: dict[str, Any] = {"quality": 30, "method": 4, "minimize_size": True}
     if suffix == ".gif":
-        sample = np.concatenate(
-            [np.asarray(image) for image in images[:: max(1, len(images) // 6)][:8]]
-        )
+        sampled = images[:: max(1, len(images) // 6)][:8]
+        sample = np.concatenate([np.asarray(image) for image in sampled])
         palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
         images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
         options = {"optimize": True}

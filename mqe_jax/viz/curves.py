@@ -1,6 +1,4 @@
-"""Drawings by matplotlib: curves of a training, and a top view for machines without a GL
-library.
-"""
+"""Drawings by matplotlib: curves of a training, and a top view for machines without GL."""
 
 import io
 import math
@@ -37,14 +35,12 @@ _SECOND = "#3fae49"
 
 
 def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
-    """Returns the running mean over a window of `fraction` of the rows; non-finite values are
-    skipped.
-    """
+    """Returns the running mean over a window of `fraction` of the rows, of finite values only."""
     values = np.asarray(values, np.float64)
     width = max(1, round(len(values) * fraction))
     windows = [values[max(0, end - width) : end] for end in range(1, len(values) + 1)]
-    windows = [window[np.isfinite(window)] for window in windows]
-    return [float(window.mean()) if window.size else math.nan for window in windows]
+    finite = [window[np.isfinite(window)] for window in windows]
+    return [float(window.mean()) if window.size else math.nan for window in finite]
 
 
 @check_arguments(tables=Annotated[Sequence[Mapping[str, Any]], MinLen(1)], title=str)
@@ -74,16 +70,11 @@ def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> "Figu
         steps = table["env_steps"] / 1e6
         reward = table[name]
         axes.plot(steps, reward, color=_RUN, lw=0.6, alpha=0.3)
-        axes.plot(
-            steps,
-            smooth(reward),
-            color=_RUN,
-            lw=1.8,
-            label="mqe_jax" if table is tables[0] else None,
-        )
+        label = "mqe_jax" if table is tables[0] else None
+        axes.plot(steps, smooth(reward), color=_RUN, lw=1.8, label=label)
     last = max(table["env_steps"][-1] for table in tables) / 1e6
     axes.set(xlabel="environment steps (millions)", ylabel=name.replace("_", " "), xlim=(0, last))
-    if any(math.isfinite(v) for t in tables for v in t.get("success", [])):
+    if any(np.isfinite(table.get("success", math.nan)).any() for table in tables):
         right = axes.twinx()
         for table in tables:
             rate = [100 * v for v in smooth(table["success"])]
@@ -102,10 +93,14 @@ def save_figure(figure: "Figure", path: Path) -> None:
 
 
 def draw_top(
-    model: mujoco.MjModel, episode: Episode, size: tuple[int, int]
+    model: mujoco.MjModel,
+    episode: Episode,
+    size: tuple[int, int],
+    shown: slice = slice(None),
 ) -> Iterator[np.ndarray]:
-    """Yields top-view frames (H, W, 3) uint8 of an episode: walls, objects, robots, and what the
-    first one senses.
+    """Yields top-view frames (H, W, 3) uint8 of an episode, or the `shown` ones.
+
+    They show walls, objects, robots, and what the first robot senses.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -119,23 +114,23 @@ def draw_top(
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
     axes.axis("off")
-    bases = shown_bases(model)
     scenery = []
     robots = []
     for geom in scenery_geoms(model):
         moves = model.body_dofnum[model.body_rootid[model.geom_bodyid[geom]]] > 0
         face = "#c9ced6" if moves else "#3a3d45"
-        patch = Polygon(np.zeros((3, 2)), facecolor=face, edgecolor="#23252b", lw=0.6, zorder=2)
+        patch = Polygon(np.zeros((3, 2)), facecolor=face, edgecolor=_INK, lw=0.6, zorder=2)
         scenery.append((geom, axes.add_patch(patch)))
     body_shape = np.array([[-0.25, -0.13], [0.2, -0.13], [0.33, 0.0], [0.2, 0.13], [-0.25, 0.13]])
-    for body in bases:
+    for body in shown_bases(model):
         colour = robot_color(model, body)
-        patch = axes.add_patch(
-            Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4)
-        )
-        robots.append((body, patch))
-    for index, data in enumerate(pose_frames(model, episode, range(len(episode)))):
-        marks = [artist for mark in episode.marks for artist in _sensed(axes, mark, index)]
+        patch = Polygon(body_shape, facecolor=colour, edgecolor="#1b1d22", lw=1, zorder=4)
+        robots.append((body, axes.add_patch(patch)))
+    frames = range(len(episode))[shown]
+    for index, data in zip(frames, pose_frames(model, episode, frames), strict=True):
+        marks = []
+        for mark in episode.marks:
+            marks += _sensed(axes, mark, index)
         for geom, patch in scenery:
             points = box_corners(model, data, geom)[:, :2]
             patch.set_xy(points[ConvexHull(points).vertices])
@@ -154,17 +149,12 @@ def _sensed(axes: Any, mark: Marks, index: int) -> list[Any]:
     """Draws the first agent's marks in a frame."""
     from matplotlib.collections import LineCollection
 
-    colors = (
-        [(*mark.color, alpha) for alpha in each[index][0]]
-        for each in (mark.line_opacity, mark.point_opacity)
-    )
-    (line, point) = colors
-    spots = mark.points[index][0]
-    lines = LineCollection(
-        [*np.asarray(mark.lines[index][0, ..., :2])],
-        colors=line,
-        lw=2 if mark.bold else 0.8,
-        zorder=3,
-    )
-    area = axes.fill(*mark.area[index][0].T[:2], color=mark.color, alpha=0.3, lw=0, zorder=1)
-    return [axes.add_collection(lines), axes.scatter(*spots.T[:2], s=6, c=point, zorder=3), *area]
+    segments = [*np.asarray(mark.lines[index][0, ..., :2])]
+    colors = [(*mark.color, alpha) for alpha in mark.line_opacity[index][0]]
+    lines = LineCollection(segments, colors=colors, lw=2 if mark.bold else 0.8, zorder=3)
+    x, y, _ = mark.points[index][0].T
+    colors = [(*mark.color, alpha) for alpha in mark.point_opacity[index][0]]
+    points = axes.scatter(x, y, s=6, c=colors, zorder=3)
+    x, y, _ = mark.area[index][0].T
+    area = axes.fill(x, y, color=mark.color, alpha=0.3, lw=0, zorder=1)
+    return [axes.add_collection(lines), points, *area]

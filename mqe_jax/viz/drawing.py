@@ -8,29 +8,27 @@ import numpy as np
 
 from mqe_jax.sensors.marks import Marks
 
-# width of a line, of the image's height; radius of a point, of the camera's distance
-_LINE = 1 / 450
-_POINT = 1 / 220
-# opacity of an area; of a line's colour, as MuJoCo lights lines more than surfaces
-_AREA = 0.3
-_SHADE = 0.55
+_LINE = 1 / 450  # width of a line, as a part of the image's height
+_POINT = 1 / 220  # radius of a point, as a part of the camera's distance
+_AREA = 0.3  # opacity of an area
+_SHADE = 0.55  # of a line's colour, as MuJoCo lights lines more than surfaces
 _TYPE = mujoco.mjtGeom
 
 
 def add_marks(
     scene: mujoco.MjvScene, marks: Sequence[Marks], frame: int, height: int, distance: float
 ) -> None:
-    """Adds the first agent's marks in a frame to a scene of an image `height` pixels high, seen
-    from `distance`, m.
+    """Adds the first agent's marks in a frame to a scene.
+
+    The image is `height` pixels high and seen from `distance`, m.
     """
     for mark in marks:
         lines = np.asarray(mark.lines[frame][0], float)
         opacity = np.asarray(mark.line_opacity[frame][0])
         width = max(1.0, (2 if mark.bold else 1) * _LINE * height)
-        for ends, alpha in zip(lines[opacity > 0], opacity[opacity > 0], strict=True):
-            mujoco.mjv_connector(
-                _add(scene, _TYPE.mjGEOM_LINE, mark, alpha), _TYPE.mjGEOM_LINE, width, *ends
-            )
+        for (start, end), alpha in zip(lines[opacity > 0], opacity[opacity > 0], strict=True):
+            geom = _add(scene, _TYPE.mjGEOM_LINE, mark, alpha)
+            mujoco.mjv_connector(geom, _TYPE.mjGEOM_LINE, width, start, end)
         points = np.asarray(mark.points[frame][0], float)
         opacity = np.asarray(mark.point_opacity[frame][0])
         for point, alpha in zip(points[opacity > 0], opacity[opacity > 0], strict=True):

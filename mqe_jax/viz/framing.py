@@ -29,10 +29,14 @@ _ROOM = 1.07  # factor of the distance at which the points would reach the image
 class Camera:
     """A free camera, in MuJoCo's convention; angles in degrees."""
 
-    lookat: tuple[float, float, float]  # point in the centre of the view, m
-    distance: float  # distance from that point, m
-    azimuth: float = 60.0  # azimuth, degrees: 0 points along +x, 90 along +y
-    elevation: float = -46.0  # elevation, degrees: -90 points straight down
+    lookat: tuple[float, float, float]
+    """Point in the centre of the view, m."""
+    distance: float
+    """Distance from that point, m."""
+    azimuth: float = 60.0
+    """0 looks along +x, 90 along +y."""
+    elevation: float = -46.0
+    """-90 looks straight down."""
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -57,46 +61,32 @@ def fit(
     aspect: float,
     distances: tuple[float, float],
 ) -> Camera:
-    """Returns a camera of the same direction whose image contains and centres the points `corners`
-    (P, 3).
-    """
+    """Returns a camera of the same direction whose image contains and centres `corners` (P, 3)."""
     forward, right, up = camera.axes
-    # of half the vertical field of view
-    tangent = float(np.tan(np.radians(model.vis.global_.fovy) / 2))
+    tangent = float(np.tan(np.radians(model.vis.global_.fovy) / 2))  # of half the field of view
     lookat = (corners.min(axis=0) + corners.max(axis=0)) / 2
     distance = 1.0
-    for _ in range(25):  # centre the projection, then adjust the distance
+    for _ in range(25):  # adjust the distance, then centre the projection
         offset = corners - lookat
-        # A corner is in the image where |offset right| <= depth tan aspect and |offset up| <= depth
+        # The image contains a corner if |offset right| <= depth tan aspect and |offset up| <= depth
         # tan.
-        need = (
-            np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up)) / tangent
-            - offset @ forward
-        )
-        distance = need.max()
+        aside = np.maximum(np.abs(offset @ right) / aspect, np.abs(offset @ up))
+        distance = (aside / tangent - offset @ forward).max()
         depth = distance + offset @ forward
         across = offset @ right / depth
         along = offset @ up / depth
-        shift = (
-            distance
-            * ((across.max() + across.min()) * right + (along.max() + along.min()) * up)
-            / 4
-        )
-        lookat = lookat + shift
-    return replace(
-        camera, lookat=tuple(lookat.tolist()), distance=float(np.clip(_ROOM * distance, *distances))
-    )
+        shift = (across.max() + across.min()) * right + (along.max() + along.min()) * up
+        lookat = lookat + distance * shift / 4
+    distance = float(np.clip(_ROOM * distance, *distances))
+    return replace(camera, lookat=tuple(lookat.tolist()), distance=distance)
 
 
 def smooth(views: Sequence[Camera], width: int) -> list[Camera]:
     """Returns cameras smoothed by a triangular window of `2 width + 1` frames."""
     values = np.array([[*camera.lookat, camera.distance] for camera in views])
-    padded = np.concatenate(
-        [np.repeat(values[:1], width, 0), values, np.repeat(values[-1:], width, 0)]
-    )
-    weights = (
-        np.minimum(np.arange(1, 2 * width + 2), np.arange(2 * width + 1, 0, -1)) / (width + 1) ** 2
-    )
+    padded = np.pad(values, ((width, width), (0, 0)), mode="edge")
+    rising = np.arange(1, 2 * width + 2)
+    weights = np.minimum(rising, rising[::-1]) / (width + 1) ** 2
     means = np.stack([np.convolve(column, weights, mode="valid") for column in padded.T], axis=1)
     rows = zip(views, means.tolist(), strict=True)
     return [
@@ -109,33 +99,35 @@ _PAPER = (246, 246, 242)
 
 
 def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
-    """Returns labels and the different colours, 0 to 255, of their robots: teams as in `env.teams`,
-    then others.
+    """Returns the labels of the legend, and the colours of their robots, each once.
+
+    Colours are 0 to 255. Teams are as in `env.teams`; other robots follow.
     """
-    bases = trunk_bodies(env.mj_model)
-    colors = [
-        tuple(round(255 * part) for part in robot_color(env.mj_model, body)[:3]) for body in bases
-    ]
+    model = env.mj_model
+    colors = [_rgb(robot_color(model, body)) for body in trunk_bodies(model)]
     names = ("team",) if len(env.teams) == 1 else ("team 0", "team 1")
-    rows = [
-        (name, list(dict.fromkeys(colors[agent] for agent in team)))
-        for name, team in zip(names, env.teams, strict=True)
-    ]
+    rows = []
+    for name, team in zip(names, env.teams, strict=True):
+        rows.append((name, list(dict.fromkeys(colors[agent] for agent in team))))
     scripted = colors[sum(map(len, env.teams)) :]
-    return [*rows, ("scripted", scripted)] if scripted else rows
+    if scripted:
+        rows.append(("scripted", scripted))
+    return rows
+
+
+def _rgb(color: Sequence[float]) -> tuple[int, ...]:
+    """Returns a colour's red, green and blue, 0 to 255."""
+    return tuple(round(255 * part) for part in color[:3])
 
 
 def legend(
     env: QuadrupedEnv, size: tuple[int, int], marks: Sequence[Marks] = ()
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a function that draws the legend into the lower left corner of a frame (H, W, 3)
-    uint8.
+    """Returns a function that draws the legend into a frame (H, W, 3) uint8, at the lower left.
 
     It names teams and `marks`; a single robot without marks has none.
     """
-    labels = entries(env) + [
-        (mark.label, [tuple(round(255 * part) for part in mark.color)]) for mark in marks
-    ]
+    labels = entries(env) + [(mark.label, [_rgb(mark.color)]) for mark in marks]
     if sum(len(dots) for _, dots in labels) < 2:
         return lambda frame: frame
     unit = max(size[1] / 360, 0.6)
@@ -155,9 +147,8 @@ def legend(
     gap = round(8 * unit)
 
     def draw_legend(frame: np.ndarray) -> np.ndarray:
-        height, width = (
-            min(a, b - gap) for a, b in zip(picture.shape[:2], frame.shape[:2], strict=True)
-        )
+        height = min(picture.shape[0], frame.shape[0] - gap)
+        width = min(picture.shape[1], frame.shape[1] - gap)
         frame = frame.copy()
         frame[-gap - height : len(frame) - gap, gap : gap + width] = picture[:height, :width]
         return frame
@@ -165,8 +156,7 @@ def legend(
     return draw_legend
 
 
-# distance from a trunk's centre of the points that are looked for in front and behind, m
-_SPAN = 0.18
+_SPAN = 0.18  # distance from a trunk's centre of the points to look for in front and behind, m
 _NEAR_GOAL = 3.0  # distance from the goal that the objects reach within which sites belong to it, m
 _CLEAR = 0.5  # opacity below which a geom hides nothing
 
@@ -177,13 +167,13 @@ def targets(model: mujoco.MjModel, episode: Episode) -> list[int]:
 
 
 def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
-    """Returns the goals' points (P, 3), m; of several goals those of the one next to the objects at
-    the end.
+    """Returns the goals' points (P, 3), m.
+
+    Of several goals, it returns those of the one next to the objects at the end.
     """
     data = next(pose_frames(model, episode, [len(episode) - 1]))
-    sites = [
-        site for site in range(model.nsite) if model.site(site).name.startswith(f"{GOAL_SITE}/")
-    ]
+    names = [model.site(site).name for site in range(model.nsite)]
+    sites = [site for site, name in enumerate(names) if name.startswith(f"{GOAL_SITE}/")]
     points = data.site_xpos[sites].reshape(-1, 3)
     objects = moving_bodies(model, episode)
     if not len(points) or not objects:
@@ -194,11 +184,10 @@ def goal_points(model: mujoco.MjModel, episode: Episode) -> np.ndarray:
 
 
 def hidden(model: mujoco.MjModel, episode: Episode, views: Sequence[Camera]) -> np.ndarray:
-    """Returns the part of each target that walls and objects hide from the camera of each frame (T,
-    targets).
+    """Returns the part of each target that is hidden from each frame's camera (T, targets).
 
-    Three points are looked for: along a robot's trunk, and one above the other in an object. Robots
-    hide nothing.
+    Walls and objects hide. Robots hide nothing. Three points are looked for: along a robot's trunk,
+    and one above the other in an object.
     """
     model = copy.deepcopy(model)
     model.geom_group[model.geom_rgba[:, 3] < _CLEAR] = HIDDEN_GROUP

@@ -16,9 +16,7 @@ _SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of
 
 
 def shown_bases(model: mujoco.MjModel) -> list[int]:
-    """Returns the ids of the trunks of visible robots; in a rendering model, of those that take
-    part.
-    """
+    """Returns the ids of the trunks of visible robots; a rendering model hides those left out."""
     return [body for body in trunk_bodies(model) if _drawn(model, body)]
 
 
@@ -35,31 +33,24 @@ def _hide(model: mujoco.MjModel, bodies: Sequence[int]) -> None:
 
 
 def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
-    """Returns the ids of visible objects and NPCs that move in the episode: free, sliding or mocap,
-    no robots.
+    """Returns the ids of the visible bodies that move in the episode, without robots.
+
+    They are objects and NPCs: free, sliding or mocap.
     """
-    moved = np.ptp(episode.mocap_pos, axis=0).max(-1) > 0.05 if model.nmocap else np.zeros(0, bool)
-    bodies = [
-        body
-        for body in range(model.nbody)
-        if model.body_mocapid[body] >= 0 and moved[model.body_mocapid[body]]
-    ]
-    robots = {int(model.body_rootid[body]) for body in trunk_bodies(model)}
-    translations = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    for joint in range(model.njnt):
-        body = int(model.jnt_bodyid[joint])
-        if (
-            int(model.jnt_type[joint]) in translations
-            and int(model.body_rootid[body]) not in robots
-        ):
-            bodies.append(body)
-    return sorted(body for body in set(bodies) if _drawn(model, body))
+    bodies = set()
+    for body in np.flatnonzero(model.body_mocapid >= 0).tolist():
+        if np.ptp(episode.mocap_pos[:, model.body_mocapid[body]], axis=0).max() > 0.05:
+            bodies.add(body)
+    robots = model.body_rootid[trunk_bodies(model)]
+    translations = [int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
+    for body in model.jnt_bodyid[np.isin(model.jnt_type, translations)].tolist():
+        if model.body_rootid[body] not in robots:
+            bodies.add(body)
+    return sorted(body for body in bodies if _drawn(model, body))
 
 
 def robot_color(model: mujoco.MjModel, trunk: int) -> tuple[float, ...]:
-    """Returns the colour (red, green, blue, alpha) of a robot: that of the first visible geom of
-    its trunk.
-    """
+    """Returns a robot's colour (red, green, blue, alpha), of its trunk's first visible geom."""
     geoms = model.body_geomadr[trunk] + np.arange(model.body_geomnum[trunk])
     seen = [geom for geom in geoms if model.geom_group[geom] != COLLISION_GROUP]
     return tuple(map(float, model.geom_rgba[seen[0]]))
@@ -92,9 +83,7 @@ def box_corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.nda
 
 
 def body_boxes(model: mujoco.MjModel, bodies: Sequence[int]) -> np.ndarray:
-    """Returns the corners (B, 8, 3) of the boxes about the bodies' visible geoms, each in its
-    body's frame, m.
-    """
+    """Returns the corners (B, 8, 3) of the boxes about bodies' visible geoms, in body frames, m."""
     boxes = []
     rotation = np.zeros(9)
     for body in bodies:
@@ -113,24 +102,20 @@ def body_boxes(model: mujoco.MjModel, bodies: Sequence[int]) -> np.ndarray:
 
 
 def pose_boxes(data: mujoco.MjData, bodies: Sequence[int], boxes: np.ndarray) -> np.ndarray:
-    """Returns the corners (B, 8, 3) of boxes given in the frames of the bodies in the world frame,
-    m.
-    """
+    """Returns the corners (B, 8, 3) of boxes in the world frame, m, from those in body frames."""
     rotation = data.xmat[list(bodies)].reshape(-1, 3, 3)
     return data.xpos[list(bodies), None] + boxes @ rotation.transpose(0, 2, 1)
 
 
 def scenery_geoms(model: mujoco.MjModel) -> list[int]:
-    """Returns the ids of the visible geoms that are neither ground, with what is painted on it, nor
-    part of a robot.
+    """Returns the ids of the visible geoms of neither ground nor robots.
+
+    Ground includes what is painted on it.
     """
-    robots = {int(model.body_rootid[body]) for body in trunk_bodies(model)}
-    return [
-        geom
-        for geom in range(model.ngeom)
-        if int(model.geom_group[geom]) not in (GROUND_GROUP, COLLISION_GROUP)
-        and int(model.body_rootid[model.geom_bodyid[geom]]) not in robots
-    ]
+    unseen = np.isin(model.geom_group, [GROUND_GROUP, COLLISION_GROUP])
+    robots = model.body_rootid[trunk_bodies(model)]
+    of_robots = np.isin(model.body_rootid[model.geom_bodyid], robots)
+    return np.flatnonzero(~unseen & ~of_robots).tolist()
 
 
 def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
@@ -151,8 +136,8 @@ def extent(model: mujoco.MjModel, episode: Episode) -> tuple[np.ndarray, np.ndar
 def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
     """Returns a rendering copy of the model, in which mocap walls end at the track's side walls.
 
-    A gate's walls are long enough for every sampled gap position; the overhang beyond the side
-    walls is hidden. So are the robots and sliding objects that take no part in the episode.
+    A gate's walls are long enough for every sampled gap position. The copy hides the overhang
+    beyond the side walls, and robots and sliding objects that take no part in the episode.
     """
     model = copy.deepcopy(model)
     data = next(pose_frames(model, episode, [0]))
@@ -164,9 +149,8 @@ def rendering_model(model: mujoco.MjModel, episode: Episode) -> mujoco.MjModel:
         return model
     corners = np.concatenate([box_corners(model, data, geom) for geom in fixed])
     sliding = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_SLIDE)]
-    _hide(
-        model, [body for body in sliding if data.xpos[body, 0] > corners[:, 0].max() + OUTSIDE / 2]
-    )
+    end = corners[:, 0].max() + OUTSIDE / 2
+    _hide(model, [body for body in sliding if data.xpos[body, 0] > end])
     sides = corners[:, 1]
     for geom in shown:
         if model.body_mocapid[model.geom_bodyid[geom]] < 0:

@@ -1,5 +1,6 @@
-"""Frames, clips and images of an episode: by `mujoco.Renderer` (EGL, then OSMesa), or from above by
-matplotlib.
+"""Frames, clips and images of an episode.
+
+`mujoco.Renderer` draws them (EGL, else OSMesa), or matplotlib from above.
 """
 
 import contextlib
@@ -40,14 +41,13 @@ model = mujoco.MjModel.from_xml_string("<mujoco/>")
 mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value).free()
 context.free()
 """
-
-
 _probing = threading.Lock()
 
 
 def gl_backend() -> str | None:
-    """Returns the name of a working GL library (`egl` or `osmesa`), or None; found once, in any
-    thread.
+    """Returns the name of a working GL library (`egl` or `osmesa`), or None.
+
+    Any thread may call it. It looks for a library once.
     """
     with _probing:
         return _working_backend()
@@ -64,27 +64,34 @@ def _working_backend() -> str | None:
     if chosen in ("disable", "disabled", "off", "false", "0"):
         return None
     for name in sorted(("egl", "osmesa"), key=lambda name: name != chosen):
-        environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {
-            "MUJOCO_GL": name
-        }
-        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            done = subprocess.run(
-                [sys.executable, "-c", _PROBE], env=environment, timeout=60, check=False, **quiet
-            )
-            if done.returncode == 0:
-                if chosen not in ("", name):
-                    print(
-                        f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead",
-                        file=sys.stderr,
-                    )
-                return name
+        if _draws(name):
+            if chosen not in ("", name):
+                text = f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead"
+                print(text, file=sys.stderr)
+            return name
     return None
 
 
+def _draws(name: str) -> bool:
+    """Returns whether a process draws with a GL library."""
+    environment = {**os.environ, "MUJOCO_GL": name}
+    environment.pop("PYOPENGL_PLATFORM", None)
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=environment,
+            timeout=60,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        return done.returncode == 0
+    return False
+
+
 def _gl_context(backend: str) -> Any:
-    """Returns MuJoCo's class of contexts of a GL library, whatever MUJOCO_GL was at the import of
-    MuJoCo.
+    """Returns MuJoCo's class of contexts of a GL library.
+
+    MUJOCO_GL may have been another at the import of MuJoCo.
     """
     os.environ["MUJOCO_GL"] = backend
     if os.environ.get("PYOPENGL_PLATFORM", backend) != backend:
@@ -99,17 +106,15 @@ def _draw_gl(
     size: tuple[int, int],
     backend: str,
 ) -> Iterator[np.ndarray]:
-    """Yields the frames (H, W, 3) uint8 of an episode, rendered by `mujoco.Renderer` with a camera
-    for each.
-    """
+    """Yields the frames (H, W, 3) uint8 of an episode, with a camera for each."""
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight = size
-    # a fifth of a software renderer's time
+    # Shadows take a fifth of a software renderer's time.
     vis.quality.shadowsize = 2048 if size[0] > 640 else 1024
     vis.quality.offsamples = 4
     vis.quality.numslices = 18
     vis.quality.numstacks = 8
-    # The ground's texture, if the model has one.
+    # -1, no material, if the model has no texture of the ground.
     material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, GROUND_MATERIAL)
     model.geom_matid[model.geom_group == GROUND_GROUP] = material
     # One directional light and a headlight, together below saturation on a pale floor.
@@ -118,11 +123,11 @@ def _draw_gl(
     vis.headlight.specular[:] = 0.0
     low, high = extent(model, episode)
     model.stat.extent = float(np.linalg.norm(high - low) / 2)
-    # MuJoCo casts shadows around the light's position, up to `shadowclip` extents: over what the
-    # cameras see.
+    # MuJoCo casts shadows around the light's position, up to `shadowclip` extents. They must reach
+    # over what the cameras see.
     reach = min(model.stat.extent, 0.75 * max(camera.distance for camera in cameras))
     vis.map.shadowclip = reach / model.stat.extent
-    # extents; a wider range causes z-fighting
+    # In extents. A wider range causes z-fighting.
     vis.map.znear = 0.1
     vis.map.zfar = 10.0
     if model.nlight:
@@ -146,9 +151,8 @@ def _draw_gl(
             view.elevation = camera.elevation
             pose(model, data, episode, index)
             if model.nlight:
-                model.light_pos[0] = (
-                    np.array(camera.lookat) - 2 * model.stat.extent * model.light_dir[0]
-                )
+                back = 2 * model.stat.extent * model.light_dir[0]
+                model.light_pos[0] = np.array(camera.lookat) - back
             mujoco.mj_camlight(model, data)
             renderer.update_scene(data, view, option)
             add_marks(renderer.scene, episode.marks, index, size[1], camera.distance)
@@ -177,21 +181,20 @@ def render_frames(
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
         return draw_top(model, episode, size)
-    return _draw_gl(
-        model, episode, views or cameras(model, episode, "scene", size[0] / size[1]), size, backend
-    )
+    if views is None:
+        views = cameras(model, episode, "scene", size[0] / size[1])
+    return _draw_gl(model, episode, views, size, backend)
 
 
 def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
-    """Raises an InputError for an episode without frames, of another task, or with numbers that are
-    not finite.
-    """
-    sizes = (env.mj_model.nq, env.mj_model.nmocap)
-    found = (episode.qpos.shape[1:], episode.mocap_pos.shape[1:2])
-    if not len(episode) or found != (sizes[:1], sizes[1:]):
+    """Raises an InputError for an episode that is empty, not finite, or of another task."""
+    nq = env.mj_model.nq
+    nmocap = env.mj_model.nmocap
+    found = (*episode.qpos.shape[1:], *episode.mocap_pos.shape[1:2])
+    if not len(episode) or found != (nq, nmocap):
         shape = f"{episode.qpos.shape} coordinates, {episode.mocap_pos.shape} of walls"
         raise InputError(
-            f"episode: {shape}; {env.name} needs (frames, {sizes[0]}) and (frames, {sizes[1]}, 3)"
+            f"episode: {shape}; {env.name} needs (frames, {nq}) and (frames, {nmocap}, 3)"
         )
     if not all(np.isfinite(x).all() for x in (episode.qpos, episode.mocap_pos, episode.mocap_quat)):
         raise InputError("episode: its coordinates hold NaN or infinite numbers")
@@ -212,13 +215,13 @@ def render_episode(
     at: Time | None = None,
     backend: str | None = "auto",
 ) -> str:
-    """Renders an episode to a file (format by suffix) and returns the renderer used (`egl`,
-    `osmesa`, `matplotlib`).
+    """Renders an episode to a file, in the format of its suffix, and returns the renderer's name.
 
-    Defaults: .mp4 960 x 540 at 25 frames/s, .gif and .webp 480 x 270 at 12.5 frames/s, .png 1280 x
-    720; view `follow` for a clip, `scene` for an image. `speed` below 1 is slow motion; `at` is the
-    time of an image, s (default: the middle). A legend names the teams' colours. Without GL, the
-    packages required for 3-D rendering are printed to standard error.
+    The renderer is `egl`, `osmesa` or `matplotlib`. Defaults: .mp4 960 x 540 at 25 frames/s, .gif
+    and .webp 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow` for a clip, `scene` for an
+    image. `speed` below 1 is slow motion. `at` is the time of an image, s (default: the middle). A
+    legend names the teams' colours. Without GL, standard error names the packages that 3-D
+    rendering needs.
 
     Example:
         ```python
@@ -240,41 +243,28 @@ def render_episode(
     fps = fps or (25.0 if suffix == ".mp4" else 12.5)
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
-        text = (
-            f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}"
-        )
-        print(text, file=sys.stderr)
-    aspect = size[0] / size[1]
+        text = "mqe: no GL library, rendered from above instead; for 3-D images install"
+        print(text, GL_PACKAGES, file=sys.stderr)
+    shown = slice(None)
     if suffix == ".png":
-        views = cameras(
-            rendering_model(env.mj_model, episode),
-            episode,
-            "scene" if view is None else view,
-            aspect,
-        )
-        shown = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
-        if backend is not None:
-            views = views[shown : shown + 1]
-            episode = episode.cut(slice(shown, shown + 1))
+        index = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
+        shown = slice(index, index + 1)
     else:
         episode = episode.cut(slice(None, None, max(1, round(speed / (fps * episode.dt)))))
         fps = speed / episode.dt
         if suffix != ".mp4" and 3 * len(episode) * size[0] * size[1] > CLIP_BYTES:
-            text = (
-                f"{len(episode)} frames of {size[0]} x {size[1]} pixels are too many for {suffix}"
-            )
+            frames = f"{len(episode)} frames of {size[0]} x {size[1]} pixels"
             raise InputError(
-                f"output: {text}; give a smaller width, fewer frames per second, or .mp4"
+                f"output: {frames} are too many for {suffix}; give a smaller width, fewer frames "
+                "per second, or .mp4"
             )
-        views = cameras(
-            rendering_model(env.mj_model, episode),
-            episode,
-            "follow" if view is None else view,
-            aspect,
-        )
-    write_clip(
-        path,
-        map(legend(env, size, episode.marks), render_frames(env, episode, views, size, backend)),
-        fps,
-    )
+    if view is None:
+        view = "scene" if suffix == ".png" else "follow"
+    model = rendering_model(env.mj_model, episode)
+    views = cameras(model, episode, view, size[0] / size[1])
+    if backend is None:
+        frames = draw_top(model, episode, size, shown)
+    else:
+        frames = _draw_gl(model, episode.cut(shown), views[shown], size, backend)
+    write_clip(path, map(legend(env, size, episode.marks), frames), fps)
     return backend or "matplotlib"
