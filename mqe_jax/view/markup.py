@@ -1,5 +1,6 @@
-"""HTML of the panel. viser's Markdown renders HTML that is in a text, so every text of the panel is
-escaped here.
+"""HTML of the panel.
+
+viser's Markdown renders HTML in a text, so this module escapes every text of the panel.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,28 +25,23 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     def cells(tag: str, texts: Sequence[str]) -> str:
         return "".join(f'<{tag} style="{_CELL}">{to_html(text)}</{tag}>' for text in texts)
 
-    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     head_row = f"<thead><tr>{cells('th', head)}</tr></thead>"
-    return (
-        f'<div style="{_BOX}"><table '
-        f'style="border-collapse:collapse">{head_row}<tbody>{body}</tbody></table></div>'
-    )
+    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    content = f"{head_row}<tbody>{body}</tbody>"
+    return f'<div style="{_BOX}"><table style="border-collapse:collapse">{content}</table></div>'
 
 
 def legend(colors: Mapping[str, tuple[float, float, float]]) -> str:
     """Returns labels, each after a dot of its colour, 0 to 1."""
-    dots = (
-        f'<span style="color:rgb({",".join(str(int(255 * part)) for part in color)})">'
-        f"&#9679;</span> {to_html(label)}"
-        for label, color in colors.items()
-    )
-    return f'<div style="{_BOX}">{" &nbsp; ".join(dots)}</div>'
+    entries = []
+    for label, color in colors.items():
+        rgb = ",".join(str(int(255 * part)) for part in color)
+        entries.append(f'<span style="color:rgb({rgb})">&#9679;</span> {to_html(label)}')
+    return f'<div style="{_BOX}">{" &nbsp; ".join(entries)}</div>'
 
 
 def bars(names: Sequence[str], values: Sequence[float]) -> str:
-    """Returns one bar per name, to the right for positive values and to the left for negative
-    ones.
-    """
+    """Returns one bar per name, to the right for positive values and to the left for others."""
     greatest = max([1e-9, *(abs(value) for value in values)])
     rows = []
     for name, value in zip(names, values, strict=True):
@@ -56,24 +52,22 @@ def bars(names: Sequence[str], values: Sequence[float]) -> str:
             f'background:{colour}"></div>'
         )
         rows.append(
-            '<div style="display:flex;font-size:11px;align-items:center"><span '
-            'style="width:8.5em">'
-            f"{to_html(name)}</span><div "
-            f'style="position:relative;flex:1;height:10px;background:#8882">{bar}</div>'
+            '<div style="display:flex;font-size:11px;align-items:center">'
+            f'<span style="width:8.5em">{to_html(name)}</span>'
+            f'<div style="position:relative;flex:1;height:10px;background:#8882">{bar}</div>'
             f'<span style="width:5em;text-align:right">{value:+.4f}</span></div>'
         )
     return f'<div style="padding:0 12px">{"".join(rows)}</div>'
 
 
 def observation_table(layout: Any, obs: np.ndarray) -> str:
-    """Returns the values (O,) of an agent's observation by the blocks of its layout, or as one
-    block.
+    """Returns the values (O,) of an agent's observation by the blocks of its layout.
+
+    Without a layout, they are one block.
     """
     if layout is None:
         parts = [("observation", obs)]
     else:
         parts = [(block.name, obs[layout.slice(block.name)]) for block in layout.blocks]
-    return table(
-        ("block", "values"),
-        [(name, " ".join(f"{x:.2f}" for x in values)) for name, values in parts],
-    )
+    rows = [(name, " ".join(f"{x:.2f}" for x in values)) for name, values in parts]
+    return table(("block", "values"), rows)

@@ -1,6 +1,4 @@
-"""What can be chosen in the page: a task, its policy and opponent from the package and from run
-folders.
-"""
+"""What the page can choose: a task, and policies from the package and from run folders."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -21,21 +19,26 @@ _LONGEST = 256  # of an option, characters; messages are no longer
 
 @dataclass(frozen=True)
 class Entry:
-    """A task with its policies, `DEFAULT` where none is named."""
+    """A task with its policies; `DEFAULT` unless one is named."""
 
-    task: str  # id of the task
-    policy: str = DEFAULT  # policy of all agents, or of team 0 of a match
-    opponent: str = DEFAULT  # policy of team 1 of a match
+    task: str
+    """Id of the task."""
+    policy: str = DEFAULT
+    """Policy of all agents, or of team 0 of a match."""
+    opponent: str = DEFAULT
+    """Policy of team 1 of a match."""
 
 
 @dataclass
 class Menu:
     """The choices, and how one becomes a session."""
 
-    # creates the session of a choice; raises an InputError if that is not possible
     open: Callable[[Entry], Session]
-    shown: Entry  # the choice on the page
-    runs: dict[str, str] = field(default_factory=dict)  # task of each run folder
+    """Creates the session of a choice; raises an InputError if that is impossible."""
+    shown: Entry
+    """The choice on the page."""
+    runs: dict[str, str] = field(default_factory=dict)
+    """Task of each run folder."""
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -49,7 +52,7 @@ class Menu:
         runs = tuple(run for run, its_task in self.runs.items() if its_task == task)
         found = (DEFAULT, *shipped, *scripted, "random", "idle", "forward", *runs)
         own = (self.shown.policy, self.shown.opponent) if task == self.shown.task else ()
-        return (*found, *(name for name in dict.fromkeys(own) if name not in found))
+        return tuple(dict.fromkeys((*found, *own)))
 
     def is_match(self, task: str) -> bool:
         """Returns whether a task has two teams."""
@@ -57,9 +60,7 @@ class Menu:
 
 
 def find_runs(folders: Sequence[Path]) -> dict[str, str]:
-    """Returns the task of each run folder with a policy directly below the folders, in order;
-    others are left out.
-    """
+    """Returns the task of each run folder with a policy directly below the folders, in order."""
     found = {}
     for folder in folders:
         for path in sorted(folder.glob(f"*/{POLICY_FILE}")):

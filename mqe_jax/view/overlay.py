@@ -1,6 +1,4 @@
-"""What the scene can show over the robots: contact points with forces, collision shapes, and what a
-robot senses.
-"""
+"""What the scene shows over the robots: contact forces, collision shapes, what a robot senses."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -13,19 +11,19 @@ from mqe_jax.sensors.marks import Marks
 from mqe_jax.viz.geometry import COLLISION_GROUP, pose
 from mqe_jax.viz.recording import Episode
 
-# of an arrow, m
-_METRES_PER_NEWTON = 0.004
-_LONGEST = 1.0
+_METRES_PER_NEWTON = 0.004  # of an arrow
+_LONGEST = 1.0  # length of an arrow, m
 _FORCE = (224, 60, 40)
 _SHAPE = (224, 138, 44)
-# towards which lines and points fade, as viser draws them opaque
-_BACKGROUND = np.array([0.7, 0.7, 0.65])
+_BACKGROUND = np.array([0.7, 0.7, 0.65])  # colour of faded lines and points, as viser's are opaque
 _AREA = 0.3  # opacity of an area
 
 
 class Overlay:
-    """Contacts and a robot's marks of one environment, and collision shapes of all, below the
-    movable root frame of a `Stage`."""
+    """Contacts and a robot's marks of one environment, and collision shapes of all.
+
+    They are below the movable root frame of a `Stage`.
+    """
 
     def __init__(self, server: Any, model: mujoco.MjModel, offset: np.ndarray) -> None:
         """Draws nothing yet; `offset` (N, 3) is the place of each environment, m."""
@@ -42,11 +40,11 @@ class Overlay:
         """Adds or removes the collision shapes of robots and objects, as wire frames."""
         for _, handle in self._shapes:
             handle.remove()
-        self._shapes = (
-            [(body, self._add(body, geoms)) for body, geoms in self._bodies().items()]
-            if shown
-            else []
-        )
+        self._shapes = []
+        if shown:
+            self._shapes = [
+                (body, self._add(body, geoms)) for body, geoms in self._bodies().items()
+            ]
 
     def draw(self, frame: Episode, index: int, qvel: np.ndarray, ctrl: np.ndarray) -> None:
         """Places the shapes of all environments, and draws the contacts of environment `index`."""
@@ -64,9 +62,8 @@ class Overlay:
             self._arrows.remove()
             self._arrows = None
         if self.contacts:
-            arrows = contact_arrows(
-                self._model, self._data, frame.cut(slice(index, index + 1)), qvel, ctrl
-            )
+            selected = frame.cut(slice(index, index + 1))
+            arrows = contact_arrows(self._model, self._data, selected, qvel, ctrl)
             if len(arrows):
                 self._arrows = self._server.scene.add_arrows(
                     "/world/contacts",
@@ -82,9 +79,9 @@ class Overlay:
         with self._server.atomic():
             for handle in self._sensed:
                 handle.remove()
-            self._sensed = [
-                handle for mark in marks for handle in self._add_marks(mark, index, agent)
-            ]
+            self._sensed = []
+            for mark in marks:
+                self._sensed += self._add_marks(mark, index, agent)
 
     def _add_marks(self, mark: Marks, index: int, agent: int) -> Iterator[Any]:
         """Yields the handles of what it draws: lines, points, an area."""
@@ -104,15 +101,14 @@ class Overlay:
             yield scene.add_point_cloud(
                 f"{name}/points", (spots + offset).astype(np.float32), colors, **look
             )
-        if corners := mark.area.shape[2]:
+        corners = mark.area.shape[2]
+        if corners:
             faces = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
-            look = {
-                "color": tuple(int(255 * part) for part in mark.color),
-                "opacity": _AREA,
-                "side": "double",
-            }
+            color = tuple(int(255 * part) for part in mark.color)
             area = (mark.area[index, agent] + offset).astype(np.float32)
-            yield scene.add_mesh_simple(f"{name}/area", area, faces, **look)
+            yield scene.add_mesh_simple(
+                f"{name}/area", area, faces, color=color, opacity=_AREA, side="double"
+            )
 
     def _bodies(self) -> dict[int, list[int]]:
         found: dict[int, list[int]] = {}
@@ -138,20 +134,16 @@ class Overlay:
 
 
 def _shown(mark: Marks, places: Any, opacity: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the places of lines or points that are not hidden, and their colours (n, 3), 0 to
-    255.
-    """
+    """Returns the places of visible lines or points, and their colours (n, 3), 0 to 255."""
     part = opacity[opacity > 0, None]
-    return places[opacity > 0], (
-        255 * (part * np.array(mark.color) + (1 - part) * _BACKGROUND)
-    ).astype(np.uint8)
+    colors = 255 * (part * np.array(mark.color) + (1 - part) * _BACKGROUND)
+    return places[opacity > 0], colors.astype(np.uint8)
 
 
 def contact_arrows(
     model: mujoco.MjModel, data: mujoco.MjData, frame: Episode, qvel: np.ndarray, ctrl: np.ndarray
 ) -> np.ndarray:
-    """Returns the start and end (C, 2, 3), m, of an arrow per contact: its point, and its force as
-    MuJoCo computes it.
+    """Returns the start and end (C, 2, 3), m, of an arrow per contact: its point and its force.
 
     250 N are one metre; arrows are not longer. The model has the physics' actuators; `data` is a
     workspace, `frame` one pose, with velocities (nv,) and actuator targets (nu,).
@@ -166,11 +158,10 @@ def contact_arrows(
         contact = data.contact[i]
         mujoco.mj_contactForce(model, data, i, force)
         turn = contact.frame.reshape(3, 3).T
-        # the force acts on the second geom; the first may be the robot
-        second = model.geom_bodyid[contact.geom2] != 0
-        arrow = _METRES_PER_NEWTON * (turn @ force[:3]) * (1.0 if second else -1.0)
+        arrow = _METRES_PER_NEWTON * (turn @ force[:3])
+        if model.geom_bodyid[contact.geom2] == 0:  # the force acts on the second geom: the world
+            arrow = -arrow
+        length = max(float(np.linalg.norm(arrow)), 1e-9)
         arrows[i, 0] = contact.pos
-        arrows[i, 1] = contact.pos + arrow * min(
-            1.0, _LONGEST / max(float(np.linalg.norm(arrow)), 1e-9)
-        )
+        arrows[i, 1] = contact.pos + arrow * min(1.0, _LONGEST / length)
     return arrows

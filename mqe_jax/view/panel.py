@@ -31,18 +31,8 @@ _MOST_STEPS = 25  # single steps waiting
 ACTION = "action"
 FREE = "free"
 NONE = "none"
-_COLORS = (
-    "#2f7fd6",
-    "#3fae49",
-    "#d64545",
-    "#e08a2c",
-    "#7d5bbe",
-    "#3aa7a3",
-    "#8a8f99",
-    "#c2549d",
-    "#23252b",
-)
-_POINTS = 200
+_COLORS = "#2f7fd6 #3fae49 #d64545 #e08a2c #7d5bbe #3aa7a3 #8a8f99 #c2549d #23252b".split()
+_POINTS = 200  # of a plot
 
 
 class Panel:
@@ -57,27 +47,26 @@ class Panel:
         robots: Sequence[str] = (),
         menu: Menu | None = None,
     ) -> None:
-        """Adds the controls to a page: `bodies` are labels of those that the camera can follow,
-        `robots` of agents.
+        """Adds the controls to a page.
 
-        `on_camera` is called when another body is chosen. Without a menu no tasks and policies are
-        offered.
+        `bodies` are labels of what the camera can follow, `robots` of the agents. The panel calls
+        `on_camera` when the user chooses another body. Without a menu it offers no tasks and
+        policies.
         """
         self._session = session
         self._gui = server.gui
         self._on_camera = on_camera
-        self._robots = tuple(robots) or tuple(
-            f"robot {i + 1}" for i in range(session.env.num_agents)
-        )
+        numbered = [f"robot {i + 1}" for i in range(session.env.num_agents)]
+        self._robots = tuple(robots or numbered)
         self._wanted_steps = 0
         self._wants_reset = False
         self._wanted: Entry | None = None
         self.camera = ACTION if session.num_envs == 1 else FREE  # or the label of the followed body
-        # the selected environment, and the steps by which the shown one lies back
-        self.env = 0
-        self.back = 0
-        self.contacts = self.shapes = False  # what is shown of them
-        self.sensors = session.senses  # whether it is shown what a robot senses
+        self.env = 0  # index of the selected environment
+        self.back = 0  # steps between the shown moment and now
+        self.contacts = False
+        self.shapes = False
+        self.sensors = session.senses
         self._state = self._gui.add_html("")
         if menu is not None:
             self._add_menu(menu)
@@ -87,9 +76,8 @@ class Panel:
             self._add_drive()
         with self._gui.add_folder("Reward terms in this step"):
             self._bars = self._gui.add_html("")
-        with self._gui.add_folder(
-            "Observation of the driven robot (default: robot 1)", expand_by_default=False
-        ):
+        title = "Observation of the driven robot (default: robot 1)"
+        with self._gui.add_folder(title, expand_by_default=False):
             self._observation = self._gui.add_html("")
         self._add_plots()
 
@@ -116,50 +104,48 @@ class Panel:
         self._state.content = paragraph(text, strong)
 
     def show(self, positions: np.ndarray, real_time: float) -> None:
-        """Shows the robots' positions (A, 3), m, in the selected environment, and the real-time
-        factor.
+        """Shows the robots' positions (A, 3), m, in the selected environment, and the speed.
+
+        `real_time` is the factor of real time.
         """
         session = self._session
         index = session.at(self.back) if session.moments else 0
-        commands = (
-            session.commands[index][self.env] if session.commands else np.zeros((len(positions), 3))
-        )
+        commands = np.zeros((len(positions), 3))
+        if session.commands:
+            commands = session.commands[index][self.env]
         rows = []
-        for agent, (x, y, z) in enumerate(positions):
-            vx, vy, turn = commands[agent]
-            chosen = session.drivable and (session.drive.env, session.drive.robot) == (
-                self.env,
-                agent,
-            )
-            name = self._robots[agent].removeprefix("robot ") + (" (driven)" if chosen else "")
-            rows.append(
-                (name, *(f"{v:.2f}" for v in (x, y, z)), *(f"{v:+.2f}" for v in (vx, vy, turn)))
-            )
+        driven = (session.drive.env, session.drive.robot) if session.drivable else None
+        for agent, position in enumerate(positions):
+            name = self._robots[agent].removeprefix("robot ")
+            if driven == (self.env, agent):
+                name += " (driven)"
+            places = [f"{value:.2f}" for value in position]
+            rows.append((name, *places, *(f"{value:+.2f}" for value in commands[agent])))
         pace = "paused" if session.paused else f"{real_time:.2f} x real time"
-        head = paragraph(
-            f"at {(session.steps - self.back) * session.env.dt:.2f} s, {pace}", session.env.name
-        )
-        head += self._score(float(session.rewards[index][self.env, -1]) if session.rewards else 0.0)
-        self._state.content = head + table(("robot", "x", "y", "z", "vx", "vy", "turn"), rows)
+        shown = (session.steps - self.back) * session.env.dt
+        reward = 0.0
         if session.rewards:
+            rewards = session.rewards[index][self.env].tolist()
+            reward = rewards[-1]
             terms = [name.removeprefix("reward/") for name in (*session.terms[:-1], "sum")]
-            self._bars.content = bars(terms, session.rewards[index][self.env].tolist())
+            self._bars.content = bars(terms, rewards)
+        head = paragraph(f"at {shown:.2f} s, {pace}", session.env.name) + self._score(reward)
+        self._state.content = head + table(("robot", "x", "y", "z", "vx", "vy", "turn"), rows)
         obs = session.moment(self.back).obs[self.env, session.drive.robot or 0]
-        self._observation.content = observation_table(
-            getattr(session.env, "observation_layout", None), obs
-        )
+        layout = getattr(session.env, "observation_layout", None)
+        self._observation.content = observation_table(layout, obs)
 
     def _score(self, reward: float) -> str:
         session = self._session
         text = f"episode {session.episodes[self.env] + 1}, reward {reward:+.3f} per step"
-        counts = ", ".join(
-            f"{name} {count}" for name, count in zip(session.outcomes, session.counts, strict=True)
-        )
+        pairs = zip(session.outcomes, session.counts, strict=True)
+        counts = ", ".join(f"{name} {count}" for name, count in pairs)
         team = f"{self._robots[0]}'s team" if len(session.outcomes) > 1 else "episodes"
         last = f"; last: {session.last[self.env]}" if session.last[self.env] else ""
         return paragraph(text) + paragraph(f"{team}: {counts} of {session.episodes.sum()}{last}")
 
     def plot(self) -> None:
+        """Draws the rewards and the driven robot's commands over time."""
         session = self._session
         if len(session.times) < 2:
             return
@@ -168,8 +154,8 @@ class Panel:
         rewards = np.stack(list(session.rewards)[::every])[:, self.env]
         self._reward_plot.data = (times, *rewards.T.astype(float))
         if self._command_plot is not None:
-            agent = session.drive.robot if session.drive.robot is not None else 0
-            commands = np.stack(list(session.commands)[::every])[:, self.env, agent]
+            commands = np.stack(list(session.commands)[::every])
+            commands = commands[:, self.env, session.drive.robot or 0]
             self._command_plot.data = (times, *commands.T.astype(float))
 
     def _add_menu(self, menu: Menu) -> None:
@@ -299,14 +285,10 @@ class Panel:
                 "Driven", (NONE, *names), initial_value=NONE, hint="Teleoperated robot"
             )
             keys = " ".join(key for _, _, key in DIRECTIONS)
-            hint = (
-                f"Hold a button to drive; each press of {keys} changes the command by a "
-                "quarter, X stops."
-            )
-            gui.add_html(paragraph(hint))
-            buttons = [
-                gui.add_button(label, hint=f"Hold, or key {key}") for label, _, key in DIRECTIONS
-            ]
+            text = "Hold a button to drive; each press of"
+            gui.add_html(paragraph(f"{text} {keys} changes the command by a quarter, X stops."))
+            for label, direction, key in DIRECTIONS:
+                self._add_direction(label, direction, key)
             stop = gui.add_button("Stop", hint="Key X")
 
         def choose(_: Any) -> None:
@@ -319,11 +301,16 @@ class Panel:
         robot.on_update(choose)
         stop.on_click(halt)
         gui.add_command("Stop", hotkey="X").on_trigger(halt)
-        for button, (label, direction, key) in zip(buttons, DIRECTIONS, strict=True):
-            vx, vy, turn = direction
-            button.on_hold(lambda _, held=direction: drive.hold(held), callback_hz=HOLD_RATE)
-            step = (KEY_STEP * vx, KEY_STEP * vy, KEY_STEP * turn)
-            gui.add_command(label, hotkey=key).on_trigger(lambda _, by=step: drive.change(by))
+
+    def _add_direction(self, label: str, direction: tuple[float, float, float], key: str) -> None:
+        """Adds the button and the key that drive the robot in a direction."""
+        gui = self._gui
+        drive = self._session.drive
+        vx, vy, turn = direction
+        step = (KEY_STEP * vx, KEY_STEP * vy, KEY_STEP * turn)
+        button = gui.add_button(label, hint=f"Hold, or key {key}")
+        button.on_hold(lambda _: drive.hold(direction), callback_hz=HOLD_RATE)
+        gui.add_command(label, hotkey=key).on_trigger(lambda _: drive.change(step))
 
     def _add_plots(self) -> None:
         session = self._session
@@ -340,11 +327,8 @@ class Panel:
             {"label": name, "stroke": _COLORS[i % len(_COLORS)], "width": 1.5}
             for i, name in enumerate(names)
         ]
-        empty = tuple(
-            np.array([0.0, 1.0]) if i == 0 else np.zeros(2) for i in range(len(names) + 1)
-        )
         return self._gui.add_uplot(
-            empty,
+            (np.array([0.0, 1.0]), *(np.zeros(2) for _ in names)),
             ({"label": "s"}, *lines),
             scales={"x": {"time": False}},
             legend={"show": True},
@@ -354,16 +338,13 @@ class Panel:
 
 
 def robot_labels(model: mujoco.MjModel) -> list[str]:
-    """Returns `robot 1 (blue)`, ... for all robots of a rendering model, without colours if they
-    bear numbers.
+    """Returns `robot 1 (blue)`, ... for all robots of a rendering model.
+
+    Robots that bear numbers have no colour in their label.
     """
     shown = np.array([robot_color(model, trunk) for trunk in trunk_bodies(model)])
     if len(shown) > UNNUMBERED:
         return [f"robot {i + 1}" for i in range(len(shown))]
-    apart = np.linalg.norm(
-        shown[:, None] - np.array(ROBOT_COLORS[: len(ROBOT_COLOR_NAMES)]), axis=-1
-    )
-    return [
-        f"robot {i + 1} ({ROBOT_COLOR_NAMES[nearest]})"
-        for i, nearest in enumerate(apart.argmin(axis=1))
-    ]
+    named = np.array(ROBOT_COLORS[: len(ROBOT_COLOR_NAMES)])
+    nearest = np.linalg.norm(shown[:, None] - named, axis=-1).argmin(axis=1)
+    return [f"robot {i + 1} ({ROBOT_COLOR_NAMES[color]})" for i, color in enumerate(nearest)]

@@ -1,14 +1,14 @@
-"""viser's web server, restricted to requests to its own address, from its own page or from no page
-at all.
+"""viser's web server, restricted to requests to its own address.
+
+It accepts those from its own page or from no page at all.
 
 Browsers let every page open a websocket to every address, and name the page's origin in the header
 `Origin`, which a page cannot change. A page whose name resolves to this machine (DNS rebinding) is
 of the same origin, with its own name in the header `Host`. Programs other than browsers send no
 `Origin`; they are accepted, since they could send any.
 
-viser has no setting for this. Written for viser 1.1.1, which starts its server by
-`websockets.asyncio.server.serve`. While viser starts, that name is replaced by a function that adds
-the documented argument `process_request`.
+viser has no setting for this. viser 1.1.1 starts its server by `websockets.asyncio.server.serve`.
+While viser starts, a function that adds the documented argument `process_request` replaces it.
 """
 
 import contextlib
@@ -37,16 +37,14 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     serving = False
 
     def answer(page: Any, connection: ServerConnection, request: Request) -> Response | None:
-        """Returns the response to a request, or None if it opens a websocket; `page` serves the
-        files of the page.
+        """Returns the response to a request, or None if it opens a websocket.
+
+        `page` serves the files of the page.
         """
         address, local_port = connection.local_address[:2]
+        allowed = authorities(host, address, local_port)
         headers = request.headers
-        reason = refusal(
-            headers.get_all("Host"),
-            headers.get_all("Origin"),
-            authorities(host, address, local_port),
-        )
+        reason = refusal(headers.get_all("Host"), headers.get_all("Origin"), allowed)
         if reason is not None:
             echo(f"mqe: view: rejected a connection: {brief(reason)}")
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"mqe view: {reason}\n")
@@ -58,9 +56,8 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         nonlocal serving
         serving = True
-        return original(
-            *arguments, process_request=functools.partial(answer, process_request), **options
-        )
+        restricted = functools.partial(answer, process_request)
+        return original(*arguments, process_request=restricted, **options)
 
     websockets_server.serve = serve  # type: ignore[misc]
     try:
@@ -77,22 +74,23 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
 
 
 def authorities(host: str, address: str, port: int) -> frozenset[str]:
-    """Returns the values of the header `Host` that name this server, in lower case, on loopback
-    localhost too.
+    """Returns the values of the header `Host` that name this server, in lower case.
 
-    `host` is the host to listen on, `address` the local IP address of the connection, `port` its
-    port.
+    On loopback, localhost is one of them. `host` is the host to listen on, `address` the local IP
+    address of the connection, `port` its port.
     """
     names = {host.lower(), address}
     if ipaddress.ip_address(address.partition("%")[0]).is_loopback:
         names |= {"localhost", "127.0.0.1", "::1"}
     names = {f"[{name}]" if ":" in name else name for name in names}
-    return frozenset(f"{name}:{port}" for name in names) | (names if port == 80 else set())
+    allowed = {f"{name}:{port}" for name in names}
+    return frozenset(allowed | names if port == 80 else allowed)
 
 
 def refusal(hosts: Sequence[str], origins: Sequence[str], allowed: frozenset[str]) -> str | None:
-    """Returns why a request is rejected, or None; `hosts` and `origins` are all values of the two
-    headers.
+    """Returns why a request is rejected, or None.
+
+    `hosts` and `origins` are all values of the two headers.
     """
     if len(hosts) != 1 or hosts[0].lower() not in allowed:
         return f"Host is {' and '.join(hosts) or 'missing'}, allowed: {', '.join(sorted(allowed))}"

@@ -15,11 +15,11 @@ from mqe_jax.viz.geometry import COLLISION_GROUP, extent, pose, pose_frames, ren
 from mqe_jax.viz.recording import Episode
 
 _GAP = 0.6  # m between environments
-# intensities of the light
-_SKY = 2.4
+_SKY = 2.4  # intensity of the light
 _SUN = 2.7
 _OPAQUE = 0.5  # opacity below which geoms are left out: meshes of several colours have none
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,9 @@ class _Batch:
 
 
 class Stage:
-    """Renders N environments under one movable root frame, which keeps a followed body at the
-    origin.
+    """Renders N environments under one movable root frame.
+
+    It keeps a followed body at the origin.
     """
 
     span = 0.0  # diagonal of the box about the followed bodies, m
@@ -42,13 +43,13 @@ class Stage:
         self._model = model
         self._data = mujoco.MjData(self._model)
         self._count = len(frame)
-        first = frame.cut(slice(1))
-        low, high = extent(rendering_model(self._model, first), first)
+        single = frame.cut(slice(1))
+        low, high = extent(rendering_model(self._model, single), single)
         self.centre = (low + high) / 2
         self.size = high - low
         shift = (high[1] - low[1] + _GAP) * (np.arange(self._count) - (self._count - 1) / 2)
-        # (N, 3)
-        self.offset = np.stack([np.zeros(self._count), shift, np.zeros(self._count)], axis=1)
+        self.offset = np.zeros((self._count, 3))
+        self.offset[:, 1] = shift
         self._mocap: np.ndarray | None = None
         self.bodies = followable(self._model)
         self._root = server.scene.add_frame("/world", show_axes=False)
@@ -57,18 +58,18 @@ class Stage:
         fixed, moving, self._walls = _sort_geoms(self._model)
         still = [self._add_batch(f"fixed/{body}", geoms, [body]) for body, geoms in fixed.items()]
         self._place(still, *self._poses(frame))
-        groups = self._group(moving)
-        self._batches = [
-            self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies) for bodies in groups
-        ]
+        self._batches = []
+        for bodies in self._group(moving):
+            first = bodies[0]
+            self._batches.append(self._add_batch(f"moving/{first}", moving[first], bodies))
         self._wall_handles = [self._add_wall(geom) for geom in self._walls]
         self.draw(frame)
 
     def draw(self, frame: Episode, followed: tuple[int, list[int]] | None = None) -> None:
-        """Renders the environments' poses; the middle of `followed` (environment, bodies) is kept
-        at the origin.
+        """Renders the environments' poses, with the middle of `followed` at the origin.
 
-        Robots that take no part in the episode are not followed.
+        `followed` are an environment and bodies of it. Robots that take no part in the episode are
+        not followed.
         """
         positions, turns = self._poses(frame)
         with self._server.atomic():
@@ -93,9 +94,8 @@ class Stage:
 
     def _place(self, batches: list[_Batch], positions: np.ndarray, turns: np.ndarray) -> None:
         for batch in batches:
-            batch.handle.batched_positions = (
-                positions[:, batch.bodies].reshape(-1, 3).astype(np.float32)
-            )
+            places = positions[:, batch.bodies].reshape(-1, 3)
+            batch.handle.batched_positions = places.astype(np.float32)
             batch.handle.batched_wxyzs = turns[:, batch.bodies].reshape(-1, 4).astype(np.float32)
 
     def overview(self) -> tuple[np.ndarray, np.ndarray]:
@@ -104,33 +104,26 @@ class Stage:
         return chase(self.centre * [1.0, 0.0, 0.0], 1.4 * float(size))
 
     def release(self) -> None:
+        """Stops following bodies."""
         self._root.position = (0.0, 0.0, 0.0)
 
     def _draw_walls(self, frame: Episode) -> None:
-        """Renders the moving walls after a change of their poses, clipped at the side walls of the
-        track.
-        """
-        if not self._walls or (
-            self._mocap is not None and np.array_equal(self._mocap, frame.mocap_pos)
-        ):
+        """Renders the moving walls if their poses have changed, clipped at the side walls."""
+        unchanged = self._mocap is not None and np.array_equal(self._mocap, frame.mocap_pos)
+        if unchanged or not self._walls:
             return
         self._mocap = frame.mocap_pos.copy()
-        boxes = [
-            _wall_boxes(self._model, frame.cut(slice(i, i + 1)), self._walls)
-            for i in range(self._count)
-        ]
+        frames = [frame.cut(slice(i, i + 1)) for i in range(self._count)]
+        boxes = [_wall_boxes(self._model, one, self._walls) for one in frames]
+        centres, turns, sizes = (np.stack(part, 1) for part in zip(*boxes, strict=True))
+        centres = centres + self.offset
         for index, handle in enumerate(self._wall_handles):
-            centre, turn, size = (
-                np.stack([box[k][index] for box in boxes]).astype(np.float32) for k in range(3)
-            )
-            handle.batched_positions = centre + self.offset.astype(np.float32)
-            handle.batched_wxyzs = turn
-            handle.batched_scales = size
+            handle.batched_positions = centres[index].astype(np.float32)
+            handle.batched_wxyzs = turns[index].astype(np.float32)
+            handle.batched_scales = sizes[index].astype(np.float32)
 
     def _add_light(self) -> None:
-        """Lights the scene about as clips are lit: viser's own lights and surroundings wash colours
-        out.
-        """
+        """Lights the scene as clips are lit; viser's lights and surroundings wash colours out."""
         scene = self._server.scene
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
@@ -140,32 +133,28 @@ class Stage:
         )
 
     def _add_floor(self, low: np.ndarray, high: np.ndarray) -> None:
-        side = [
-            float(high[0] - low[0]) + 4.0,
-            float(high[1] - low[1]) + 2 * float(self.offset[-1, 1]) + 4.0,
-        ]
+        model = self._model
+        length = float(high[0] - low[0]) + 4.0
+        width = float(high[1] - low[1]) + 2 * float(self.offset[-1, 1]) + 4.0
         middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
-        floor = np.flatnonzero(
-            (self._model.geom_type == _PLANE) & (self._model.geom_group == GROUND_GROUP)
-        )[0]
-        colour = tuple(round(255 * float(c)) for c in self._model.geom_rgba[floor, :3])
+        floors = (model.geom_type == _PLANE) & (model.geom_group == GROUND_GROUP)
+        colour = tuple(round(255 * float(c)) for c in model.geom_rgba[floors][0, :3])
         self._server.scene.add_box(
             "/world/floor",
             color=colour,
-            dimensions=(*side, 0.02),
+            dimensions=(length, width, 0.02),
             position=(*middle, -0.012),
             cast_shadow=False,
         )
 
     def _group(self, moving: dict[int, list[int]]) -> list[list[int]]:
-        """Returns the moving bodies, grouped by their geoms: bodies with the same ones share a
-        mesh.
-        """
+        """Returns the moving bodies, in groups of the same geoms, which share a mesh."""
         names = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
         fields = [np.round(getattr(self._model, f"geom_{name}"), 5) + 0.0 for name in names]
         groups: dict[bytes, list[int]] = {}
         for body, geoms in moving.items():
-            groups.setdefault(b"".join(field[geoms].tobytes() for field in fields), []).append(body)
+            look = b"".join(field[geoms].tobytes() for field in fields)
+            groups.setdefault(look, []).append(body)
         return list(groups.values())
 
     def _add_batch(self, name: str, geoms: list[int], bodies: list[int]) -> _Batch:
@@ -195,13 +184,14 @@ class Stage:
 
 
 def chase(look_at: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns camera position and look-at point (3,), m, at a distance from behind and above, m."""
+    """Returns camera position and look-at point (3,), m, from behind and above at a distance, m."""
     return look_at + distance * np.array([-0.62, -0.28, 0.73]), look_at
 
 
 def start_frame(env: QuadrupedEnv, num_envs: int) -> Episode:
-    """Returns the robots at their start, in `num_envs` frames: the mean of the initial states,
-    without compilation.
+    """Returns the robots at their start, the mean of the initial states, in `num_envs` frames.
+
+    It compiles nothing.
     """
     index = env.index
     data = mujoco.MjData(env.compiled.model)
@@ -209,9 +199,8 @@ def start_frame(env: QuadrupedEnv, num_envs: int) -> Episode:
     qpos[index.joint_qpos] = env.robot.default_joints
     for row, (x, y, yaw) in zip(index.base_qpos, env.spawn_poses(), strict=True):
         qpos[row] = (x, y, env.params.spawn_height, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
-    return Episode(
-        *(np.stack([x] * num_envs) for x in (qpos, data.mocap_pos, data.mocap_quat)), dt=env.dt
-    )
+    poses = [np.stack([x] * num_envs) for x in (qpos, data.mocap_pos, data.mocap_quat)]
+    return Episode(*poses, dt=env.dt)
 
 
 def followable(model: mujoco.MjModel) -> dict[str, int]:
@@ -221,30 +210,27 @@ def followable(model: mujoco.MjModel) -> dict[str, int]:
         body = int(model.jnt_bodyid[joint])
         if int(model.body_rootid[body]) == body:
             kind, _, name = model.body(body).name.partition("/")
-            labels[f"robot {int(kind[5:]) + 1}" if kind.startswith("robot") else name or kind] = (
-                body
-            )
+            if kind.startswith("robot"):
+                name = f"robot {int(kind[5:]) + 1}"
+            labels[name or kind] = body
     return labels
 
 
 def _sort_geoms(
     model: mujoco.MjModel,
 ) -> tuple[dict[int, list[int]], dict[int, list[int]], list[int]]:
-    """Returns the visible geoms of fixed and of moving bodies, by body, and the boxes of mocap
-    bodies.
-    """
+    """Returns the visible geoms of fixed and of moving bodies, by body, and mocap bodies' boxes."""
     fixed: dict[int, list[int]] = {}
     moving: dict[int, list[int]] = {}
     walls = []
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
-        if int(model.geom_group[geom]) == COLLISION_GROUP or int(model.geom_type[geom]) == _PLANE:
+        kind = int(model.geom_type[geom])
+        if int(model.geom_group[geom]) == COLLISION_GROUP or kind == _PLANE:
             continue
         if model.geom_rgba[geom, 3] < _OPAQUE:
             continue
-        if model.body_mocapid[body] >= 0 and int(model.geom_type[geom]) == int(
-            mujoco.mjtGeom.mjGEOM_BOX
-        ):
+        if model.body_mocapid[body] >= 0 and kind == _BOX:
             walls.append(geom)
         elif is_fixed_body(model, body):
             fixed.setdefault(body, []).append(geom)
@@ -256,8 +242,9 @@ def _sort_geoms(
 def _wall_boxes(
     model: mujoco.MjModel, episode: Episode, geoms: list[int]
 ) -> tuple[np.ndarray, ...]:
-    """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls, clipped at the
-    side walls.
+    """Returns centre (G, 3), quaternion (G, 4) and half sizes (G, 3) of the walls.
+
+    They end at the side walls.
     """
     clipped = rendering_model(model, episode)
     data = next(pose_frames(clipped, episode, [0]))

@@ -18,8 +18,9 @@ from mqe_jax.view.stage import Stage, chase, start_frame
 from mqe_jax.viz.recording import Episode
 
 DRAW_RATE = 25.0
+"""Frames per second of the scene."""
 PANEL_RATE = 5.0
-"""Frames per second of the scene, and of state and plots."""
+"""Frames per second of state and plots."""
 _FIELD_OF_VIEW = 0.87  # rad, vertical
 _BEHIND = 0.25  # lag behind real time beyond which the schedule is reset, s
 
@@ -32,14 +33,13 @@ class Viewer:
     def __init__(self, host: str = "127.0.0.1", port: int = 8080, menu: Menu | None = None) -> None:
         """Starts the server with an empty page; `menu` lets the page choose other sessions."""
         self.server = open_server(host, port, "mqe view")
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
+        name = f"[{host}]" if ":" in host else host
+        self.url = f"http://{name}:{self.server.get_port()}"
         self._menu = menu
         self._announced = False
 
     def announce(self, env: QuadrupedEnv, num_envs: int) -> None:
-        """Shows a task with its robots at their start, before the session that `run` opens: that
-        compiles.
-        """
+        """Shows a task with its robots at their start, while `run` opens and compiles a session."""
         self._build(env.mj_model, start_frame(env, num_envs))
         self.server.gui.add_html(paragraph("is being compiled", env.name))
         self._announced = True
@@ -49,7 +49,8 @@ class Viewer:
         self._clear()
         self._stage = Stage(self.server, model, frame)
         self.server.initial_camera.fov = _FIELD_OF_VIEW
-        self._point(frame, (0, list(self._stage.bodies.values())) if len(frame) == 1 else None)
+        followed = (0, list(self._stage.bodies.values())) if len(frame) == 1 else None
+        self._point(frame, followed)
 
     def _clear(self) -> None:
         self.server.gui.reset()
@@ -59,8 +60,9 @@ class Viewer:
         self.server.gui.main_panel.dock_right()
 
     def show(self, session: Session) -> None:
-        """Builds scene and panel of a session, in place of the last ones; the scene of `announce`
-        stays.
+        """Builds scene and panel of a session, in place of the last ones.
+
+        The scene of `announce` stays.
         """
         self.session = session
         model = session.env.mj_model
@@ -81,8 +83,9 @@ class Viewer:
         self._aim()
 
     def run(self, open_session: Callable[[], Session]) -> None:
-        """Opens a session, steps and renders it at its speed until an exception; then stops the
-        server.
+        """Opens a session, then steps and renders it at its speed until an exception.
+
+        It stops the server in the end.
         """
         try:
             self.show(open_session())
@@ -106,21 +109,25 @@ class Viewer:
                     drawn = now
                     self._draw()
                 if now - shown >= 1 / PANEL_RATE:
-                    real_time = (self.session.steps - counted) * dt / (now - shown)
+                    self._show_panel((self.session.steps - counted) * dt / (now - shown))
                     shown = now
                     counted = self.session.steps
-                    agents = self.session.env.index.base_qpos[: self.session.env.num_agents, :3]
-                    frame = self.session.moment(self._panel.back).frame
-                    self._panel.show(frame.qpos[self._panel.env, agents], real_time)
-                    self._panel.plot()
                 if not stepped:
                     time.sleep(max(0.001, min(due - now, 0.01)))
         finally:
             self.server.stop()
 
+    def _show_panel(self, real_time: float) -> None:
+        env = self.session.env
+        frame = self.session.moment(self._panel.back).frame
+        agents = env.index.base_qpos[: env.num_agents, :3]
+        self._panel.show(frame.qpos[self._panel.env, agents], real_time)
+        self._panel.plot()
+
     def _open_chosen(self) -> bool:
-        """Opens the session that was chosen on the page, if any; keeps the current one if that is
-        not possible.
+        """Opens the session that the user chose on the page, if any; returns whether it did.
+
+        The current session stays if the other one cannot be opened.
         """
         choice = self._panel.take_choice()
         if choice is None or self._menu is None:
@@ -146,14 +153,11 @@ class Viewer:
             self._overlay.show_shapes(self._shapes)
         self._overlay.contacts = panel.contacts
         self._overlay.draw(moment.frame, panel.env, moment.qvel[panel.env], moment.ctrl[panel.env])
-        self._overlay.draw_marks(
-            moment.marks if panel.sensors else (), panel.env, self.session.drive.robot or 0
-        )
+        marks = moment.marks if panel.sensors else ()
+        self._overlay.draw_marks(marks, panel.env, self.session.drive.robot or 0)
 
     def _step_if_due(self, now: float, due: float) -> bool:
-        """Handles reset and single-step requests, advances if the next step is due; returns whether
-        it was due.
-        """
+        """Handles reset and single-step requests; advances and returns True if a step is due."""
         if self._panel.take_reset():
             self.session.reset()
         for _ in range(self._panel.take_steps()):
@@ -167,17 +171,15 @@ class Viewer:
         camera = self._panel.camera
         if camera == FREE:
             return None
-        return self._panel.env, list(self._bodies.values()) if camera == ACTION else [
-            self._bodies[camera]
-        ]
+        if camera == ACTION:
+            return self._panel.env, list(self._bodies.values())
+        return self._panel.env, [self._bodies[camera]]
 
     def _aim(self) -> None:
         self._point(self.session.moment(self._panel.back).frame, self._target())
 
     def _point(self, frame: Episode, followed: tuple[int, list[int]] | None) -> None:
-        """Points the cameras of all clients, also of later ones, at the followed bodies or the
-        whole scene.
-        """
+        """Points the cameras of all clients, also of later ones, at bodies or the whole scene."""
         if followed is None:
             self._stage.release()
             position, look_at = self._stage.overview()
