@@ -3,7 +3,7 @@
 
 The advantage of an actor's turn is multiplied by the probability ratios of the agents that have had
 theirs, so that it responds to what they do now. `python examples/happo.py` trains Narrow Gate; a
-few minutes on a CPU.
+few minutes on a CPU. Once registered, it is selected by `stages: {name: happo}` in YAML.
 """
 
 from __future__ import annotations
@@ -15,26 +15,48 @@ import jax.numpy as jnp
 
 import mqe_jax
 from mqe_jax.core.types import Batch, where_rows
+from mqe_jax.train.algorithms import StagesSettings, register_stages
+from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.loss import ratio_per_agent
+from mqe_jax.train.networks import Network
 from mqe_jax.train.schedules import Scheduled
 from mqe_jax.train.stages import Carry, Metrics, Stages
 
 SETTINGS = {
+    "stages.name": "happo",
     "network.share_policy": False,
     "network.critic_input": "privileged",
     "ppo.value": "joint",
 }
 
 
-class Happo(Stages):
-    """An update in a turn of each agent, in random order; the critic learns in every turn."""
+@register_stages("happo")
+class Happo(StagesSettings):
+    """Settings of the algorithm."""
+
+    random_order: bool = True
+    """Draw the order of the agents' turns for every update; else they keep that of their ids."""
+
+    def build(self, network: Network, config: TrainConfig) -> Stages:
+        """Returns the stages of a training."""
+        return Turns(network, config, random_order=self.random_order)
+
+
+class Turns(Stages):
+    """An update in a turn of each agent; the critic learns in every turn."""
+
+    def __init__(self, network: Network, config: TrainConfig, *, random_order: bool) -> None:
+        super().__init__(network, config)
+        self.random_order = random_order
 
     def update(
         self, carry: Carry, batch: Batch, now: Scheduled, key: jax.Array
     ) -> tuple[Carry, Metrics]:
         agents = batch.active.shape[-1]
         order_key, key = jax.random.split(key)
-        order = jax.random.permutation(order_key, agents)
+        order = jnp.arange(agents)
+        if self.random_order:
+            order = jax.random.permutation(order_key, agents)
 
         def turn(before: tuple[Carry, jax.Array], inputs: tuple[jax.Array, jax.Array]) -> Any:
             (carry, factor) = before
@@ -43,7 +65,7 @@ class Happo(Stages):
             own = batch._replace(
                 advantage=batch.advantage * factor[..., None], learners=batch.learners & mine
             )
-            learned, metrics = super(Happo, self).update(carry, own, now, key)
+            learned, metrics = super(Turns, self).update(carry, own, now, key)
             learned = self._of(mine, learned, carry)
             return (learned, factor * self._ratio(learned, batch)[..., agent]), metrics
 
@@ -76,9 +98,7 @@ class Happo(Stages):
 
 def main(updates: int = 20, **settings: object) -> list[float]:
     """Trains, and returns the average step reward after every update."""
-    init, update = mqe_jax.make_learner(
-        "go1gate", {"config": "demo", **SETTINGS, **settings}, stages=Happo
-    )
+    init, update = mqe_jax.make_learner("go1gate", {"config": "demo", **SETTINGS, **settings})
     state = jax.jit(init)(jax.random.PRNGKey(0))
     step = jax.jit(update)
     rewards = []

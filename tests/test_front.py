@@ -21,13 +21,16 @@ from mqe_jax.core.settings import to_mapping
 from mqe_jax.core.types import Outcome
 from mqe_jax.runs import build, playing
 from mqe_jax.selfplay.league.sides import BothSides
+from mqe_jax.train import algorithms
+from mqe_jax.train.algorithms import StagesSettings, register_stages
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Rate, Result, evaluate_batch
+from mqe_jax.train.networks import Network
 from mqe_jax.train.runner import Training
 from mqe_jax.train.stages import Stages
 from tests.fake_env import SMALL, FakeEnv, FakeVectorEnv
 from tests.inputs import refuses
-from tests.training import assert_same
+from tests.training import assert_same, registered
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
 FEW: dict[str, Any] = {"num_envs": 4, "rollout_steps": 8, "total_steps": 64}
@@ -137,16 +140,50 @@ class Still(Stages):
         return carry, super().update(carry, batch, now, key)[1]
 
 
-def test_an_own_algorithm_is_trained_and_resumed() -> None:
-    halfway = mqe_jax.learn("fake", FEW | {"total_steps": 32}, run_dir="run", stages=Still)
-    with pytest.raises(
-        InputError, match=r"stages: .Stages. is not allowed; .* .Still., the algorithm of"
-    ):
+class Standing(StagesSettings):
+    """Settings of an algorithm that never learns, or only with a field."""
+
+    learns: bool = False
+
+    def build(self, network: Network, config: TrainConfig) -> Stages:
+        return (Stages if self.learns else Still)(network, config)
+
+
+def test_an_own_algorithm_is_trained_and_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithms, "STAGES", {**algorithms.STAGES})
+    kind = register_stages("standing")(Standing)
+    own = FEW | {"stages": {"name": "standing"}}
+    halfway = mqe_jax.learn("fake", own | {"total_steps": 32}, run_dir="run")
+    assert halfway.config.stages == kind()
+    with pytest.raises(InputError, match=r"stages\.name: 'ppo' differs from the run in run"):
         mqe_jax.learn("fake", FEW, run_dir="run", resume=True)
-    done = mqe_jax.learn("fake", FEW, run_dir="run", resume=True, stages=Still)
+    with pytest.raises(InputError, match=r"stages\.learns: True differs from the run in run"):
+        mqe_jax.learn("fake", own | {"stages.learns": True}, run_dir="run", resume=True)
+    done = mqe_jax.learn("fake", own, run_dir="run", resume=True)
     assert done.finished
     assert_same(done.policy.params, halfway.policy.params)
-    refuses(r"stages: .* must be a subclass of", mqe_jax.learn, "fake", FEW, stages=object)
+    flags = parse_train(["go1gate", "--stages.name", "standing", "--stages.learns"])
+    assert flags.settings.stages == kind(learns=True)
+    learning = mqe_jax.learn("fake", own | {"stages.learns": True})
+    weights = [jax.tree.leaves(run.policy.params) for run in (learning, done)]
+    assert not all(map(np.array_equal, *weights))
+
+    algorithms.STAGES.pop("standing")
+    # its policy acts without the algorithm, and its settings stay as they are
+    again = mqe_jax.load_run("run")
+    assert dict(again.config.stages) == {"name": "standing", "learns": False}  # pyright: ignore
+    again.save("saved")
+    assert mqe_jax.load_run("saved").config == again.config
+    assert mqe_jax.evaluate("fake", "run", episodes=2).episodes == 2
+    message = r"stages\.name: 'standing' is not allowed; it must be a registered algorithm: ppo"
+    refuses(message, mqe_jax.learn, "fake", again.config)
+    refuses(message, parse_train, ["go1gate", "--stages.name", "standing"])
+
+
+def test_what_an_algorithm_builds_is_checked() -> None:
+    message = "stages: .* must be what build returns: mqe_jax.train.stages.Stages"
+    made: Any = registered(lambda network, config: network)  # pyright: ignore[reportArgumentType]
+    refuses(message, mqe_jax.learn, "fake", FEW | {"stages": made})
 
 
 def test_seeds_are_trained_in_one_program_into_their_folders() -> None:

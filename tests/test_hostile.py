@@ -38,6 +38,7 @@ from mqe_jax.selfplay.league import games, tournament
 from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.study.runs import read_curve
 from mqe_jax.study.sweep import Sweep, load_sweep
+from mqe_jax.train.algorithms import register_stages
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.evaluate import evaluate_batch
@@ -383,6 +384,8 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("state: ", lambda x, v: policy_of(v, x["batch"], x["config"]), (None, {})),
     ("name: ", lambda x, v: register_network(v), (None, 3)),
     ("network: ", lambda x, v: register_network("x")(v), (None, 3, dict)),
+    ("name: ", lambda x, v: register_stages(v), (None, 3)),
+    ("stages: ", lambda x, v: register_stages("x")(v), (None, 3, dict)),
     ("skill: ", lambda x, v: skills.register(x.get(v, v)), (None, Path, "task")),
     *(
         (n, lambda x, v, n=n: save_tree(**{**SAVED, n: v}), ([], {"a": KEY}))

@@ -35,6 +35,7 @@ from tests.training import (
     Stop,
     assert_same_run,
     random_params,
+    registered,
     settings,
     stop_after,
     updated,
@@ -258,8 +259,9 @@ def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
         imitation={"teacher": "scripted", "until": 1.0},
         action_scale=0.5,
         network__log_std_min=-1.0,
+        stages=registered(Watched),
     )
-    metrics = updated(env, config, 12, stages=Watched, teacher=Counter())[1]
+    metrics = updated(env, config, 12, teacher=Counter())[1]
     for obs, action in shown:
         np.testing.assert_allclose(action, obs[..., 2:3] * obs[..., 3:] / 8 / 0.5, atol=1e-6)
     losses = [float(row["loss/imitation"]) for row in metrics]

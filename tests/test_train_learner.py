@@ -16,17 +16,20 @@ import pytest
 from safetensors.numpy import save_file
 
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import override
 from mqe_jax.core.types import Batch
 from mqe_jax.policies import SimplePolicy
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
 from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree
+from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, make_learner
+from mqe_jax.train.networks import Network
 from mqe_jax.train.stages import Stages
 from tests import training as probes
 from tests.inputs import refuses
-from tests.training import FAST, Probe, assert_same, settings, updated
+from tests.training import FAST, Probe, assert_same, registered, settings, updated
 
 small = functools.partial(settings, FAST)
 
@@ -42,7 +45,7 @@ VARIANTS = {
     },
     "happo": {"network__share_policy": False, "ppo__value": "joint", "ppo__epochs": 2},
 }
-Happo: Any = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "happo.py"))["Happo"]
+Turns: Any = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "happo.py"))["Turns"]
 TURNS: list[Any] = []
 """Advantages and learning agents, then ratios, of every turn of `NotedHappo`."""
 
@@ -55,17 +58,24 @@ class Noted(Stages):
         return super().update(carry, batch, now, key)
 
 
-class NotedHappo(Happo, Noted):
+class NotedHappo(Turns, Noted):
     def _ratio(self, *inputs: Any) -> jax.Array:
         jax.debug.callback(TURNS.append, ratio := super()._ratio(*inputs), ordered=True)
         return ratio
 
 
+def noted_happo(network: Network, config: TrainConfig) -> Stages:
+    turns: Any = NotedHappo
+    return turns(network, config, random_order=True)
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     env = Probe(probes.show_hidden, probes.pay_sum_and_difference, num_envs=32)
-    stages = NotedHappo if variant == "happo" else Stages
-    metrics = updated(env, small(**VARIANTS[variant]), 60, stages=stages)[1][-1]
+    config = small(**VARIANTS[variant])
+    if variant == "happo":
+        config = override(config, {"stages": registered(noted_happo)})
+    metrics = updated(env, config, 60)[1][-1]
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
     assert float(metrics["ended"]["episode_length"]) == 4.0
     if variant == "happo":

@@ -24,10 +24,12 @@ from safetensors.numpy import load_file
 
 from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Outcome, Params
+from mqe_jax.train.algorithms import StagesSettings, register_stages
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.networks import Network
+from mqe_jax.train.stages import Stages
 
 
 @jax.tree_util.register_dataclass
@@ -210,6 +212,17 @@ def settings(defaults: Mapping[str, Any] = SHORT, **values: Any) -> TrainConfig:
         build(TrainConfig, defaults),
         {name.replace("__", "."): value for name, value in values.items()},
     )
+
+
+def registered(stages: Callable[[Network, TrainConfig], Stages]) -> StagesSettings:
+    """Returns the settings of an algorithm that has these stages."""
+
+    @register_stages("own")
+    class Own(StagesSettings):
+        def build(self, network: Network, config: TrainConfig) -> Stages:
+            return stages(network, config)
+
+    return Own()
 
 
 def updated(

@@ -17,6 +17,7 @@ from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import settings_class
 from mqe_jax.presets import resolve
+from mqe_jax.train.algorithms import UnknownStages
 from mqe_jax.train.config import TrainConfig
 
 HINT = "resume with the same command and --resume; the run is in {}"
@@ -41,6 +42,8 @@ class Choices:
 
     network: Annotated[str | None, tyro.conf.arg(name="network.name", metavar="NAME")] = None
     """Registered name of the network."""
+    stages: Annotated[str | None, tyro.conf.arg(name="stages.name", metavar="NAME")] = None
+    """Registered name of the algorithm."""
     group: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Group of observations."""
 
@@ -125,11 +128,15 @@ def parse_train(arguments: Sequence[str]) -> Train:
     changes: dict[str, Any] = {"env": given.overrides()}
     if chosen.network is not None:
         changes["network.name"] = chosen.network
+    if chosen.stages is not None:
+        changes["stages.name"] = chosen.stages
     if chosen.group is not None:
         changes["group"] = chosen.group
     if any(word.split("=")[0] == "--opponent" for word in others):
         # tyro would append to those of the file
         changes["opponents"] = ()
     settings = resolve(task, source.config, source.algorithm, {"": changes})
+    if isinstance(settings.stages, UnknownStages):
+        settings.stages.refuse()
     default = Train(target=tyro.MISSING, settings=settings, source=source)
     return tyro.cli(Train, prog="mqe train", args=list(arguments), default=default, config=MARKERS)

@@ -26,7 +26,7 @@ import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar, dataclass_transform
+from typing import Annotated, Any, Literal, NoReturn, ParamSpec, TypeVar, dataclass_transform
 
 import pydantic
 import pydantic_core
@@ -123,6 +123,13 @@ def settings_class(cls: type[T]) -> type[T]:
 
     made.__init__ = checked_init  # pyright: ignore[reportAttributeAccessIssue]
     return typing.cast(type[T], made)
+
+
+def name_settings(cls: type[Any], name: str) -> type[Any]:
+    """Makes a class a settings class whose field `name` tells it from those of other names."""
+    cls.__annotations__ = {"name": Literal[name], **cls.__annotations__}
+    cls.name = name
+    return settings_class(cls)
 
 
 def _path(value: Any) -> Any:

@@ -41,7 +41,6 @@ from mqe_jax.train.learner import Learner
 from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.policy import POLICY_FILE, Policy, groups_of
-from mqe_jax.train.stages import Stages
 from mqe_jax.train.start import initial_key, policy_to_start
 
 TaskLike = str | QuadrupedEnv | AnyVectorEnv
@@ -99,7 +98,6 @@ def make_learner(
     env: Mapping[str, Any] | None = None,
     impl: str = "auto",
     seeds: int = 1,
-    stages: type[Stages] = Stages,
 ) -> Learner:
     """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure
     functions, not compiled.
@@ -117,16 +115,12 @@ def make_learner(
         env: task parameters.
         impl: physics engine.
         seeds: number of states under an outer `jax.vmap`, for which buffers are sized.
-        stages: the algorithm; a subclass has other advantages, another loss or another update
-            (examples/happo.py).
 
     Raises:
         InputError: as `mqe_jax.learn`.
     """
     (made, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
-    return learner.make_learner(
-        cast.env, made, league=cast.league, teacher=cast.teacher, stages=stages
-    )
+    return learner.make_learner(cast.env, made, league=cast.league, teacher=cast.teacher)
 
 
 def make_env(

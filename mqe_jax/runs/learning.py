@@ -24,7 +24,6 @@ from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
 from mqe_jax.train.monitor import Evaluation, read_evaluations, write_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import Training, open_training
-from mqe_jax.train.stages import Stages
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,7 +144,6 @@ def learn(
     run_dir: str | Path | None = None,
     resume: bool = False,
     dump_diverged: str | Path | None = None,
-    stages: type[Stages] = Stages,
 ) -> Run:
     """Trains a policy on one device, as `mqe train` with the same settings does.
 
@@ -171,8 +169,6 @@ def learn(
             one.
         dump_diverged: folder for recordings of environments whose physics diverges (see `mqe
             replay`).
-        stages: the algorithm; a subclass has other advantages, another loss or another update
-            (examples/happo.py).
 
     Raises:
         InputError: for a task, settings or parameters that are not allowed, or a run folder that
@@ -181,7 +177,7 @@ def learn(
     """
     configs, cast = prepare(task, config, env, impl=impl, seeds=None if seed is None else [seed])
     return _train(
-        configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged, stages
+        configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged
     )[0]
 
 
@@ -198,7 +194,6 @@ def learn_seeds(
     run_dir: str | Path | None = None,
     resume: bool = False,
     dump_diverged: str | Path | None = None,
-    stages: type[Stages] = Stages,
 ) -> list[Run]:
     """Trains several seeds in one program, each as `learn` would up to rounding; arguments and
     errors as there.
@@ -210,7 +205,7 @@ def learn_seeds(
         ```
 
     Args:
-        task: as `learn`, and so are config, env, impl, resume, dump_diverged and stages.
+        task: as `learn`, and so are config, env, impl, resume and dump_diverged.
         seeds: random seeds.
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
@@ -221,7 +216,7 @@ def learn_seeds(
     )
     configs, cast = prepare(task, config, env, impl=impl, seeds=numbers)
     folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
-    return _train(configs, cast, folders, resume, dump_diverged, stages)
+    return _train(configs, cast, folders, resume, dump_diverged)
 
 
 @check_arguments(resume=bool, dump_diverged=PathText | None)
@@ -231,7 +226,6 @@ def _train(
     folders: Sequence[Path | None],
     resume: bool,
     dump_diverged: str | Path | None,
-    stages: type[Stages],
 ) -> list[Run]:
     with (
         guard(cast.env, dump_diverged) as env,
@@ -239,7 +233,6 @@ def _train(
             configs=configs,
             run_dirs=folders,
             resume=resume,
-            stages=stages,
             **cast._replace(env=env)._asdict(),
         ) as training,
     ):

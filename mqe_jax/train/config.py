@@ -32,6 +32,7 @@ from mqe_jax.core.settings import (
     override,
     settings_class,
 )
+from mqe_jax.train.algorithms import PPOStages, StagesSettings, stages_settings
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
@@ -249,6 +250,7 @@ class TrainConfig:
     action_scale: Positive = 1.0
     """Factor on sampled actions before the environment clips them; log-probabilities are of the
     unscaled sample."""
+    stages: Annotated[StagesSettings, pydantic.BeforeValidator(stages_settings)] = PPOStages()
     ppo: PPO = PPO()
     optimizer: OptimizerSettings = OptimizerSettings()
     network: Annotated[NetworkSettings, pydantic.BeforeValidator(network_settings)] = ActorCritic()

@@ -89,23 +89,21 @@ def make_learner(
     league: Matchmaker | None = None,
     teacher: Any = None,
     processes: int = 1,
-    stages: type[Stages] = Stages,
 ) -> Learner:
     """Returns the learner of an environment; InputError if the settings do not fit it.
 
     Of several `processes`, `env` is the share of one, and `devices.Processes` compiles the
-    functions. `teacher` is the policy that `imitation` imitates. A subclass of `Stages`
-    (advantages, loss and update) is another algorithm.
+    functions. `teacher` is the policy that `imitation` imitates.
     """
     check_environment(env, config, processes)
     check_teacher(config, teacher)
-    if not (isinstance(stages, type) and issubclass(stages, Stages)):
-        fail("stages", stages, "a subclass of mqe_jax.train.stages.Stages")
     dims = needs_of(env, config).dims
     network = config.network.build(dims)
     features = config.network.features(dims)
     check_divisible(config, network, processes)
-    algorithm = stages(network, config)
+    algorithm = config.stages.build(network, config)
+    if not isinstance(algorithm, Stages):
+        fail("stages", algorithm, "what build returns: mqe_jax.train.stages.Stages or a subclass")
     # messages are not imitated
     moving = getattr(getattr(env, "env", env), "moving", lambda action: action)
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import nearest
 from mqe_jax.core.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
-from mqe_jax.core.settings import build, check, fail, settings_class
+from mqe_jax.core.settings import build, check, fail, name_settings, settings_class
 
 if TYPE_CHECKING:
     import jax
@@ -174,9 +174,7 @@ def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
             )
 
         cls.build = build_single
-        cls.__annotations__ = {"name": Literal[name], **cls.__annotations__}
-        cls.name = name
-        NETWORKS[name] = settings_class(cls)
+        NETWORKS[name] = name_settings(cls, name)
         return NETWORKS[name]
 
     return register

@@ -25,7 +25,6 @@ from mqe_jax.train.logs import LOGGERS, CsvLog, MetricsLog, ProgressLog, check_l
 from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import SeedBatch, without_shared
-from mqe_jax.train.stages import Stages
 from mqe_jax.train.start import (
     check_parameters,
     first_state,
@@ -93,7 +92,6 @@ def open_training(
     eval_env: VectorEnv | None = None,
     league: Matchmaker | None = None,
     teacher: Any = None,
-    stages: type[Stages] = Stages,
 ) -> Iterator["Training"]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
     check("env", env, AnyBatch)
@@ -116,7 +114,7 @@ def open_training(
         check_loggers(configs[0].loggers)
     elif resume:
         fail("resume", True, "false without a run_dir")
-    learner, processes = own_learner(env, configs[0], league, teacher, stages)
+    learner, processes = own_learner(env, configs[0], league, teacher)
     with (
         translate_errors(),
         open_folders(folders, resume) if processes.leads else contextlib.nullcontext(),
@@ -136,7 +134,6 @@ def open_training(
                 eval_env,
                 league,
                 progress,
-                stages,
             )
 
 
@@ -156,20 +153,16 @@ class Training:
         eval_env: VectorEnv | None,
         league: Matchmaker | None,
         progress: ProgressLog,
-        stages: type[Stages],
     ) -> None:
         self._env = env
         self._configs = configs
         self._folders = folders
-        self._stages = stages
         self._config = configs[0]
         self._processes = processes
         self._progress = progress
         self._seeds = seeds = SeedBatch(learner.init, len(configs))
         first = [
-            first_state(
-                env, learner, processes, own, path, seeds.shared, league, progress.doing, stages
-            )
+            first_state(env, learner, processes, own, path, seeds.shared, league, progress.doing)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stack(seeds.shared)
@@ -296,8 +289,7 @@ class Training:
         kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
         for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
             metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
-            metadata |= {"generator": generator(), "stages": self._stages.__name__}
-            metadata["environments"] = config.checkpoint.environments
+            metadata |= {"generator": generator(), "environments": config.checkpoint.environments}
             if config.checkpoint.environments:
                 tree = self._processes.join(without_shared(state, self._seeds.shared))
             else:

@@ -24,7 +24,7 @@ _ADAPTATION = 1.5
 
 class Stages:
     """The stages of PPO, pure functions; a subclass that overrides some of them is another
-    algorithm.
+    algorithm (`mqe_jax.train.algorithms`).
     """
 
     def __init__(self, network: Network, config: TrainConfig) -> None:

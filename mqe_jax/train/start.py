@@ -22,7 +22,6 @@ from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import NAMED, TrainedPolicy, check_policy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
-from mqe_jax.train.stages import Stages
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
 MAY_DIFFER = (
@@ -46,22 +45,19 @@ def own_learner(
     config: TrainConfig,
     league: Matchmaker | None = None,
     teacher: Any = None,
-    stages: type[Stages] = Stages,
 ) -> tuple[Learner, Processes]:
     """Returns the learner of this process, which has its share of the environments, and all
     processes.
     """
     count = jax.process_count()
-    whole = own = make_learner(env, config, league=league, teacher=teacher, stages=stages)
+    whole = own = make_learner(env, config, league=league, teacher=teacher)
     if count > 1:
         share: Any = getattr(env, "share", None)
         if share is None:
             raise InputError(
                 f"env: {env.name} cannot be split over {count} processes: it has no `share`"
             )
-        own = make_learner(
-            share(count), config, league=league, teacher=teacher, processes=count, stages=stages
-        )
+        own = make_learner(share(count), config, league=league, teacher=teacher, processes=count)
     return own, Processes(
         *(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole))
     )
@@ -76,7 +72,6 @@ def first_state(
     shared: PyTree,
     league: Matchmaker | None = None,
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
-    stages: type[Stages] = Stages,
 ) -> tuple[TrainState, float]:
     """Returns this process's initial or restored state and the seconds already spent; `shared` as
     in `SeedBatch`.
@@ -106,8 +101,6 @@ def first_state(
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
     if (theirs := metadata.get("generator", generator())) != generator():
         fail("jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {run}")
-    if (algorithm := metadata.get("stages", Stages.__name__)) != stages.__name__:
-        fail("stages", stages.__name__, f"{algorithm!r}, the algorithm of the run in {run}")
     before = metadata.get("config", {})
     seconds = metadata.get("seconds", 0.0)
     if (
