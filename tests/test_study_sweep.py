@@ -140,6 +140,11 @@ def test_variants_override_the_settings(tmp_path: Path) -> None:
         ({"task": ["go1gate"]}, "task: unknown name .*'tasks'"),
         ({"variants": {"a b": {}}}, r"variants\.a b"),
         ({"variants": {}}, "variants: {}"),
+        (
+            {"variants": {"a": {"task": "go1tug"}}},
+            r"^variants\.a\.task: 'go1tug' is not allowed; it must be left out",
+        ),
+        ({"settings": {"seed": 3}}, r"^settings\.seed: 3 is not allowed; it must be left out"),
     ],
 )
 def test_mistakes_are_named(change: dict[str, Any], message: str) -> None:
@@ -158,11 +163,6 @@ def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) ->
     ("text", "message"),
     [
         ("settings: {ppo: {clips: 1}}\n", r"^settings\.ppo"),
-        (
-            "variants: {a: {task: go1tug}}\n",
-            r"^variants\.a\.task: 'go1tug' is not allowed; it must be left out",
-        ),
-        ("settings: {seed: 3}\n", r"^settings\.seed: 3 is not allowed; it must be left out"),
         (
             "variants: {plain: {}, a: {env: {gate_wdth: 1}}}\n",
             r"^go1gate/mappo\+a: gate_wdth.*'gate_width'",
