@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.core.settings import NonNegative, Positive, PositiveInt, settings_class
 from mqe_jax.envs import Moment, QuadrupedEnv, State, TaskParams, VectorEnv, make, register_task
 from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
@@ -21,7 +22,6 @@ from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import Scene
 from mqe_jax.policies.scripted import Observation, go_to, pose, scripted_policy
 from mqe_jax.terrain import EndWall, Layout, Plane, SpawnArea, TerrainBlock, Track, Wall
-from mqe_jax.train.evaluate import evaluate_batch
 
 if TYPE_CHECKING:
     from mujoco import mjx

@@ -15,6 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mqe_jax.acting.results import Result
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
     from mqe_jax.policies import load_policy
     from mqe_jax.runs.build import make_learner
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from mqe_jax.runs.throughput import bench
     from mqe_jax.selfplay.opponents import versus
     from mqe_jax.train.config import TrainConfig
-    from mqe_jax.train.evaluate import Result
     from mqe_jax.walk.evaluation import evaluate_skill
     from mqe_jax.walk.training import train_skill
 
@@ -61,7 +61,7 @@ _PLAYING = dict.fromkeys(("Clip", "evaluate", "render", "tournament"), "runs.pla
 _HOMES = {
     **_LEARNING,
     **_PLAYING,
-    "Result": "train.evaluate",
+    "Result": "acting.results",
     "TrainConfig": "train.config",
     "bench": "runs.throughput",
     "evaluate_skill": "walk.evaluation",

@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mqe_jax.acting.seats import Seats
+from mqe_jax.core.types import Observations
 from mqe_jax.export.site import Entry, entries
 from mqe_jax.export.task import TaskFunctions, normal_numbers, state_arrays
-from mqe_jax.policies import all_agents
 
 STEPS = (1, 20)
 """Environment steps after which states are compared."""
@@ -38,7 +40,8 @@ def record(
     """
     env = entry.env
     policy = next(iter(entry.policies.values()))
-    both = all_agents(env, policy, policy if len(env.teams) > 1 else None)
+    both = Seats.of_teams(env, *[policy] * len(env.teams))
+    still = jnp.zeros((1, env.num_agents, env.action_size))
     size = TaskFunctions(env).control_inputs.get("noise", (0,))[0]
     reset = jax.jit(env.reset)
     key = jax.random.PRNGKey(seed)
@@ -47,7 +50,7 @@ def record(
 
     @jax.jit
     def step(state: Any, memory: Any, key: jax.Array) -> tuple[Any, Any, jax.Array, jax.Array]:
-        action, memory = both.act(state.obs[None], memory, key)
+        action, memory = both.act(Observations(state.obs[None]), memory, key, still)
         noise = jax.random.normal(jax.random.fold_in(key, 1), (size,))
         with normal_numbers(noise):
             return env.step(state, action[0]), memory, action[0], noise

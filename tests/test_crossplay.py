@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 
 from mqe_jax import cli
+from mqe_jax.acting.results import Rate
+from mqe_jax.acting.seats import Seat, Seats, exchangeable
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.types import Observations
 from mqe_jax.envs import make
-from mqe_jax.policies import MixedTeam, SimplePolicy, load_policy
+from mqe_jax.policies import SimplePolicy, load_policy
 from mqe_jax.selfplay.league import games
 from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
 from mqe_jax.selfplay.league.games import Estimate
 from mqe_jax.selfplay.league.tournament import Standings, rate
-from mqe_jax.train.evaluate import Rate
 from tests import fake_env
 
 KEY = jax.random.PRNGKey(0)
@@ -41,27 +43,36 @@ def test_each_agent_does_what_its_own_policy_does_for_it() -> None:
         changed,
         load_policy(OTHER, env, deterministic=True),
     )
-    obs = jax.random.normal(KEY, (3, 2, 16))
+    seen = Observations(jax.random.normal(KEY, (3, 2, 16)))
     memories = [policy.initial_memory(3) for policy in policies]
-    team = MixedTeam(policies, (0, 0))
-    memory = team.initial_memory(3)
-    both = jnp.array([*itertools.product(range(4), repeat=2)])
+    actors = exchangeable(policies)
+    pairs = [*itertools.product(range(4), repeat=2)]
+    teams = [
+        Seats((Seat(actors[i], (0, 1), (0,)), Seat(actors[j], (0, 1), (1,)))) for i, j in pairs
+    ]
+    traced = []
 
     @jax.jit
     @jax.vmap
-    def act(seats: jax.Array, memory: Any) -> Any:
-        return dataclasses.replace(team, seats=seats).act(obs, memory, KEY)
+    def act(seats: Seats, memory: Any) -> Any:
+        traced.append(1)
+        return seats.act(seen, memory, KEY, jnp.zeros((3, 2, 3)))
 
-    memory = jax.tree.map(lambda x: np.stack([x] * 16), memory)
+    memory = jax.tree.map(lambda *x: jnp.stack(x), *(team.initial_memory(3) for team in teams))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *teams)
     actions = jnp.zeros(())
     for _ in range(2):
-        own = [policy.act(obs, now, KEY) for policy, now in zip(policies, memories, strict=True)]
+        own = [
+            policy.act(seen if hasattr(policy, "groups") else seen.obs, now, KEY)
+            for policy, now in zip(policies, memories, strict=True)
+        ]
         memories = [now for _, now in own]
-        actions, memory = act(both, memory)
-        for (first, second), action in zip(both.tolist(), actions, strict=True):
+        actions, memory = act(stacked, memory)
+        for (first, second), action in zip(pairs, actions, strict=True):
             expected = jnp.stack([own[first][0][:, 0], own[second][0][:, 1]], axis=1)
             np.testing.assert_allclose(action, expected, atol=1e-5)
     assert len({np.asarray(action).tobytes() for action in actions}) == 16
+    assert len(traced) == 1
 
 
 def simple(*forward: float) -> SimplePolicy:

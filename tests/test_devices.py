@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 import mqe_jax.adapters.gymnasium  # noqa: F401  (registers the tasks)
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core import devices
 from mqe_jax.core.settings import build
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.policies import all_agents, load_policy, parameters_for
+from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.selfplay.league.sides import BothSides
@@ -200,7 +201,9 @@ BATCHES: dict[str, Callable[[], Any]] = {
     "vector": lambda: VectorEnv(made("go1plane"), 2),
     "deadline": lambda: Deadline(VectorEnv(made("go1plane"), 2)),
     "demonstrated": lambda: Demonstrated(
-        played("go1gate"), 2, load_policy("scripted", played("go1gate"))
+        played("go1gate"),
+        2,
+        Seats.of_teams(played("go1gate"), load_policy("scripted", played("go1gate"))),
     ),
     "versus": lambda: versus(matches(), ["go1wrestling", "scripted"]),
     "mirror": lambda: Mirror(matches()),
@@ -223,11 +226,10 @@ def test_batches(name: str) -> None:
     assert programs[0] == programs[1]
 
 
-@pytest.mark.parametrize("name", ["scripted", "random", "idle", "forward", "go1wrestling", "both"])
+@pytest.mark.parametrize("name", ["scripted", "random", "idle", "forward", "go1wrestling"])
 def test_policies(name: str) -> None:
     env = played("go1wrestling")
-    policy = load_policy("scripted" if name == "both" else name, env)
-    policy = all_agents(env, policy, load_policy("go1wrestling", env)) if name == "both" else policy
+    policy = load_policy(name, env)
     obs = jax.random.normal(KEY, (2, policy.agents, env.observation_size))
     one, other = (each.act(obs, each.initial_memory(2), KEY) for each in (policy, copied(policy)))
     assert_same(one, other)

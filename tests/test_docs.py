@@ -24,6 +24,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax import cli
+from mqe_jax.acting.evaluate import Evaluator
 from mqe_jax.cli import demo
 from mqe_jax.cli.arguments import COMMANDS, parse
 from mqe_jax.core.settings import override
@@ -33,9 +34,9 @@ from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.runs import build
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import NETWORKS
 from mqe_jax.walk.training import AGILE
+from tests.acting import seats
 from tests.training import Stop
 
 ROOT = Path(__file__).parents[1]
@@ -367,9 +368,12 @@ def example(script_folder: None) -> Any:
 def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: Any) -> None:
     env = VectorEnv(make("go1catch", impl="c", num_envs=8), 8)
     plan = jax.vmap(scripted_policy(env.env))
-    evaluator = Evaluator(env, lambda scale, seen, memory, _: (scale * plan(seen.obs), memory))
+
+    def act(scale: Any, seen: Any, memory: Any, key: Any) -> Any:
+        return scale * plan(seen.obs), memory
+
     keys = jax.random.split(jax.random.PRNGKey(0))
-    scripted, idle = evaluator(jnp.array([1.0, 0.0]), 8, keys)
+    scripted, idle = Evaluator(env)(seats(env, act, jnp.array([1.0, 0.0])), 8, keys)
     assert scripted.success_rate >= 0.5 and idle.success_rate == 0
     near = example.flee(jnp.array([3.0, 1.0]), jnp.array([3.0, 0.0]), speed=0.4)
     far = example.flee(jnp.array([3.0, 2.0]), jnp.array([3.0, 0.0]), speed=0.4)

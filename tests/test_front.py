@@ -15,6 +15,8 @@ import pytest
 
 import mqe_jax
 from mqe_jax import cli
+from mqe_jax.acting.evaluate import evaluate_batch
+from mqe_jax.acting.results import Rate, Result
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import to_mapping
@@ -24,7 +26,6 @@ from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.train import algorithms
 from mqe_jax.train.algorithms import StagesSettings, register_stages
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Rate, Result, evaluate_batch
 from mqe_jax.train.networks import Network
 from mqe_jax.train.runner import Training
 from mqe_jax.train.stages import Stages
@@ -77,7 +78,7 @@ def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path:
     assert run.finished and run.env_steps == 64 and list(Path.cwd().iterdir()) == []
     assert cli.main(["train", "fake", "--seed", "2", "--run-dir", "run", *SMALL]) == 0
     written = mqe_jax.load_run("run")
-    assert_same(run.policy.arrays, written.policy.arrays)
+    assert_same(run.policy.actor, written.policy.actor)
     assert run.metrics.keys() == written.metrics.keys() and len(run.metrics["success"]) == 2
     for name in run.metrics.keys() - {"seconds", "fps"}:
         np.testing.assert_allclose(
@@ -88,7 +89,7 @@ def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path:
 def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixture[str]) -> None:
     run.save("saved")
     again = mqe_jax.load_run("saved")
-    assert_same(run.policy.arrays, again.policy.arrays)
+    assert_same(run.policy.actor, again.policy.actor)
     assert again.config == run.config and again.evaluations == [] and repr(again) == repr(run)
     np.testing.assert_allclose(again.metrics["loss/value"], run.metrics["loss/value"], rtol=1e-7)
     refuses(r"run_dir: saved holds config.yaml, .* but no checkpoint", run.save, "saved")
@@ -412,7 +413,8 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
     evaluate: Any = mqe_jax.evaluate
     about = evaluate("go1tug", "forward", "scripted", **options).about
     assert about == {"policy": "forward", "opponent": "scripted", "sides": "both", "seed": 0}
-    assert isinstance(played["batch"], BothSides) and played["policy"].second.name == "scripted"
+    assert isinstance(played["batch"], BothSides)
+    assert played["policy"].seats[1].policy.policy.name == "scripted"
     for wrong in ({"episodes": 5}, {"num_envs": 3}):
         with pytest.raises(
             InputError, match=f"{next(iter(wrong))}: . is not allowed; it must be even"

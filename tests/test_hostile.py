@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 import mqe_jax
 from mqe_jax import load_policy, skills
+from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.adapters import gymnasium
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.arguments import parse
@@ -32,8 +33,7 @@ from mqe_jax.envs.registry import register_scripted
 from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
-from mqe_jax.policies import all_agents, zoo
-from mqe_jax.selfplay.demonstrations import Demonstrated
+from mqe_jax.policies import zoo
 from mqe_jax.selfplay.league import games, tournament
 from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.study.runs import read_curve
@@ -41,7 +41,6 @@ from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.algorithms import register_stages
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
-from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import register_network
@@ -199,21 +198,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         (None, "x", np.zeros((2, 1, 9)), 3),
     ),
     ("data: ", lambda x, v: x["match"].object_pose(v, "cylinder"), (None, 3, KEY)),
-    (
-        "obs: ",
-        lambda x, v: all_agents(x["match"], x["idle"]).act(v, ((), ()), KEY),
-        (None, np.zeros((2, 1, 10))),
-    ),
-    (
-        "key: ",
-        lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), ((), ()), v),
-        (None, 3),
-    ),
-    (
-        "memory: ",
-        lambda x, v: all_agents(x["match"], x["idle"]).act(np.zeros((2, 2, 10)), v, KEY),
-        (None, ()),
-    ),
     ("num_envs: ", lambda x, v: x["idle"].initial_memory(v), (0, NAN, "x")),
     (
         "key: ",
@@ -334,7 +318,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     ("episode: ", lambda x, v: _render(x, episode=v), (None, 3, [])),
     ("env: ", lambda x, v: scene_xml(x.get(v, v)), (None, "go1gate", "matches")),
-    ("demonstrator: ", lambda x, v: Demonstrated(x["task"], 2, v), (None, 3, TrainedPolicy)),
     ("robot: ", lambda x, v: robots.register(v), (None, "go1")),
     ("path: ", lambda x, v: read_curve(v), (None, 3, "", "a\0b")),
     (

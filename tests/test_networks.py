@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.acting.evaluate import evaluate_batch
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core.blocks import Block, entities
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory, Params
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.presets import preset
 from mqe_jax.skills.agile import FRAME_SIZE, NOW_SIZE
-from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.mat import Mat, log_std_of
 from mqe_jax.train.networks import NETWORKS, EnvDims, Network
 from mqe_jax.train.policy import read_policy
@@ -237,7 +238,7 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
     result = evaluate_batch(env, policy, 8, jax.random.PRNGKey(0), block=3)
     assert result.episode_length == 3.0 and -4.0 < result.average_step_reward < 0.0
     monkeypatch.setattr(Session, "moment", lambda self: None)  # the probe has no bodies
-    session = Session(env, env, policy)
+    session = Session(env, env, Seats.of(env, policy))
     for _ in range(4):
         session.advance()
     assert session.episodes.tolist() == [1] * 4 and np.all(np.isfinite(session.rewards))

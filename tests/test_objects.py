@@ -200,7 +200,7 @@ def test_the_herd_starts_as_listed(herd: Any) -> None:
     ],
 )
 def test_the_scripted_policy_wins(task: str, share: float) -> None:
-    from mqe_jax.train.evaluate import evaluate_batch
+    from mqe_jax.acting.evaluate import evaluate_batch
 
     batch = VectorEnv(make(task, impl="c", num_envs=16), 16)
     plan = jax.vmap(scripted_policy(batch.env))

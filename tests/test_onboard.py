@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mqe_jax import make
+from mqe_jax.acting.seats import check_policy
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
@@ -23,7 +24,7 @@ from mqe_jax.runs import build
 from mqe_jax.runs.build import prepare
 from mqe_jax.train.needs import Needs, needs_of
 from mqe_jax.train.normalize import running_init
-from mqe_jax.train.policy import TrainedPolicy, check_policy, read_policy
+from mqe_jax.train.policy import TrainedPolicy, read_policy
 from mqe_jax.train.runner import train_seeds
 from mqe_jax.train.stages import Stages
 from tests import training as probes

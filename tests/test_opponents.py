@@ -12,17 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.acting.evaluate import evaluate_batch
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, override
-from mqe_jax.core.types import observations
+from mqe_jax.core.types import Observations, observations
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.wrestling import WrestlingRewards
-from mqe_jax.policies import BothTeams, all_agents, load_policy
+from mqe_jax.policies import load_policy
 from mqe_jax.runs import build as setup
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.opponents import Mirror, Versus, versus
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.monitor import score
 from mqe_jax.train.needs import needs_of
@@ -94,16 +95,16 @@ def test_teams_may_see_different_groups_of_observations() -> None:
         state.groups["proprioception"][..., :3], robots.projected_gravity, atol=1e-6
     )
     assert less.groups == {}
-    both = BothTeams(seeing, blind)
-    assert {*both.groups} == {"policy", "proprioception"}
+    both = Seats.of_teams(env, seeing, blind)
+    assert both.groups == {"policy", "proprioception"}
     memory = both.initial_memory(2)
     keys = jax.random.split(KEY)
-    action, _ = both.act(observations(state), memory, KEY)
+    still = jnp.zeros((2, 2, 12))
+    action, _ = both.act(observations(state), memory, KEY, still)
     own, _ = blind.act(state.groups["proprioception"][:, 1:], memory[1], keys[1])
     np.testing.assert_array_equal(action[:, 1:], own)
-    refuses(
-        "group: 'proprioception' is missing in the state", both.act, observations(less), memory, KEY
-    )
+    missing = "group: 'proprioception' is missing in the state"
+    refuses(missing, both.act, observations(less), memory, KEY, still)
     config = build(TrainConfig, {**SETTINGS, "num_envs": 2, "group": "proprioception"})
     config = override(config, {"network.critic_input": "own"})
     learner = make_learner(Versus(env, [seeing]), config)
@@ -123,10 +124,9 @@ policies = pytest.fixture(scope="module")(
 
 def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv) -> None:
     assert all(load_policy(name, door.env).agents == 1 for name in ("random", "idle", "forward"))
-    both = all_agents(door.env, load_policy("forward", door.env))
-    assert isinstance(both, BothTeams) and both.agents == 2
-    action, _ = both.act(jnp.zeros((3, 2, 12)), both.initial_memory(3), KEY)
-    # without opponent: idle
+    seats = Seats.of_teams(door, *(load_policy(name, door.env) for name in ("forward", "idle")))
+    seen = Observations(jnp.zeros((3, 2, 12)))
+    action, _ = seats.act(seen, seats.initial_memory(3), KEY, jnp.ones((3, 2, 12)))
     np.testing.assert_allclose(action[:, :, 0], jnp.tile(jnp.array([0.25, 0.0]), (3, 1)))
 
 
@@ -230,7 +230,7 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
     env = versus(door, ["idle", policies[0]])
     refuses("block 0 is fixed", env.change, env.reset(KEY), 0, policies[0])
     other = new_policy(versus(door, ["idle"]), network={"hidden_sizes": [16]})
-    refuses("another architecture", env.change, env.reset(KEY), 1, other)
+    refuses("another form", env.change, env.reset(KEY), 1, other)
 
 
 @pytest.mark.parametrize("kind", ["versus", "mirror"])

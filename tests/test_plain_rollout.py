@@ -11,15 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.core.types import RESULTS, NetworkMemory, Outcome
-from mqe_jax.policies import BothTeams, load_policy
+from mqe_jax.acting.evaluate import Evaluator
+from mqe_jax.acting.seats import Seats
+from mqe_jax.core.types import RESULTS, NetworkMemory, Observations, Outcome
+from mqe_jax.policies import load_policy
 from mqe_jax.selfplay.league import league, pool
 from mqe_jax.selfplay.opponents import Mirror, OpponentState, exchange
-from mqe_jax.train.evaluate import Evaluator
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.rollout import ObservationNormalizer, RolloutState, rollout
 from tests import training as probes
+from tests.acting import seats
 from tests.states import made
 from tests.test_opponents import matches
 from tests.training import Probe
@@ -188,7 +190,8 @@ def test_evaluations_are_those_of_a_plain_implementation() -> None:
         return params * obs.obs[..., 2:3] + memory[:, None, None], memory + 0.5
 
     both = jnp.array([0.3, -0.8])
-    found = Evaluator(env, act, jnp.full(N, 0.1), block=4)(both, 9, jax.random.split(KEY, 2))
+    acting = seats(env, act, both, lambda num_envs: jnp.full(num_envs, 0.1))
+    found = Evaluator(env, block=4)(acting, 9, jax.random.split(KEY, 2))
     step = jax.jit(env.step)
     for gain, result in zip((0.3, -0.8), found, strict=True):
         now = env.reset(KEY)
@@ -265,7 +268,7 @@ def test_results_are_those_of_the_agents_that_take_part() -> None:
     def act(params, seen, memory, key):
         return (seen.obs[..., 2:3], memory)
 
-    (result,) = Evaluator(env, act, block=2)(None, N, KEY[None])
+    (result,) = Evaluator(env, block=2)(seats(env, act), N, KEY[None])
     hidden = np.asarray(env.reset(KEY).hidden)
     assert result.episode_return == pytest.approx(4 * hidden.mean())
     nothing: Any = None
@@ -450,7 +453,9 @@ def test_policies_without_files_act_as_named() -> None:
     assert columns.shape[1] == 24 and columns.min() < -0.99 and columns.max() > 0.99
     assert np.abs(columns.mean(0)).max() < 0.08 and np.abs(columns.std(0) - 3**-0.5).max() < 0.03
     assert np.abs(np.corrcoef(columns.T) - np.eye(24)).max() < 0.13
-    teams = BothTeams(random, random).act(jnp.zeros((2000, 4, 1)), ((), ()), KEY)[0]
+    both = Seats.of_teams(env, random, random)
+    seen = Observations(jnp.zeros((2000, 4, env.observation_size)))
+    teams = both.act(seen, ((), ()), KEY, jnp.zeros((2000, 4, env.action_size)))[0]
     assert np.abs(np.corrcoef(np.asarray(teams).reshape(2000, -1).T) - np.eye(48)).max() < 0.13
     assert not np.asarray(idle.act(obs, (), KEY)[0]).any()
     ahead = np.asarray(forward.act(obs, (), KEY)[0])

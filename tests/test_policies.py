@@ -15,6 +15,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax import cli, skills
+from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.cli.commands import Eval
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import override
@@ -23,7 +24,7 @@ from mqe_jax.envs.registry import NAMED_SCRIPTED, register_scripted
 from mqe_jax.envs.state import ENDINGS
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.policies import BothTeams, SimplePolicy, load_policy, parameters_for, zoo
+from mqe_jax.policies import SimplePolicy, load_policy, parameters_for, zoo
 from mqe_jax.policies.scripted import find_scripted
 from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.policies.scripted.matches import plan_tug
@@ -33,8 +34,7 @@ from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import SKILLS, Command, Skill
 from mqe_jax.train.checkpoint import read_metadata, save_tree
 from mqe_jax.train.config import load_config
-from mqe_jax.train.evaluate import evaluate_batch
-from mqe_jax.train.policy import TrainedPolicy, save_policy
+from mqe_jax.train.policy import Actor, TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 from tests.inputs import refuses
 
@@ -112,26 +112,24 @@ def test_a_shipped_policy_does_what_its_card_says() -> None:
     assert result.success_rate > zoo.card("go1gate").results["success"].value - 4 * 0.02
 
 
-def policy_of(target: str, **options: Any) -> Any:
-    return players(**override(Eval(target=target, impl="c"), options).playing).policy
+def acting(target: str, **options: Any) -> list[Any]:
+    """Returns who acts, one for each team: an `Actor`, or a policy."""
+    seats = players(**override(Eval(target=target, impl="c"), options).playing).seats
+    return [getattr(seat.policy, "policy", seat.policy) for seat in seats.seats]
 
 
 def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() -> None:
-    assert isinstance(policy_of("go1gate"), TrainedPolicy)
-    assert isinstance(policy_of("go1gate", policy="scripted"), SimplePolicy)
-    assert isinstance(policy_of("go1gate", robot="go2"), SimplePolicy)  # trained on the Go1
-    assert isinstance(policy_of("go1gate", set=["gate_width=0.8"]), SimplePolicy)
-    assert isinstance(policy_of("go1plane"), SimplePolicy)  # none is shipped
-    joints = policy_of("go1gate", control="position")
+    assert isinstance(acting("go1gate")[0], Actor)
+    assert isinstance(acting("go1gate", policy="scripted")[0], SimplePolicy)
+    assert isinstance(acting("go1gate", robot="go2")[0], SimplePolicy)  # trained on the Go1
+    assert isinstance(acting("go1gate", set=["gate_width=0.8"])[0], SimplePolicy)
+    assert isinstance(acting("go1plane")[0], SimplePolicy)  # none is shipped
+    (joints,) = acting("go1gate", control="position")
     assert joints.act(jnp.zeros((1, 2, 16)), (), jax.random.PRNGKey(0))[0].shape == (1, 2, 12)
-    both = policy_of("go1tug")
-    assert (
-        isinstance(both, BothTeams)
-        and both.first is both.second
-        and isinstance(both.first, TrainedPolicy)
-    )
-    alone = policy_of("go1tug", opponent="idle")
-    assert isinstance(alone, BothTeams) and isinstance(alone.second, SimplePolicy)
+    first, second = acting("go1tug")
+    assert isinstance(first, Actor) and first.params is second.params
+    first, second = acting("go1tug", opponent="idle")
+    assert isinstance(first, Actor) and isinstance(second, SimplePolicy)
 
 
 @pytest.mark.parametrize("task", AGILE)
@@ -452,8 +450,8 @@ def test_a_name_comes_before_a_folder_of_that_name(
 ) -> None:
     (tmp_path / "go1gate").mkdir()
     monkeypatch.chdir(tmp_path)
-    env, _, policy, _ = players(**Eval(target="go1gate", impl="c").playing)
-    assert env.name == "go1gate" and isinstance(policy, TrainedPolicy)
+    env, _, seats, _ = players(**Eval(target="go1gate", impl="c").playing)
+    assert env.name == "go1gate" and isinstance(seats.seats[0].policy, Actor)
     refuses("go1gate", players, **Eval(target="./go1gate", impl="c").playing)
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax.acting.results import Rate, Result
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import make
 from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.policies.zoo import population
 from mqe_jax.runs import playing
 from mqe_jax.selfplay.opponents import versus
-from mqe_jax.train.evaluate import Rate, Result
 from tests.test_opponents import MATCHES, matches, new_policy
 
 TASK = "go1revolvingdoor"

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.envs import Moment, State, make
@@ -242,16 +243,14 @@ def test_a_demonstrator_needs_assistance_and_episodes_of_sixteen_steps() -> None
         Demonstrated,
         task,
         N,
-        Bending(),
+        Seats.of(task, Bending()),
     )
 
 
 def test_thousands_of_environments_have_a_demonstrator() -> None:
     """More than 4096, whose memory is checked before they are made."""
-    assert (
-        Demonstrated(make("go1plane", impl="c", control="position"), 4097, Bending()).num_envs
-        == 4097
-    )
+    task = make("go1plane", impl="c", control="position")
+    assert Demonstrated(task, 4097, Seats.of(task, Bending())).num_envs == 4097
 
 
 @pytest.fixture(scope="module")
@@ -262,7 +261,7 @@ def rollout() -> tuple[Any, dict[str, Any]]:
     task = make(
         "go1plane", impl="c", num_envs=N, control="position", episode_length=0.64, min_height=0.3
     )
-    env = Demonstrated(task, N, Bending())
+    env = Demonstrated(task, N, Seats.of(task, Bending()))
 
     @jax.jit
     def run(assistance: jax.Array) -> Any:

@@ -415,7 +415,7 @@ def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
 
 def test_policies_of_two_skills_meet_in_the_viewer(policies: Any, match: Any) -> None:
     playing = players(match, policies["agile"], policies["walk"], num_envs=4)
-    session = Session(match, playing.batch, playing.policy)
+    session = Session(match, playing.batch, playing.seats)
     session.advance()
     np.testing.assert_array_equal(session.state.control.skill["acting"], [[1, 0]] * 4)
 

@@ -18,10 +18,10 @@ import pytest
 import yaml
 from PIL import Image
 
+from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.policies import zoo
 from mqe_jax.selfplay.league.crossplay import CrossPlay
-from mqe_jax.train.evaluate import Rate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 strength_page: Any = importlib.import_module("strength_page")

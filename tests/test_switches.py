@@ -16,15 +16,17 @@ import numpy as np
 import pytest
 from jax.extend.random import threefry_2x32
 
+from mqe_jax.acting.evaluate import evaluate_batch
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core import threefry  # noqa: F401
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
+from mqe_jax.core.types import Observations
 from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
-from mqe_jax.policies import all_agents, load_policy, parameters_for
+from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
@@ -92,11 +94,13 @@ def test_policies_act_in_single_precision(task: str, name: str) -> None:
     with strict_x64():
         env = make(task, impl="c", num_envs=2, **parameters_for(task, name))
         policy = load_policy(name, env)
-        policy = all_agents(env, policy, policy if len(env.teams) > 1 else None)
+        seats = Seats.of_teams(env, *[policy] * len(env.teams))
         obs = jax.ShapeDtypeStruct((2, env.num_agents, env.observation_size), jnp.float32)
 
         def act(obs):
-            return policy.act(obs, policy.initial_memory(2), jax.random.PRNGKey(0))
+            still = jnp.zeros((2, env.num_agents, env.action_size), jnp.float32)
+            memory = seats.initial_memory(2)
+            return seats.act(Observations(obs), memory, jax.random.PRNGKey(0), still)
 
         assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(act, obs))} == {
             jnp.dtype(jnp.float32)

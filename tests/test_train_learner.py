@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from mqe_jax.acting.evaluate import Evaluator, evaluate_batch
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import Batch
@@ -23,11 +24,11 @@ from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
 from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Evaluator, evaluate_batch
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import Network
 from mqe_jax.train.stages import Stages
 from tests import training as probes
+from tests.acting import seats
 from tests.inputs import refuses
 from tests.training import FAST, Probe, assert_same, registered, settings, updated
 
@@ -211,8 +212,8 @@ def test_every_step_of_an_evaluation_has_a_random_key_of_its_own() -> None:
         shown = jax.pure_callback(see, action, action, vmap_method="broadcast_all")
         return action, jnp.sum(shown, axis=(1, 2))  # so that the call is not left out
 
-    evaluator = Evaluator(env, act, jnp.zeros(4), block=2)
-    evaluator(None, 4, jax.random.split(jax.random.PRNGKey(0), 2))
+    evaluator = Evaluator(env, block=2)
+    evaluator(seats(env, act, memory=jnp.zeros), 4, jax.random.split(jax.random.PRNGKey(0), 2))
     actions = np.concatenate([np.ravel(action) for action in seen])
     assert len(seen) == 6 and len(np.unique(actions)) == actions.size == 6 * 2 * 4 * 2
 

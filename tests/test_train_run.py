@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints, save_tree
-from mqe_jax.train.evaluate import evaluate_batch
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations

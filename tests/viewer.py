@@ -16,6 +16,7 @@ import pytest
 from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax import skills
+from mqe_jax.acting.seats import Seats
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.policies import load_policy
 from mqe_jax.skills.control import Controller
@@ -51,7 +52,8 @@ class Driven(FakeEnv):
 
 
 def session(env: Any, num_envs: int = 2, name: str = "idle", **options: Any) -> Session:
-    return Session(env, FakeVectorEnv(env, num_envs), load_policy(name, env), **options)
+    seats = Seats.of(env, load_policy(name, env))
+    return Session(env, FakeVectorEnv(env, num_envs), seats, **options)
 
 
 def free_port() -> int:

@@ -15,8 +15,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 from mqe_jax import make
+from mqe_jax.acting.seats import Seats
 from mqe_jax.envs import TASKS
-from mqe_jax.policies import all_agents, load_policy, parameters_for
+from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import write_clip
 from mqe_jax.viz.framing import legend
@@ -50,10 +51,10 @@ def write(name: str) -> None:
     env = make(task, impl="c", num_envs=EPISODES, **settings)
     scripted = load_policy("scripted", env)
     policy = scripted if name in SIZES else load_policy(task, env)
-    policy = all_agents(env, policy, scripted if len(env.teams) > 1 else None)
+    seats = Seats.of_teams(env, *[policy, scripted][: len(env.teams)])
     limit = env.params.episode_length
     episode = typical(
-        record_episodes(env, policy, jax.random.PRNGKey(0), episodes=EPISODES, seconds=limit)
+        record_episodes(env, seats, jax.random.PRNGKey(0), episodes=EPISODES, seconds=limit)
     )
     end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
     shown = episode.cut(

@@ -26,7 +26,7 @@ def member(run: Path, share: float) -> TrainedPolicy:
     checkpoint = latest(run)
     if checkpoint is None:
         raise InputError(f"{run}: has no checkpoint")
-    template = jax.eval_shape(lambda: pool.new_pool(policy.arrays, policy.config.league.members))
+    template = jax.eval_shape(lambda: pool.new_pool(policy.actor, policy.config.league.members))
     members = load_tree(checkpoint, template, kind="checkpoint", part="extra/pool/").tree
     steps = np.asarray(members.born, np.int64) * policy.config.steps_per_update
     apart = np.abs(steps - share * policy.metadata["env_steps"])

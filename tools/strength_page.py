@@ -19,10 +19,10 @@ from typing import Any
 from matplotlib.figure import Figure
 from paper_page import filled, reduced
 
+from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
 from mqe_jax.study import runs
-from mqe_jax.train.evaluate import Rate
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "results" / "strength"

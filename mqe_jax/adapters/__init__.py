@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import envs
+from mqe_jax.acting.seats import Policy
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.settings import check
 from mqe_jax.envs import ALIASES, QuadrupedEnv, State
 from mqe_jax.policies import parameters_for
-from mqe_jax.train.policy import Policy
 
 
 def missing(library: str, error: ImportError) -> InputError:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.spaces import Box
 
+from mqe_jax.acting.seats import Policy
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, check_arguments
@@ -21,7 +22,7 @@ from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.observation import box
 from mqe_jax.envs.state import with_final
 from mqe_jax.policies import SimplePolicy, load_as
-from mqe_jax.train.policy import Policy, TrainedPolicy, groups_of
+from mqe_jax.train.policy import TrainedPolicy, groups_of
 
 
 @jax.tree_util.register_dataclass
@@ -88,9 +89,9 @@ class TeamEnv:
         """
         if isinstance(self.opponent, TrainedPolicy):
             digest = hashlib.sha256()
-            for leaf in jax.tree.leaves(self.opponent.arrays):
+            for leaf in jax.tree.leaves(self.opponent.actor):
                 digest.update(np.asarray(leaf).tobytes())
-            return str(self.opponent.architecture), digest.hexdigest()
+            return str(self.opponent.form.by_name()), digest.hexdigest()
         named = isinstance(self.opponent, SimplePolicy) and self._source is not None
         return self._source if named else id(self.opponent)
 

@@ -137,7 +137,7 @@ class Zoo:
 
 def _print_card(task: str, card: Any, plain: dict[str, Any], long: bool) -> None:
     """Prints a policy's card: its rates, skill and training; with `long` all fields."""
-    from mqe_jax.train.evaluate import Rate
+    from mqe_jax.acting.results import Rate
 
     shown = {"task": task}
     for name, found in sorted(card.results.items(), reverse=True):  # wins first

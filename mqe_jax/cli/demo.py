@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 
+from mqe_jax.acting.results import Rate
 from mqe_jax.core import interrupts
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_folder, write_atomically
@@ -15,7 +16,6 @@ from mqe_jax.core.literal import echo
 from mqe_jax.runs import build
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
-from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import policy_of

@@ -61,7 +61,7 @@ class View(PolicyOptions):
             )
             return Session(*players(**options.playing, **shown)[:3], self.seed)
 
-        env, vector_env, policy, _ = players(**self.playing, **shown)
+        env, vector_env, seats, _ = players(**self.playing, **shown)
         runs = find_runs([Path("runs"), Path(self.target).parent])
         own = self.policy or (DEFAULT if self.target in (env.name, *ALIASES) else self.target)
         menu = Menu(open_choice, Entry(env.name, own, self.opponent or DEFAULT), runs)
@@ -73,7 +73,7 @@ class View(PolicyOptions):
                 "control the robots"
             )
         echo(f"mqe: open {viewer.url} in a browser; press Ctrl-C to stop")
-        viewer.run(lambda: Session(env, vector_env, policy, self.seed))
+        viewer.run(lambda: Session(env, vector_env, seats, self.seed))
 
 
 def _check_address(host: str, port: int) -> None:

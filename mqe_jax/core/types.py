@@ -340,6 +340,20 @@ def observations(state: Any) -> Observations:
     return Observations(state.obs, getattr(state, "active", None), getattr(state, "groups", {}))
 
 
+def active_of(state: Any) -> jax.Array:
+    """Returns which agents of an environment's state take part (N, A) bool."""
+    active = getattr(state, "active", None)
+    return jnp.ones(state.reward.shape, bool) if active is None else active
+
+
+def mean_of_team(reward: jax.Array, active: jax.Array) -> jax.Array:
+    """Returns the mean over the active agents: (..., A) -> (...); 0 without any."""
+    count = jnp.sum(active.astype(jnp.float32), axis=-1)
+    return jnp.sum(jnp.where(active, reward.astype(jnp.float32), 0.0), axis=-1) / jnp.maximum(
+        count, 1.0
+    )
+
+
 RESULTS = ("win", "draw", "loss")
 """Results of a match for a team."""
 

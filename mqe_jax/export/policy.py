@@ -28,6 +28,7 @@ import onnx
 
 import mqe_jax
 from mqe_jax import skills
+from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.settings import check_arguments
 from mqe_jax.core.types import AnyTrained
 from mqe_jax.envs import QuadrupedEnv
@@ -35,7 +36,7 @@ from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Skill
-from mqe_jax.train.policy import TrainedPolicy, check_policy
+from mqe_jax.train.policy import TrainedPolicy
 
 SENSED = ("gravity", "joint_position", "joint_velocity")
 """Inputs of a skill that are its robot's `Proprioception`, in this order."""

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 
+from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import check_arguments, fail, to_mapping
 from mqe_jax.core.types import AnyTrained, observations
@@ -25,7 +26,7 @@ from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors
 from mqe_jax.export.policy import properties
 from mqe_jax.export.task import readings_function
 from mqe_jax.export.translate import translate
-from mqe_jax.train.policy import TrainedPolicy, check_policy
+from mqe_jax.train.policy import TrainedPolicy
 
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)

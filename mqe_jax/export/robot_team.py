@@ -25,7 +25,7 @@ from mqe_jax.core.settings import PathText, build, check_arguments, fail
 from mqe_jax.core.types import Memory, Observations
 from mqe_jax.export.robot import Robot, read_frame, write_frame
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.needs import Needs
+from mqe_jax.train.needs import Needs, unmet
 from mqe_jax.train.policy import check_obs
 
 _PROGRAM = "mqe_jax.export.robot"
@@ -41,7 +41,7 @@ class RobotTeam:
 
     file: Path  # the graph of one robot
     needs: Needs  # what the team needs of its environment
-    config: TrainConfig  # settings of which `check_policy` reads the group of observations
+    config: TrainConfig  # settings of which `unmet` reads the group of observations
     task: str
     agents: int  # number of robots A
     groups: tuple[str, ...]  # the group of observations that they see
@@ -62,6 +62,10 @@ class RobotTeam:
 
     def __repr__(self) -> str:
         return str(self.file)
+
+    def unmet(self, env: Any) -> dict[str, tuple[Any, Any]]:
+        """Returns what it needs and an environment lacks: the values of both by name."""
+        return unmet(self.needs, env, self.config)
 
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns zeros (N,): no episode has started."""

@@ -19,6 +19,7 @@ import jax
 import numpy as np
 import onnx
 
+from mqe_jax.acting.seats import Policy
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.files import write_atomically
 from mqe_jax.core.settings import fail, override
@@ -35,7 +36,7 @@ from mqe_jax.policies import load_policy, parameters_for, zoo
 from mqe_jax.policies.translated import together, translate
 from mqe_jax.sensors.suite import ONBOARD
 from mqe_jax.skills.agile import AgileSkill
-from mqe_jax.train.policy import Policy, TrainedPolicy
+from mqe_jax.train.policy import TrainedPolicy
 
 PAGE = Path(__file__).parent / "page"
 """Files of the page."""

@@ -13,11 +13,12 @@ from typing import Any, overload
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import Policy, check_policy
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, check, check_arguments, fail
+from mqe_jax.core.settings import PathText, check, check_arguments
 from mqe_jax.core.types import AnyEnvironment, Memory, Observations, PolicyOrAct, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_SCRIPTED, TASKS
@@ -27,14 +28,7 @@ from mqe_jax.policies.translated import together, translate
 from mqe_jax.policies.zoo import population
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.needs import Needs
-from mqe_jax.train.policy import (
-    Composed,
-    Policy,
-    TrainedPolicy,
-    check_obs,
-    check_policy,
-    read_policy,
-)
+from mqe_jax.train.policy import TrainedPolicy, check_obs, read_policy
 
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies that need no file: the task's scripted one, uniform random actions, zero actions, and
@@ -67,105 +61,6 @@ class SimplePolicy:
         """Returns the actions; see `Policy`."""
         obs = check_obs(Observations.at(obs).obs, self.agents)
         return self.plan(obs, check("key", key, RandomKey)), memory
-
-
-@dataclasses.dataclass(frozen=True)
-class BothTeams(Composed):
-    """The policies of a match's two teams, as one policy for the agents of both."""
-
-    first: Policy
-    """Policy of team 0."""
-    second: Policy
-    """Policy of team 1."""
-
-    _parts = property(lambda self: (self.first, self.second))
-
-    @property
-    def agents(self) -> int:
-        """Number of agents of both teams."""
-        return self.first.agents + self.second.agents
-
-    def initial_memory(self, num_envs: int) -> Memory:
-        """Returns the initial recurrent states of both."""
-        return self.first.initial_memory(num_envs), self.second.initial_memory(num_envs)
-
-    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-        """Returns the actions of all agents; see `Policy`."""
-        seen = Observations.at(obs)
-        size = self.first.agents
-        check_obs(seen.obs, self.agents)
-        if not isinstance(memory, tuple) or len(memory) != 2:
-            fail("memory", memory, "that of `initial_memory`, one for each team")
-        keys = jax.random.split(check("key", key, RandomKey))
-        first, first_memory = self.first.act(
-            seen.of(slice(size)).to(self.first), memory[0], keys[0]
-        )
-        others = seen.of(slice(size, None)).to(self.second)
-        second, second_memory = self.second.act(others, memory[1], keys[1])
-        return jnp.concatenate([first, second], axis=1), (first_memory, second_memory)
-
-
-@dataclasses.dataclass(frozen=True)
-class MixedTeam(Composed):
-    """A team whose agents follow different policies of the whole team, as one policy.
-
-    Each agent takes its own action from what its policy does for all. Trained policies of equal
-    architecture are exchanged as arrays, so that a compiled program serves all seats.
-    """
-
-    policies: tuple[Policy, ...]
-    """Policies of the team."""
-    seats: Any
-    """Index of each agent's policy (A,), an array that may be traced."""
-
-    _parts = property(lambda self: self.policies)
-
-    @functools.cached_property
-    def _kinds(self) -> list[list[int]]:
-        """Returns the indices of the policies that can be exchanged for each other, by their
-        architectures.
-        """
-        kinds: dict[Any, list[int]] = {}
-        for index, policy in enumerate(self.policies):
-            kind = repr(policy.architecture) if isinstance(policy, TrainedPolicy) else index
-            kinds.setdefault(kind, []).append(index)
-        return list(kinds.values())
-
-    def initial_memory(self, num_envs: int) -> Memory:
-        """Returns the initial recurrent states of each agent's policy, of all architectures."""
-        every = tuple(self.policies[indices[0]].initial_memory(num_envs) for indices in self._kinds)
-        return (every,) * self.agents
-
-    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-        """Returns the actions of all agents; see `Policy`."""
-        seen = Observations.at(obs)
-        check_obs(seen.obs, self.agents)
-        keys = jax.random.split(check("key", key, RandomKey), (self.agents, len(self._kinds)))
-        seats = jnp.asarray(self.seats)
-        actions = []
-        memories = []
-        for agent in range(self.agents):
-            action = 0.0
-            after = []
-            for indices, now, own in zip(self._kinds, memory[agent], keys[agent], strict=True):
-                chosen = jnp.asarray(indices) == seats[agent]
-                (first, *more) = [self.policies[i] for i in indices]
-                if isinstance(first, TrainedPolicy):
-                    place = jnp.argmax(chosen)
-                    each = [
-                        policy.arrays
-                        for policy in (first, *more)
-                        if isinstance(policy, TrainedPolicy)
-                    ]
-                    arrays = jax.tree.map(lambda *x: jnp.stack(x)[place], *each)  # noqa: B023
-                    team, now = first.act_with(arrays, seen, now, own)
-                else:
-                    team, now = first.act(seen.to(first), now, own)
-                action = jnp.where(jnp.any(chosen), team[:, agent], action)
-                after.append(now)
-            actions.append(action)
-            memories.append(tuple(after))
-        return jnp.stack(actions, axis=1), tuple(memories)
 
 
 @overload
@@ -282,20 +177,6 @@ def parameters_for(task: str, *sources: Any) -> dict[str, Any]:
         params = asked | {name: value for name, value in params.items() if value is not None}
     commanding = scripted if all(needs.control == "command" for needs in every) else []
     return params | together([*(needs.by_name() for needs in every), *commanding])
-
-
-def all_agents(env: QuadrupedEnv, policy: Policy, opponent: Policy | None = None) -> Policy:
-    """Returns the policy of all agents of a task: of a match, that of both teams; without opponent,
-    team 1 is idle.
-
-    Raises:
-        InputError: for an opponent in a task that is not a match.
-    """
-    if len(env.teams) < 2:
-        if opponent is not None:
-            raise InputError(f"opponent: {env.name} is not a competitive task; omit the opponent")
-        return policy
-    return BothTeams(policy, opponent or load_policy("idle", env))
 
 
 def _plan(name: str, env: QuadrupedEnv) -> Callable[[jax.Array, jax.Array], jax.Array]:

@@ -12,12 +12,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import Policy, check_policy
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import Memory, Observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.skills import SKILLS
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import Composed, Policy, TrainedPolicy, check_policy
+from mqe_jax.train.policy import Composed, TrainedPolicy
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from mqe_jax.acting.seats import Act, Policy, Seats
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
@@ -27,7 +28,7 @@ from mqe_jax.core.types import VectorEnv as AnyVectorEnv
 from mqe_jax.envs import ALIASES, SCRIPTED, TASKS, QuadrupedEnv, TaskParams, VectorEnv, make
 from mqe_jax.envs.registry import task_id
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.policies import all_agents, load_as, load_policy, parameters_for, zoo
+from mqe_jax.policies import load_as, load_policy, parameters_for, zoo
 from mqe_jax.presets import resolve
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.league.league import League, Roster
@@ -36,11 +37,10 @@ from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.sensors.suite import ONBOARD, sensors_of
 from mqe_jax.train import learner
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Act
 from mqe_jax.train.learner import Learner
 from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.needs import needs_of
-from mqe_jax.train.policy import POLICY_FILE, Policy, groups_of
+from mqe_jax.train.policy import POLICY_FILE, groups_of
 from mqe_jax.train.start import initial_key, policy_to_start
 
 TaskLike = str | QuadrupedEnv | AnyVectorEnv
@@ -207,7 +207,7 @@ def environments(
             )
         else:
             policy = load_as("curriculum.demonstrator", demonstrator, both)
-            everyone = all_agents(both, policy, policy if len(both.teams) > 1 else None)
+            everyone = Seats.of_teams(both, *[policy] * len(both.teams))
             made = Demonstrated(both, num_envs, everyone, seeds, final=final)
         made = made.with_groups(groups)
         return Deadline(made) if config.time_limit_ends else made
@@ -306,8 +306,8 @@ class Players(NamedTuple):
     """The task."""
     batch: VectorEnv
     """Environments with automatic reset."""
-    policy: Policy
-    """The policy of all agents."""
+    seats: Seats
+    """Who acts for which agents."""
     about: dict[str, Any]
     """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
 
@@ -360,6 +360,9 @@ def players(
     match = len(task_env.teams) > 1
     other, against = (own, chosen) if shipped and match else (None, "idle")
     if opponent is not None:
+        if not match:
+            name = task_env.name
+            raise InputError(f"opponent: {name} is not a competitive task; omit the opponent")
         other = load_as("opponent", opponent, task_env, deterministic=deterministic)
         against = opponent
     about: dict[str, Any] = {"policy": str(chosen)}
@@ -367,9 +370,12 @@ def players(
         about["actions"] = "mean" if mean else "sampled"
     if match:
         about["opponent"] = str(against)
-    everyone = all_agents(task_env, own, other)
-    groups = {*groups_of(everyone), *([ONBOARD] if sensors else [])}
-    return Players(task_env, batch.with_groups(groups), everyone, about)
+    teams = [own]
+    if match:
+        teams.append(load_policy("idle", task_env) if other is None else other)
+    seats = Seats.of_teams(task_env, *teams)
+    groups = seats.groups | {ONBOARD} if sensors else seats.groups
+    return Players(task_env, batch.with_groups(groups), seats, about)
 
 
 def run_config(target: str) -> TrainConfig:

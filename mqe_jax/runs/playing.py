@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal
 import jax
 from annotated_types import MinLen
 
+from mqe_jax.acting.evaluate import evaluate_batch
+from mqe_jax.acting.results import Result, pool
 from mqe_jax.core.limits import (
     Candidates,
     ClipLength,
@@ -35,7 +37,6 @@ from mqe_jax.selfplay.league import tournament as league
 from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.league.tournament import Standings
-from mqe_jax.train.evaluate import Result, evaluate_batch, pool
 
 Camera = Literal["follow", "near", "scene", "side"]
 
@@ -122,7 +123,7 @@ def evaluate(
         batch = BothSides(batch)
         about["sides"] = sides
     with guard(batch, dump_diverged) as guarded:
-        result = evaluate_batch(guarded, playing.policy, episodes, jax.random.PRNGKey(seed))
+        result = evaluate_batch(guarded, playing.seats, episodes, jax.random.PRNGKey(seed))
     return dataclasses.replace(result, about={**about, "seed": seed}, labels=playing.env.labels)
 
 
@@ -244,7 +245,7 @@ def render(
     playing = build.players(task, policy, opponent, **options, sensors=sensors)
     key = jax.random.PRNGKey(seed)
     recorded = record_episodes(
-        playing.env, playing.policy, key, episodes=episodes, seconds=seconds, sensors=sensors
+        playing.env, playing.seats, key, episodes=episodes, seconds=seconds, sensors=sensors
     )
     size = None if width is None else (width, round(width * 9 / 32) * 2)
     look = {"view": view, "size": size, "fps": fps, "speed": speed}

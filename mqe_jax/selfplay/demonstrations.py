@@ -12,14 +12,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core import devices
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check_arguments, fail
-from mqe_jax.core.types import AnyPolicy, PyTree, observations, where_rows
+from mqe_jax.core.settings import fail
+from mqe_jax.core.types import PyTree, observations
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.autoreset import KEPT, SEEN
 from mqe_jax.physics.engines import STATE_FIELDS
-from mqe_jax.train.policy import Policy, groups_of
 
 NUM_ENVS = 128
 """Environments in which the demonstrator acts."""
@@ -44,21 +44,17 @@ class Demonstrated(VectorEnv):
     runs of a task.
     """
 
-    @check_arguments(demonstrator=AnyPolicy)
     def __init__(
         self,
         env: QuadrupedEnv,
         num_envs: int,
-        demonstrator: Policy,
+        demonstrator: Seats,
         copies: int = 1,
         *,
         final: Sequence[str] = SEEN,
     ) -> None:
-        """Creates the batch, as `VectorEnv`; `demonstrator` acts for all agents."""
+        """Creates the batch, as `VectorEnv`; `demonstrator` acts in it."""
         super().__init__(env, num_envs, copies, final=final)
-        if (demonstrator.task, demonstrator.agents) != (env.name, env.num_agents):
-            given = f"one of {demonstrator.agents} agents on {demonstrator.task}"
-            fail("demonstrator", given, f"one of all {env.num_agents} agents on {env.name}")
         if self.max_episode_steps < MOMENTS:
             fail(
                 "episode_length",
@@ -66,7 +62,7 @@ class Demonstrated(VectorEnv):
                 f"at least {MOMENTS} steps with a demonstrator",
             )
         self.demonstrator = demonstrator
-        self._guide = VectorEnv(self.env, NUM_ENVS, final=()).with_groups(groups_of(demonstrator))
+        self._guide = VectorEnv(self.env, NUM_ENVS, final=()).with_groups(demonstrator.groups)
 
     @single
     def reset(self, key: jax.Array) -> DemonstratedState:
@@ -106,15 +102,15 @@ class Demonstrated(VectorEnv):
 
     def _record(self) -> PyTree:
         guide = self._guide
-        policy = self.demonstrator
-        first = policy.initial_memory(NUM_ENVS)
+        seats = self.demonstrator
+        still = jnp.zeros((NUM_ENVS, guide.num_agents, guide.action_size))
 
         def advance(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], None]:
             state, memory = carry
-            action, memory = policy.act(observations(state).to(policy), memory, key)
+            action, memory = seats.act(observations(state), memory, key, still)
             state = guide.step(state, action)
             done = state.terminated | state.truncated
-            return (state, where_rows(done, first, memory)), None
+            return (state, seats.restart(memory, done)), None
 
         def moment(carry: tuple[State, Any], keys: jax.Array) -> tuple[tuple[State, Any], PyTree]:
             carry, _ = jax.lax.scan(advance, carry, keys)
@@ -122,7 +118,8 @@ class Demonstrated(VectorEnv):
 
         reset_key, key = jax.random.split(jax.random.PRNGKey(0))
         keys = jax.random.split(key, (MOMENTS, self.max_episode_steps // MOMENTS))
-        _, fields = jax.lax.scan(moment, (guide.reset(reset_key), first), keys)
+        start = (guide.reset(reset_key), seats.initial_memory(NUM_ENVS))
+        _, fields = jax.lax.scan(moment, start, keys)
         return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), fields)
 
 

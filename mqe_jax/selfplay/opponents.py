@@ -10,6 +10,7 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import Policy, check_policy
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import NonNegativeInt, Number
@@ -30,7 +31,7 @@ from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.envs.wrappers import Outer, Wrapper
 from mqe_jax.policies import load_as
-from mqe_jax.train.policy import Policy, TrainedPolicy, check_policy
+from mqe_jax.train.policy import TrainedPolicy
 
 
 @jax.tree_util.register_dataclass
@@ -196,7 +197,7 @@ class Versus(OneTeam):
         self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False
     ) -> TeamState:
         """Returns the state with another opponent in a block, a trained policy of the same
-        architecture.
+        form.
 
         Each environment keeps its opponent until its episode ends, unless `at_once`. Another change
         before that replaces only the waiting opponent, also in environments in which it already
@@ -212,13 +213,14 @@ class Versus(OneTeam):
                 f"block: the opponent of block {block} is fixed; only trained policies can be "
                 "exchanged"
             )
-        given = policy.architecture
-        known = first.architecture
+        given = policy.form.by_name()
+        known = first.form.by_name()
         for name in dict.fromkeys((*given, *known)):
             if given.get(name) != known.get(name):
                 other = f"{name} {given.get(name)!r}, not {known.get(name)!r}"
-                raise InputError(f"policy: of another architecture than block {block}: {other}")
-        changed = exchange(opponent, _arrays(policy), at_once=at_once)
+                raise InputError(f"policy: of another form than block {block}: {other}")
+        alike = dataclasses.replace(policy.actor, form=first.form)
+        changed = exchange(opponent, alike, at_once=at_once)
         return dataclasses.replace(
             state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :])
         )
@@ -355,7 +357,7 @@ def exchange(opponent: OpponentState, arrays: PyTree, *, at_once: bool = False) 
 
 def _arrays(policy: Policy) -> PyTree:
     """Returns the arrays in which a trained policy can change; none of others."""
-    return jax.tree.map(jnp.asarray, policy.arrays) if isinstance(policy, TrainedPolicy) else ()
+    return jax.tree.map(jnp.asarray, policy.actor) if isinstance(policy, TrainedPolicy) else ()
 
 
 def _act(
@@ -366,10 +368,10 @@ def _act(
         return policy.act(obs.to(policy), opponent.memory, key)
 
     def now() -> tuple[jax.Array, Any]:
-        return policy.act_with(opponent.arrays, obs, opponent.memory, key)
+        return opponent.arrays.act(obs, opponent.memory, key)
 
     def either() -> tuple[jax.Array, Any]:
-        before = policy.act_with(opponent.before, obs, opponent.memory, key)
+        before = opponent.before.act(obs, opponent.memory, key)
         return where_rows(opponent.waiting, before, now())
 
     return jax.lax.cond(jnp.any(opponent.waiting), either, now)

@@ -6,6 +6,7 @@
 Source: Gorsane et al. 2022, arXiv 2209.10485, section 4.
 """
 
+import dataclasses
 import json
 import math
 from collections.abc import Sequence
@@ -18,22 +19,20 @@ import pydantic
 from annotated_types import Ge
 from typing_extensions import TypedDict
 
+from mqe_jax.acting.evaluate import Evaluator
+from mqe_jax.acting.results import Result
+from mqe_jax.acting.seats import Seat, Seats
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_locks, read_json, write_atomically
 from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Memory, Observations, VectorEnv
 from mqe_jax.train.checkpoint import files_by_step
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.evaluate import Evaluator, Result
-from mqe_jax.train.needs import needs_of
-from mqe_jax.train.policy import TrainedPolicy, policy_act, read_policy, save_policy
+from mqe_jax.train.policy import Actor, TrainedPolicy, read_policy, save_policy
 
 EVALUATIONS_FILE = "evaluations.json"
 ABSOLUTE_FACTOR = 10
 """Number of episodes of the absolute metric, relative to an evaluation."""
-
-_SAMPLED = 0
-_DETERMINISTIC = 1
 
 
 class Evaluation(TypedDict):
@@ -51,6 +50,27 @@ class _Evaluations(TypedDict):
     ended_at: NotRequired[int]
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Either:
+    """An actor that samples, or acts with its mean actions."""
+
+    actor: Actor
+    sampled: jax.Array  # whether it samples () bool
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        return self.actor.groups
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        return self.actor.initial_memory(num_envs)
+
+    def act(self, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        sampled = self.actor.act(seen, memory, key)
+        mean = self.actor.act(seen, memory, None)
+        return jax.tree.map(lambda a, b: jnp.where(self.sampled, a, b), sampled, mean)
+
+
 class Monitor:
     """Evaluates the policies of several seeds in one program, with sampled and with mean
     actions.
@@ -63,21 +83,9 @@ class Monitor:
                 config.evaluation.episodes,
                 f"the number of environments, {env.num_envs}",
             )
-        dims = needs_of(env, config).dims
-        act_of = policy_act(dims, config.network, config.normalization.observations)
-
-        def act(
-            params: Any, seen: Observations, memory: Memory, key: jax.Array
-        ) -> tuple[jax.Array, Memory]:
-            arrays, mode = params
-            sampled = act_of(arrays, seen.group(config.group), memory, key, seen.active)
-            mean = act_of(arrays, seen.group(config.group), memory, None, seen.active)
-            return jax.tree.map(lambda a, b: jnp.where(mode == _SAMPLED, a, b), sampled, mean)
-
         self._config = config
-        self._evaluator = Evaluator(
-            env, act, config.network.build(dims).initial_memory(env.num_envs).actor
-        )
+        self._agents = tuple(range(env.num_agents))
+        self._evaluator = Evaluator(env)
 
     def evaluate(
         self,
@@ -92,13 +100,14 @@ class Monitor:
 
         The `absolute` metric has other episodes than the evaluations that chose its policy.
         """
-        stacked = _twice([policy.arrays for policy in policies])
-        modes = jnp.tile(jnp.array([_SAMPLED, _DETERMINISTIC]), len(policies))
+        actors = _twice([policy.actor for policy in policies])
+        sampled = jnp.tile(jnp.array([True, False]), len(policies))
+        seats = Seats((Seat(_Either(actors, sampled), self._agents, self._agents),))
         # The same random keys for every policy and training step, to reduce the variance of
         # comparisons.
         key = jax.random.PRNGKey(self._config.seed)
         keys = jnp.tile(jax.random.fold_in(key, 2) if absolute else key, (2 * len(policies), 1))
-        results = self._evaluator((stacked, modes), episodes, keys)
+        results = self._evaluator(seats, episodes, keys)
         return [
             {
                 "env_steps": steps,

@@ -1,5 +1,5 @@
 """What a policy needs of its environment: its file holds it, and
-`mqe_jax.train.policy.check_policy` compares it.
+`mqe_jax.acting.seats.check_policy` compares it.
 """
 
 import dataclasses
@@ -130,3 +130,13 @@ def needs_of(env: Any, config: TrainConfig) -> Needs:
         blocks=described.pop("blocks", ()),
     )
     return Needs(task=env.name, group=config.group, dims=dims, **described)
+
+
+def unmet(needs: Needs, env: Any, config: TrainConfig) -> dict[str, tuple[Any, Any]]:
+    """Returns what an environment lacks of the needs of a policy with these settings: the values of
+    both by name.
+    """
+    groups = {"policy", *getattr(env, "group_sizes", {})}
+    if needs.group not in groups:
+        return {"group": (needs.group, ", ".join(sorted(groups)))}
+    return needs.mismatches(needs_of(env, config))

@@ -1,13 +1,11 @@
-"""Policies: the protocol of what acts for a team, and trained policies, which are saved, loaded and
-exchanged.
-"""
+"""Trained policies, which are saved, loaded and exchanged."""
 
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Protocol, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,47 +18,21 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, build, check, check_arguments, fail, to_mapping
 from mqe_jax.core.types import (
     AnyEnvironment,
-    AnyPolicy,
     Memory,
     Observations,
     Params,
     RandomKey,
     VectorEnv,
     shapes_of,
-    teams_of,
 )
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
 from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.learner import TrainState
-from mqe_jax.train.needs import Needs, needs_of
+from mqe_jax.train.needs import Needs, needs_of, unmet
 from mqe_jax.train.networks import EnvDims, NetworkSettings
 from mqe_jax.train.normalize import RunningStatistics, running_init, running_normalize
 
 POLICY_FILE = "policy.safetensors"
-
-
-class Policy(Protocol):
-    """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled
-    code.
-
-    `initial_memory(num_envs)` returns the recurrent state at an episode's start, leading axis N.
-    `act(obs, memory, key) -> (action, memory)` maps observations (N, A, O) to actions (N, A, D) in
-    [-1, 1]. A policy with `groups`, the names of the observation groups that it sees, also accepts
-    `Observations`.
-    """
-
-    @property
-    def task(self) -> str:
-        """Id of the task."""
-        ...
-
-    @property
-    def agents(self) -> int:
-        """Number of agents of the team, A."""
-        ...
-
-    def initial_memory(self, num_envs: int) -> Memory: ...
-    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]: ...
 
 
 def groups_of(*policies: Any) -> set[str]:
@@ -91,8 +63,34 @@ class Composed:
         return tuple(groups_of(*self._parts))
 
 
-class PolicyArrays(NamedTuple):
-    """The arrays in which trained policies of one architecture differ."""
+class Form(NamedTuple):
+    """What trained policies have in common if they can be exchanged within compiled code."""
+
+    needs: Needs
+    """What they need of their environment."""
+    network: NetworkSettings
+    """Settings of their network."""
+    normalize: bool
+    """Whether they normalise observations."""
+    deterministic: bool
+    """Whether they act with their mean actions."""
+
+    def by_name(self) -> dict[str, Any]:
+        """Returns all parts by the names that settings and `Needs` have."""
+        network = {f"network.{name}": value for name, value in vars(self.network).items()}
+        settings = {"normalization.observations": self.normalize}
+        return {
+            **self.needs.by_name(),
+            **network,
+            **settings,
+            "deterministic": self.deterministic,
+        }
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Actor:
+    """The acting half of a `TrainedPolicy`: a pytree of its arrays, whose structure is its form."""
 
     params: Params
     """Parameters as `Network.policy_params` returns them."""
@@ -100,6 +98,46 @@ class PolicyArrays(NamedTuple):
     """Statistics of the observations."""
     action_scale: jax.Array
     """Factor on the network's actions () float32."""
+    form: Form = dataclasses.field(metadata={"static": True})
+    """What it shares with others for which it can be exchanged."""
+
+    def __repr__(self) -> str:
+        mode = "mean" if self.form.deterministic else "sampled"
+        return f"<Actor of {self.form.needs.task}: {self.form.network.name}, {mode} actions>"
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The group of observations that it sees."""
+        return (self.form.needs.group,)
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns the recurrent state at an episode's start, leading axis N."""
+        network = self.form.network.build(self.form.needs.dims)
+        return network.initial_memory(num_envs).actor
+
+    def act(
+        self, seen: Observations, memory: Memory, key: jax.Array | None
+    ) -> tuple[jax.Array, Memory]:
+        """Returns actions (N, A, D) in [-1, 1] and the next recurrent state; means without a
+        key.
+        """
+        obs = seen.group(self.form.needs.group)
+        key = None if self.form.deterministic else key
+        return _act(self, obs, memory, key, seen.active)
+
+
+@jax.jit
+def _act(
+    actor: Actor, obs: jax.Array, memory: Memory, key: jax.Array | None, active: jax.Array | None
+) -> tuple[jax.Array, Memory]:
+    dims = actor.form.needs.dims
+    network = actor.form.network.build(dims)
+    if actor.form.normalize:
+        obs = running_normalize(actor.normalizer, obs, actor.form.network.features(dims))
+    if active is not None:
+        obs = jnp.where(active[..., None], obs, 0.0)
+    action, _, memory = network.act(actor.params, memory, obs, key, active)
+    return jnp.clip(actor.action_scale * action, -1.0, 1.0), memory
 
 
 @dataclass(frozen=True)
@@ -154,18 +192,18 @@ class TrainedPolicy:
         return (self.needs.group,)
 
     @property
-    def arrays(self) -> PolicyArrays:
-        """All arrays of the policy."""
-        return PolicyArrays(self.params, self.normalizer, jnp.float32(self.config.action_scale))
+    def form(self) -> Form:
+        """Everything but the arrays; policies of equal form can be exchanged within compiled
+        code.
+        """
+        normalize = self.config.normalization.observations
+        return Form(self.needs, self.config.network, normalize, self.deterministic)
 
     @property
-    def architecture(self) -> dict[str, Any]:
-        """Everything but the arrays by name; policies with equal ones can be exchanged within
-        compiled code.
-        """
-        settings = {"normalization.observations": self.config.normalization.observations}
-        network = {f"network.{name}": value for name, value in vars(self.config.network).items()}
-        return {**self.needs.by_name(), **network, **settings, "deterministic": self.deterministic}
+    def actor(self) -> Actor:
+        """The policy as a pytree of its arrays."""
+        scale = jnp.float32(self.config.action_scale)
+        return Actor(self.params, self.normalizer, scale, self.form)
 
     def acting(self, deterministic: bool) -> Self:
         """Returns the policy that acts with its mean actions, or samples them."""
@@ -182,12 +220,17 @@ class TrainedPolicy:
         needs = self.needs.at_size(needs_of(env, self.config))
         return self if needs == self.needs else dataclasses.replace(self, needs=needs)
 
+    def unmet(self, env: Any) -> dict[str, tuple[Any, Any]]:
+        """Returns what it needs and an environment lacks: the values of both by name."""
+        return unmet(self.needs, env, self.config)
+
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the initial recurrent state: leading axis N, or none for a single environment."""
         num_envs = check("num_envs", num_envs, PositiveInt | None)
-        memory = self.config.network.build(self.dims).initial_memory(num_envs or 1).actor
+        memory = self.actor.initial_memory(num_envs or 1)
         return jax.tree.map(lambda x: x[0], memory) if num_envs is None else memory
 
+    @single
     def act(
         self, obs: Any, memory: Memory, key: jax.Array | None = None
     ) -> tuple[jax.Array, Memory]:
@@ -200,22 +243,16 @@ class TrainedPolicy:
         Raises:
             InputError: for an observation of another shape.
         """
-        return self.act_with(self.arrays, obs, memory, key)
-
-    @single
-    def act_with(
-        self, arrays: PolicyArrays, obs: Any, memory: Memory, key: jax.Array | None = None
-    ) -> tuple[jax.Array, Memory]:
-        """Returns what a policy of the same architecture with other arrays does; see `act`."""
         seen = Observations.at(obs)
-        given = seen.group(self.needs.group) if isinstance(obs, Observations) else obs
-        obs = check_obs(given, self.dims.agents, self.dims.observation)
+        group = self.needs.group
+        given = seen.group(group) if isinstance(obs, Observations) else obs
+        given = check_obs(given, self.dims.agents, self.dims.observation)
         check("key", key, RandomKey | None)
         expected = jax.tree.structure(self.initial_memory())
         if jax.tree.structure(memory) != expected:
             fail("memory", memory, f"the recurrent state of this policy, {expected}")
-        act = policy_act(self.dims, self.config.network, self.config.normalization.observations)
-        return act(arrays, obs, memory, None if self.deterministic else key, seen.active)
+        seen = Observations(given, seen.active, {group: given})
+        return self.actor.act(seen, memory, key)
 
 
 @functools.lru_cache(maxsize=32)
@@ -231,34 +268,6 @@ def _template(dims: EnvDims, settings: NetworkSettings) -> dict[str, Any]:
         }
 
     return jax.eval_shape(arrays)
-
-
-@functools.lru_cache(maxsize=32)
-def policy_act(dims: EnvDims, settings: NetworkSettings, normalize: bool) -> Any:
-    """Returns a network's compiled `act(arrays, obs, memory, key or None, active)`, scaled and
-    clipped.
-
-    It returns the action and the next recurrent state.
-    """
-    network = settings.build(dims)
-    features = settings.features(dims)
-
-    @jax.jit
-    def act(
-        arrays: PolicyArrays,
-        obs: jax.Array,
-        memory: Memory,
-        key: jax.Array | None,
-        active: jax.Array | None = None,
-    ) -> tuple[jax.Array, Memory]:
-        if normalize:
-            obs = running_normalize(arrays.normalizer, obs, features)
-        if active is not None:
-            obs = jnp.where(active[..., None], obs, 0.0)
-        action, _, memory = network.act(arrays.params, memory, obs, key, active)
-        return jnp.clip(arrays.action_scale * action, -1.0, 1.0), memory
-
-    return act
 
 
 def check_obs(obs: Any, agents: int, size: int | None = None) -> jax.Array:
@@ -283,34 +292,6 @@ def policy_of(
     needs = needs_of(env, config)
     policy_params = config.network.build(needs.dims).policy_params(state.params)
     return TrainedPolicy(policy_params, state.obs_normalizer.obs, needs, config, metadata)
-
-
-def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "policy") -> None:
-    """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, a
-    trained one's `Needs`.
-
-    Raises:
-        InputError: naming `field`, the policy and what differs, with the values of both.
-    """
-    check("policy", policy, AnyPolicy)
-    pairs: dict[str, tuple[Any, Any]] = {
-        "task": (policy.task, env.name),
-        "agents": (policy.agents, len(teams_of(env)[0])),
-    }
-    trained: Any = policy
-    if isinstance(own := getattr(policy, "needs", None), Needs) and all(
-        a == b for a, b in pairs.values()
-    ):
-        groups = {"policy", *getattr(env, "group_sizes", {})}
-        if own.group in groups:
-            pairs = own.mismatches(needs_of(env, trained.config))
-        else:
-            pairs = {"group": (own.group, ", ".join(sorted(groups)))}
-    for need, (value, found) in pairs.items():
-        if value != found:
-            raise InputError(
-                f"{field}: {name} needs {need} {value!r}; the environment has {found!r}"
-            )
 
 
 NAMED: dict[str, Callable[[], TrainedPolicy]] = {}

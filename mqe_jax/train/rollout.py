@@ -15,6 +15,8 @@ from mqe_jax.core.types import (
     Params,
     Transition,
     VectorEnv,
+    active_of,
+    mean_of_team,
     observations,
     reset_memory,
     where_rows,
@@ -59,20 +61,6 @@ def normalize_obs(
         obs = running_normalize(normalizer.obs, obs, features)
         privileged = running_normalize(normalizer.privileged, privileged)
     return jnp.where(active[..., None], obs, 0.0), privileged
-
-
-def active_of(state: Any) -> jax.Array:
-    """Returns which agents of an environment's state take part (N, A) bool."""
-    active = getattr(state, "active", None)
-    return jnp.ones(state.reward.shape, bool) if active is None else active
-
-
-def mean_of_team(reward: jax.Array, active: jax.Array) -> jax.Array:
-    """Returns the mean over the active agents: (..., A) -> (...); 0 without any."""
-    count = jnp.sum(active.astype(jnp.float32), axis=-1)
-    return jnp.sum(jnp.where(active, reward.astype(jnp.float32), 0.0), axis=-1) / jnp.maximum(
-        count, 1.0
-    )
 
 
 def rollout(

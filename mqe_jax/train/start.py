@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import fail, is_settings, leaves, override, to_mapping
@@ -20,7 +21,7 @@ from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
 from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
-from mqe_jax.train.policy import NAMED, TrainedPolicy, check_policy, read_policy
+from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 from mqe_jax.train.seeds import with_shared, without_shared
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")

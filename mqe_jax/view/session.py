@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.types import RESULTS, VectorEnv, observations, where_rows
+from mqe_jax.acting.seats import Seats
+from mqe_jax.core.types import RESULTS, VectorEnv, observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.suite import ONBOARD
-from mqe_jax.train.policy import Policy
 from mqe_jax.viz.recording import Episode
 
 DRIVEN = ("vx", "vy", "yaw_rate")
@@ -79,13 +79,11 @@ class Session:
         self,
         env: QuadrupedEnv,
         vector_env: VectorEnv,
-        policy: Policy,
+        seats: Seats,
         seed: int = 0,
         history: float = 20.0,
     ) -> None:
-        """Creates the environments; `policy` acts for all agents, `history` is the length of the
-        history, s.
-        """
+        """Creates the environments, in which `seats` act, with a history of that length, s."""
         self.env = env
         self.num_envs = vector_env.num_envs
         # a real-time factor
@@ -93,8 +91,7 @@ class Session:
         self.speed = 1.0
         self.drive = Drive(np.zeros(3), np.zeros(3))
         self._vector_env = vector_env
-        self._policy = policy
-        self._first_memory = policy.initial_memory(self.num_envs)
+        self._seats = seats
         self._key = jax.random.PRNGKey(seed)
         self._reset = jax.jit(vector_env.reset)
         self._step = jax.jit(self._advance)
@@ -126,7 +123,7 @@ class Session:
         """Resets all environments."""
         self._key, key = jax.random.split(self._key)
         self.state = self._reset(key)
-        self.memory = self._first_memory
+        self.memory = self._seats.initial_memory(self.num_envs)
 
     def advance(self) -> None:
         """Advances all environments by one step, with automatic reset."""
@@ -175,7 +172,8 @@ class Session:
         self, state: Any, memory: Any, key: jax.Array, mask: jax.Array, driven: jax.Array
     ) -> Any:
         env = self.env
-        action, memory = self._policy.act(observations(state).to(self._policy), memory, key)
+        still = jnp.zeros((*mask.shape, env.action_size))
+        action, memory = self._seats.act(observations(state), memory, key, still)
         commands = jnp.zeros((*mask.shape, len(DRIVEN)))
         if self.drivable:
             # Teleoperation commands are in the robot's frame: mirrored here for team 1, `step`
@@ -190,7 +188,7 @@ class Session:
             commands = applied(moving)[..., env.controller.skill.index(DRIVEN)]
         state = self._vector_env.step(state, action)
         done = state.terminated | state.truncated
-        memory = where_rows(done, self._first_memory, memory)
+        memory = self._seats.restart(memory, done)
         names = [name for name in state.metrics if name.startswith("reward/")]
         rewards = jnp.stack(
             [state.metrics[name] for name in (*names, "average_step_reward")], axis=-1

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from annotated_types import MinLen
 
+from mqe_jax.acting.seats import Act, Policy, Seats
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength, Positive
 from mqe_jax.core.precision import single
@@ -17,8 +18,6 @@ from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.suite import ONBOARD
-from mqe_jax.train.evaluate import Act, make_act
-from mqe_jax.train.policy import Policy, groups_of
 
 _DRAWN = 2048  # numbers that the marks of an agent take, about
 
@@ -78,7 +77,7 @@ class Episode:
 )
 def record_episodes(
     env: QuadrupedEnv,
-    policy: Policy | Act,
+    policy: Seats | Policy | Act,
     key: jax.Array,
     *,
     episodes: int = 1,
@@ -87,8 +86,9 @@ def record_episodes(
 ) -> list[Episode]:
     """Records one episode in each of several environments, until it ends or for `seconds`.
 
-    `policy` is that of all agents, or a function like its `act` without recurrent state; batched
-    over episodes. `sensors` also records what shows the readings of the task's sensors.
+    `policy` is that of all agents, seats of several, or a function like a policy's `act` without
+    recurrent state; batched over episodes. `sensors` also records what shows the readings of the
+    task's sensors.
 
     Example:
         ```python
@@ -103,7 +103,8 @@ def record_episodes(
         render_episode(env, best(episodes), Path("gate.gif"))
         ```
     """
-    groups = tuple({*groups_of(policy), *([ONBOARD] if sensors else [])} - {"policy"})
+    seats = Seats.of(env, policy)
+    groups = tuple({*seats.groups, *([ONBOARD] if sensors else [])} - {"policy"})
     size = env.mj_model.nq + 7 * env.mj_model.nmocap + (_DRAWN * env.num_agents if sensors else 0)
     numbers = episodes * round(seconds / env.dt) * size
     if 4 * numbers > CLIP_BYTES:
@@ -113,7 +114,7 @@ def record_episodes(
             f"fewer for {seconds:g} s: they may have at most {CLIP_BYTES / 2**30:g} GB",
         )
     length = 50
-    act, memory = make_act(policy, env, episodes)
+    still = jnp.zeros((episodes, env.num_agents, env.action_size))
 
     def now(state: Any) -> tuple[jax.Array, ...]:
         return (state.data.qpos, state.data.mocap_pos, state.data.mocap_quat)
@@ -125,7 +126,7 @@ def record_episodes(
             if groups
             else state
         )
-        action, memory = act(observations(seen), memory, key)
+        action, memory = seats.act(observations(seen), memory, key, still)
         state = jax.vmap(env.step)(dataclasses.replace(seen, groups=state.groups), action)
         done = state.terminated | state.truncated
         reward = state.metrics.get("average_step_reward", state.reward.mean(-1))
@@ -149,7 +150,7 @@ def record_episodes(
     first = [np.asarray(x)[None] for x in now(state)]
     rows: list[Any] = []
     steps = max(1, round(seconds / env.dt))
-    carry = (state, memory)
+    carry = (state, seats.initial_memory(episodes))
     for index in range(-(-steps // length)):
         carry, out = chunk(carry, key, np.uint32(index))
         rows.append(jax.device_get(out))

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Episodes, Fraction, NonNegative
 from mqe_jax.core.settings import PathText, build, check_arguments, settings_class, to_mapping
 from mqe_jax.core.types import AnyTrained
 from mqe_jax.train.checkpoint import read_metadata
-from mqe_jax.train.evaluate import Rate
 from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
 
 FOLDER = Path(__file__).parent

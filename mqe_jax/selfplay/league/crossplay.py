@@ -13,16 +13,16 @@ import numpy as np
 from annotated_types import MinLen
 from numpy.typing import NDArray
 
+from mqe_jax.acting.evaluate import Evaluator
+from mqe_jax.acting.results import Rate
+from mqe_jax.acting.seats import Policy, Seat, Seats, check_policy, exchangeable
 from mqe_jax.core.limits import Episodes
 from mqe_jax.core.settings import PathText, check_arguments, fail
-from mqe_jax.core.types import AnyBatch, AnyPolicy, Memory, Observations, RandomKey, teams_of
+from mqe_jax.core.types import AnyBatch, AnyPolicy, RandomKey, teams_of
 from mqe_jax.envs import VectorEnv
-from mqe_jax.policies import MixedTeam
 from mqe_jax.selfplay.league.games import Estimate, mates, partners
 from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
 from mqe_jax.selfplay.league.tournament import CSV, PICTURE
-from mqe_jax.train.evaluate import Evaluator, Rate
-from mqe_jax.train.policy import Policy, check_policy, groups_of
 
 Array = NDArray[np.float64]
 
@@ -46,21 +46,19 @@ def cross_play(
         check_policy(policy, batch, name)
     if batch.num_agents < 2 or len(teams_of(batch)) > 1:
         fail("task", batch.name, "one of a team of several agents")
-    count = len(policies)
-    team = MixedTeam(tuple(policies.values()), (0,) * batch.num_agents)
+    team = tuple(range(batch.num_agents))
+    actors = exchangeable([*policies.values()])
 
-    def act(
-        seats: jax.Array, seen: Observations, memory: Memory, key: jax.Array
-    ) -> tuple[jax.Array, Memory]:
-        return dataclasses.replace(team, seats=seats).act(seen, memory, key)
+    def seats(first: Any, others: Any) -> Seats:
+        return Seats((Seat(first, team, team[:1]), Seat(others, team, team[1:])))
 
-    evaluator = Evaluator(
-        batch.with_groups(groups_of(team)), act, team.initial_memory(batch.num_envs)
-    )
+    evaluator = Evaluator(batch.with_groups(seats(actors[0], actors[0]).groups))
+    count = len(actors)
     rates = np.zeros((count, count))
     for first, row_key in enumerate(jax.random.split(key, count)):
-        seats = jnp.tile(jnp.arange(count)[:, None], batch.num_agents).at[:, 0].set(first)
-        results = evaluator(seats, episodes, jax.random.split(row_key, count))
+        teams = [seats(actors[first], others) for others in actors]
+        stacked = jax.tree.map(lambda *x: jnp.stack(x), *teams)
+        results = evaluator(stacked, episodes, jax.random.split(row_key, count))
         rates[first] = [result.success_rate for result in results]
     return rates
 

@@ -27,7 +27,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import running_init
-from mqe_jax.train.policy import PolicyArrays, TrainedPolicy
+from mqe_jax.train.policy import Actor, TrainedPolicy
 
 _FADE = 0.95  # of the counts behind the metrics, per update
 _SWING = 30.0  # Elo points per update, at most; one per game beyond what was expected
@@ -93,6 +93,7 @@ class League:
         params = self._network.policy_params(self._network.init(jax.random.PRNGKey(0)))
         statistics = running_init(needs.dims.observation, config.network.features(needs.dims))
         first = TrainedPolicy(params, statistics, needs, config, {})
+        self._form = first.form
 
         def load(name):
             return load_as("opponent", name, matches.env) if name in self._roster.fixed else first
@@ -146,20 +147,19 @@ class League:
             league
         )
 
-    def _member(self, league: LeagueState, block: int) -> PolicyArrays:
-        """Returns the arrays of the member that a block plays."""
+    def _member(self, league: LeagueState, block: int) -> Actor:
+        """Returns the member that a block plays."""
         return jax.tree.map(lambda x: x[league.member[block]], league.pool.arrays)
 
     @property
     def _network(self) -> Network:
         return self._config.network.build(self._dims)  # whose functions cannot be pickled
 
-    def _own(self, state: TrainState) -> PolicyArrays:
-        """Returns the arrays of the learner's policy."""
+    def _own(self, state: TrainState) -> Actor:
+        """Returns the learner's policy."""
         scale = jnp.float32(self._config.action_scale)
-        return PolicyArrays(
-            self._network.policy_params(state.params), state.obs_normalizer.obs, scale
-        )
+        params = self._network.policy_params(state.params)
+        return Actor(params, state.obs_normalizer.obs, scale, self._form)
 
     def _record(self, league: LeagueState, opponents: Sequence[Any]) -> LeagueState:
         counts = devices.total(jnp.stack([opponent.outcomes for opponent in opponents])).astype(
@@ -183,7 +183,7 @@ class League:
             recent=_FADE * league.recent + counts,
         )
 
-    def _snapshot(self, league: LeagueState, own: PolicyArrays, updates: jax.Array) -> LeagueState:
+    def _snapshot(self, league: LeagueState, own: Actor, updates: jax.Array) -> LeagueState:
         settings = self._config.league
         every = -(-settings.snapshot_steps // self._config.steps_per_update)
         since = updates - league.snapshot

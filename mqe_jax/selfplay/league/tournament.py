@@ -13,6 +13,8 @@ import numpy as np
 from annotated_types import MinLen
 from numpy.typing import NDArray
 
+from mqe_jax.acting.results import Rate
+from mqe_jax.acting.seats import Policy, check_policy
 from mqe_jax.core.limits import NonNegativeInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check_arguments, fail
@@ -37,8 +39,6 @@ from mqe_jax.selfplay.league.games import (
 )
 from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
 from mqe_jax.selfplay.opponents import Versus
-from mqe_jax.train.evaluate import Rate
-from mqe_jax.train.policy import Policy, check_policy
 
 Array = NDArray[np.float64]
 CSV = "tournament.csv"
