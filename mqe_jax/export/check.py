@@ -1,6 +1,5 @@
 """Compares an exported graph in onnxruntime with the exported function, on episodes of the task."""
 
-import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,27 +20,30 @@ STEPS = 100
 LARGEST_ERROR = 1e-4
 """Largest error of a graph's outputs."""
 CYCLES = {"gait": 1.0, "obs": 2 * np.pi}
-"""Ends of the names of outputs with cyclic entries, gait phase and yaw, whose errors are cyclic
-too: ONNX has no signed zero at +-pi."""
+"""Ends of the names of outputs with cyclic entries, gait phase and yaw, and their cycles.
+
+Their errors are cyclic too, as ONNX has no signed zero at +-pi.
+"""
 
 Arrays = dict[str, np.ndarray]
 
 
 def verify_policy(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:
-    """Returns the graph of a policy and its error against JAX in `STEPS` steps; InputError above
-    `LARGEST_ERROR`.
+    """Returns the graph of a policy and its error against JAX in `STEPS` steps.
+
+    InputError above `LARGEST_ERROR`.
     """
     model = to_onnx(policy, env)
-    return model, check_errors(
-        model, *record_actions(policy, env, STEPS), f"{STEPS} steps of {env.name}"
-    )
+    inputs, expected = record_actions(policy, env, STEPS)
+    return model, check_errors(model, inputs, expected, f"{STEPS} steps of {env.name}")
 
 
 def verify(
     function: Function, shapes: Mapping[str, tuple[int, ...]], name: str, inputs: Arrays
 ) -> onnx.ModelProto:
-    """Returns the graph of a function, compared with it for inputs with leading axis N; errors as
-    `verify_policy`.
+    """Returns the graph of a function, compared with it for inputs with leading axis N.
+
+    Errors are as those of `verify_policy`.
     """
     model = translate(function, shapes, name)
     expected = jax.device_get(jax.jit(jax.vmap(function))(inputs))
@@ -50,37 +52,35 @@ def verify(
 
 
 def check_errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays, where: str) -> float:
-    """Returns the largest error of a graph, for arguments as of `errors`; InputError above
-    `LARGEST_ERROR`.
+    """Returns the largest error of a graph, for arguments as of `errors`.
+
+    InputError above `LARGEST_ERROR`.
     """
     error, output = max((error, name) for name, error in errors(model, inputs, expected).items())
     if not error <= LARGEST_ERROR:
         raise InputError(
             f"export: nothing is written, because in {where} the graph's output {output!r} "
-            "differs from JAX by "
-            f"{error:.1e}; at most {LARGEST_ERROR:g} is allowed"
+            f"differs from JAX by {error:.1e}; at most {LARGEST_ERROR:g} is allowed"
         )
     return error
 
 
 def record_actions(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
-    """Returns inputs and outputs of `policy_step` by name, leading axis T, with mean actions and
-    idle opponents.
+    """Returns inputs and outputs of `policy_step` by name, leading axis T.
+
+    Actions are means. Opponents are idle.
     """
     shapes = input_shapes(policy, env)
     group = policy.needs.group
 
     @jax.jit
     def advance(state: Any, memory: dict[str, Any]) -> tuple[Any, Any, Any]:
-        sensed = {
-            "obs": observations(state).group(group),
-            **dict(zip(SENSED, env.read(state.data).proprioception, strict=True)),
-        }
+        sensed = dict(zip(SENSED, env.read(state.data).proprioception, strict=True))
+        sensed = {"obs": observations(state).group(group), **sensed}
         inputs = {name: x[: policy.agents] for name, x in sensed.items() if name in shapes} | memory
         outputs = policy_step(policy, env, inputs)
-        action = (
-            jnp.zeros((env.num_agents, env.action_size)).at[: policy.agents].set(outputs["action"])
-        )
+        action = jnp.zeros((env.num_agents, env.action_size))
+        action = action.at[: policy.agents].set(outputs["action"])
         return inputs, outputs, env.with_observations(env.advance(state, action), [group])
 
     @jax.jit
@@ -102,9 +102,7 @@ def record_actions(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tupl
 
 
 def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str, float]:
-    """Returns the largest absolute error of each output, for inputs and expected outputs (T, ...)
-    as one batch.
-    """
+    """Returns the largest absolute error of each output over a batch of inputs (T, ...)."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -117,12 +115,11 @@ def errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays) -> dict[str
         found = dict(zip(names, session.run(names, inputs), strict=True))
     except Exception as error:  # onnxruntime's errors have no common class
         raise InputError(f"export: onnxruntime cannot run the graph: {error}") from None
-    differences = {
-        name: np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf) for name in names
-    }
-    for name, cycle in itertools.product(differences, CYCLES):
-        if name.endswith(cycle):
-            differences[name] = np.minimum(
-                differences[name], np.abs(CYCLES[cycle] - differences[name])
-            )
-    return {name: float(x.max()) for name, x in differences.items()}
+    largest = {}
+    for name in names:
+        difference = np.nan_to_num(np.abs(found[name] - expected[name]), nan=np.inf)
+        for ending, cycle in CYCLES.items():
+            if name.endswith(ending):
+                difference = np.minimum(difference, np.abs(cycle - difference))
+        largest[name] = float(difference.max())
+    return largest

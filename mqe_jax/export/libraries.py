@@ -1,5 +1,6 @@
-"""The page's browser libraries: npm packages at pinned versions, checked by SHA-256 and kept in the
-user's cache.
+"""The page's browser libraries: npm packages at pinned versions, kept in the user's cache.
+
+SHA-256 checks them.
 """
 
 import hashlib
@@ -60,13 +61,14 @@ def add_libraries(folder: Path, source: Path | None = None) -> None:
     for package in PACKAGES:
         for file in package.files:
             name = Path(file).name
-            if source is not None and not (source / name).is_file():
+            if source is None:
+                contents[name] = _member(_archive(package), file)
+            elif (source / name).is_file():
+                contents[name] = (source / name).read_bytes()
+            else:
                 raise InputError(
                     f"libraries: {source} has no {name}, of {package.name}@{package.version}"
                 )
-            contents[name] = (
-                _member(_archive(package), file) if source is None else (source / name).read_bytes()
-            )
     for name, content in contents.items():
         write_atomically(folder / name, content)
 
@@ -74,11 +76,8 @@ def add_libraries(folder: Path, source: Path | None = None) -> None:
 def _archive(package: Package) -> Path:
     """Returns the archive of a package, fetched if the cache lacks it."""
     title = f"{package.name}@{package.version}"
-    archive = (
-        user_cache()
-        / "play"
-        / f"{package.name.lstrip('@').replace('/', '-')}-{package.version}.tgz"
-    )
+    name = package.name.lstrip("@").replace("/", "-")
+    archive = user_cache() / "play" / f"{name}-{package.version}.tgz"
     if not archive.is_file():
         _fetch(title, archive)
     if hashlib.sha256(archive.read_bytes()).hexdigest() != package.sha256:
@@ -103,15 +102,8 @@ def _fetch(title: str, archive: Path) -> None:
         )
     archive.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=archive.parent) as temporary:
-        command = [
-            npm,
-            "pack",
-            "--loglevel=error",
-            "--fetch-retries=0",
-            "--pack-destination",
-            temporary,
-            title,
-        ]
+        options = ["--loglevel=error", "--fetch-retries=0", "--pack-destination", temporary]
+        command = [npm, "pack", *options, title]
         try:
             done = subprocess.run(
                 command, cwd=temporary, capture_output=True, text=True, timeout=300
@@ -120,8 +112,7 @@ def _fetch(title: str, archive: Path) -> None:
             raise InputError(f"libraries: {title}: npm pack took more than 300 s") from None
         found = list(Path(temporary).glob("*.tgz"))
         if done.returncode or not found:
-            reason = next(
-                (line for line in done.stderr.splitlines() if "error" in line.lower()), "no archive"
-            )
-            raise InputError(f"libraries: {title}: npm pack failed ({reason.strip()})")
+            errors = [line for line in done.stderr.splitlines() if "error" in line.lower()]
+            reason = errors[0].strip() if errors else "no archive"
+            raise InputError(f"libraries: {title}: npm pack failed ({reason})")
         found[0].replace(archive)

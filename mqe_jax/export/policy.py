@@ -1,5 +1,4 @@
-"""A team's policy as one function and its ONNX graph: high-level policy and, in `command` control,
-skill.
+"""A team's policy as one function and its ONNX graph, with the skill in `command` control.
 
 Every input and output has a leading batch axis N. The input `obs` (N, A, O) is the policy's group
 of observations. Recurrent states are initialised to zero, and each output `next_X` is the input `X`
@@ -44,8 +43,9 @@ SENSED = ("gravity", "joint_position", "joint_velocity")
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)
 def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
-    """Returns the graph of a policy with its mean actions; its task defines control mode, robot and
-    walk policy.
+    """Returns the graph of a policy with its mean actions.
+
+    The task defines control mode, robot and walk policy.
 
     Example:
         ```python
@@ -71,13 +71,11 @@ def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[in
     robots: dict[str, tuple[int, ...]] = {"obs": (policy.needs.dims.observation,)}
     if env.control == "command":
         skill, _ = skill_of(env)
-        robots |= sensed_shapes(env.robot) | {
-            name: x.shape for name, x in name_arrays(skill.name, skill.init_memory()).items()
-        }
+        memory = name_arrays(skill.name, skill.init_memory())
+        robots |= sensed_shapes(env.robot) | {name: x.shape for name, x in memory.items()}
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
-    return shapes | {
-        name: x.shape for name, x in name_arrays("memory", policy.initial_memory()).items()
-    }
+    memory = name_arrays("memory", policy.initial_memory())
+    return shapes | {name: x.shape for name, x in memory.items()}
 
 
 def sensed_shapes(robot: Robot) -> dict[str, tuple[int, ...]]:
@@ -89,54 +87,47 @@ def sensed_shapes(robot: Robot) -> dict[str, tuple[int, ...]]:
 def policy_step(
     policy: TrainedPolicy, env: QuadrupedEnv, inputs: Mapping[str, jax.Array]
 ) -> dict[str, jax.Array]:
-    """Returns the outputs of one step of one environment by name, the function that the graph maps
-    over N.
+    """Returns the outputs of a step of one environment by name.
+
+    The graph maps this function over N.
     """
-    action, memory = policy.act(
-        inputs["obs"], fill_arrays("memory", policy.initial_memory(), inputs)
-    )
+    memory = fill_arrays("memory", policy.initial_memory(), inputs)
+    action, memory = policy.act(inputs["obs"], memory)
     outputs = {"action": action} | name_arrays("next_memory", memory)
     moving = env.moving(action)
     if env.control == "torque":
         return outputs | {"torque": moving * env.robot.torque_limit}
     if env.control == "position":
-        return outputs | {
-            "joint_target": env.robot.joint_targets(moving, env.params.position_scale)
-        }
+        target = env.robot.joint_targets(moving, env.params.position_scale)
+        return outputs | {"joint_target": target}
     skill, params = skill_of(env)
     commands = env.controller.skill_commands(moving)
     sensed = Proprioception(*(inputs[name] for name in SENSED))
     act = jax.vmap(functools.partial(skill.targets, params))
     target, memory = act(fill_arrays(skill.name, skill.init_memory(), inputs), commands, sensed)
-    return (
-        outputs
-        | {"commands": commands, "joint_target": target}
-        | name_arrays(f"next_{skill.name}", memory)
-    )
+    outputs |= {"commands": commands, "joint_target": target}
+    return outputs | name_arrays(f"next_{skill.name}", memory)
 
 
 def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
-    """Returns the skill of a task's robots for any commands, with its parameters as they are in the
-    file.
-    """
+    """Returns the skill of a task's robots for any commands, and its parameters as in the file."""
     skill = skills.make(env.params.skill, env.robot)
     return skill, skill.load_params(env.params.skill_weights)
 
 
 def name_arrays(prefix: str, memory: Any) -> dict[str, Any]:
     """Returns the arrays of a recurrent state by name."""
-    leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
-    return {
-        "_".join([prefix, *(jax.tree_util.keystr((k,), simple=True) for k in path)]): x
-        for path, x in leaves
-    }
+    named = {}
+    for path, x in jax.tree_util.tree_flatten_with_path(memory)[0]:
+        keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
+        named["_".join([prefix, *keys])] = x
+    return named
 
 
 def fill_arrays(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:
     """Returns a recurrent state of the structure of `memory` with the arrays of the inputs."""
-    return jax.tree.unflatten(
-        jax.tree.structure(memory), [inputs[name] for name in name_arrays(prefix, memory)]
-    )
+    leaves = [inputs[name] for name in name_arrays(prefix, memory)]
+    return jax.tree.unflatten(jax.tree.structure(memory), leaves)
 
 
 def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:

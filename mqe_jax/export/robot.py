@@ -41,8 +41,9 @@ class Robot:
         self.properties = self._session.get_modelmeta().custom_metadata_map
 
     def act(self, readings: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        """Returns the actions (N, D) for readings (N, O); `starts` (N,) is 1 where an episode
-        starts, else 0.
+        """Returns the actions (N, D) for readings (N, O).
+
+        `starts` (N,) is 1 where an episode starts, else 0.
         """
         count = len(readings)
         inputs = {"obs": readings.reshape(count, *self._shapes["obs"])}
@@ -69,15 +70,14 @@ def write_frame(stream: IO[bytes], numbers: np.ndarray) -> None:
 
 def read_frame(stream: IO[bytes]) -> np.ndarray | None:
     """Returns the next frame (rows, columns), or None if the stream has ended."""
-    if len(head := stream.read(_HEAD.size)) < _HEAD.size:
+    head = stream.read(_HEAD.size)
+    if len(head) < _HEAD.size:
         return None
     rows, columns = _HEAD.unpack(head)
     content = stream.read(4 * rows * columns)
-    return (
-        np.frombuffer(content, "<f4").reshape(rows, columns)
-        if len(content) == 4 * rows * columns
-        else None
-    )
+    if len(content) < 4 * rows * columns:
+        return None
+    return np.frombuffer(content, "<f4").reshape(rows, columns)
 
 
 def main(file: str, seed: str = "0") -> None:

@@ -1,5 +1,4 @@
-"""The graph of one robot: the part of a team's policy that turns its own readings into its own
-actions.
+"""The graph of one robot: from its own readings to its own actions, as its team's policy does.
 
 | input | output | |
 |---|---|---|
@@ -24,15 +23,16 @@ from mqe_jax.core.types import AnyTrained, observations
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors
 from mqe_jax.export.policy import properties
-from mqe_jax.export.task import readings_function
+from mqe_jax.export.task import Shapes, readings_function
 from mqe_jax.export.translate import translate
 from mqe_jax.train.policy import TrainedPolicy
 
 
 @check_arguments(policy=AnyTrained, env=QuadrupedEnv)
 def robot_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
-    """Returns the graph of any robot of a policy's team; its actions are means if those of the
-    policy are.
+    """Returns the graph of any robot of a policy's team.
+
+    Its actions are means if those of the policy are.
 
     Raises:
         InputError: for another task than the policy's, a policy whose robots do not share a
@@ -66,8 +66,9 @@ def verify_robot(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelPr
 
 
 def _one_robot(policy: TrainedPolicy) -> TrainedPolicy:
-    """Returns the policy of a team of one, which acts as each robot of a team whose robots do not
-    see each other.
+    """Returns the policy of a team of one.
+
+    It acts as each robot of a team whose robots do not see each other.
     """
     if policy.agents == 1:
         return policy
@@ -88,30 +89,28 @@ def _record(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[Arrays, Arrays, f
     size = policy.needs.dims.observation
     group = policy.needs.group
     batch = VectorEnv(env, 1, final=()).with_groups(policy.groups)
-    (team, team_sizes) = readings_function(policy, size)
-    (robot, sizes) = readings_function(_one_robot(policy), size)
+    team, team_sizes = readings_function(policy, size)
+    robot, sizes = readings_function(_one_robot(policy), size)
 
-    def empty(sizes, *lead):
+    def empty(sizes: Shapes, *lead: int) -> dict[str, jax.Array]:
         return {n: jnp.zeros((*lead, *x)) for n, x in sizes.items() if n.startswith("memory")}
 
     @jax.jit
     def advance(state: Any, memories: Any, noise: jax.Array) -> Any:
         seen = observations(state).group(group)[0, :agents]
-        drawn = {"noise": noise} if "noise" in sizes else {}
-        inputs = {"obs": seen[:, None], **drawn, **memories[0]}
+        inputs = {"obs": seen[:, None], **memories[0]}
+        team_inputs = {"obs": seen, **memories[1]}
+        if "noise" in sizes:
+            inputs["noise"] = noise
+            team_inputs["noise"] = noise.reshape(-1)
         outputs = jax.vmap(robot)(inputs)
-        drawn = {"noise": noise.reshape(-1)} if drawn else {}
-        together = team({"obs": seen, **drawn, **memories[1]})
-        action = (
-            jnp.zeros((1, env.num_agents, env.action_size)).at[0, :agents].set(together["action"])
-        )
-        state = batch.step(state, action)
+        together = team(team_inputs)
+        action = jnp.zeros((1, env.num_agents, env.action_size))
+        state = batch.step(state, action.at[0, :agents].set(together["action"]))
         kept = 1.0 - (state.terminated | state.truncated)[0]
-        after = [
-            {n: kept * x[f"next_{n}"] for n in m}
-            for x, m in zip((outputs, together), memories, strict=True)
-        ]
-        return inputs, outputs, together["action"], state, after
+        own = {name: kept * outputs[f"next_{name}"] for name in memories[0]}
+        common = {name: kept * together[f"next_{name}"] for name in memories[1]}
+        return inputs, outputs, together["action"], state, [own, common]
 
     random = np.random.default_rng(0)
     rows = []

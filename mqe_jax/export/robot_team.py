@@ -1,6 +1,4 @@
-"""A team whose robots are separate processes, each with an exported graph and its own readings
-only.
-"""
+"""A team whose robots are processes, each with an exported graph and its own readings only."""
 
 from __future__ import annotations
 
@@ -39,14 +37,21 @@ class RobotTeam:
     state, so that the one of `act` only says whether the episode has started.
     """
 
-    file: Path  # the graph of one robot
-    needs: Needs  # what the team needs of its environment
-    config: TrainConfig  # settings of which `unmet` reads the group of observations
+    file: Path
+    """The graph of one robot."""
+    needs: Needs
+    """What the team needs of its environment."""
+    config: TrainConfig
+    """Settings of which `unmet` reads the group of observations."""
     task: str
-    agents: int  # number of robots A
-    groups: tuple[str, ...]  # the group of observations that they see
-    deterministic: bool  # whether they act with their mean actions
-    failure: str  # why a process ended, if one did
+    agents: int
+    """Number of robots A."""
+    groups: tuple[str, ...]
+    """The group of observations that the robots see."""
+    deterministic: bool
+    """Whether the robots act with their mean actions."""
+    failure: str
+    """Why a process ended, if one did."""
 
     def __init__(self, file: Path, needs: Needs, deterministic: bool, seed: int) -> None:
         self.file = file
@@ -91,9 +96,7 @@ class RobotTeam:
             process.close()
 
     def _exchange(self, readings: Any, started: Any) -> np.ndarray:
-        """Sends every robot its readings (..., A, O) and returns the actions (..., A, D) that they
-        answer.
-        """
+        """Sends every robot its readings (..., A, O) and returns their actions (..., A, D)."""
         readings = np.asarray(readings)
         rows = readings.reshape(-1, *readings.shape[-2:])
         starts = 1.0 - np.asarray(started).reshape(-1, 1)
@@ -158,8 +161,9 @@ class _Process:
 @contextlib.contextmanager
 @check_arguments(file=PathText, seed=limits.Seed)
 def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
-    """Starts the processes of a team of robots that all have one file, written with `--per-robot`;
-    yields its policy.
+    """Starts the processes of a team of robots that share one file, and yields its policy.
+
+    `mqe export --per-robot` writes such a file.
 
     Example:
         ```python
@@ -175,8 +179,7 @@ def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
         ConnectionError: at the end, if a process ended before.
     """
     team = _read(Path(file), seed)
-    # which prints the traceback of an error in a callback
-    logger = logging.getLogger("jax._src.callback")
+    logger = logging.getLogger("jax._src.callback")  # prints the traceback of a callback's error
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:

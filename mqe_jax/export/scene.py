@@ -1,6 +1,4 @@
-"""A task's scene for other programs: MJCF, and the numbers that stepping and drawing need beside
-it.
-"""
+"""A task's scene for other programs: MJCF, and the numbers that it lacks."""
 
 from typing import Any
 
@@ -47,10 +45,11 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     index = env.index
     scene = env.compiled.scene
     tables = ("base_qpos", "joint_qpos", "joint_qvel", "actuator")
-    rows = [
-        {name: getattr(index, name)[i].tolist() for name in tables} for i in range(index.num_robots)
-    ]
     colors = scene.colors or range(index.num_robots)
+    robots = []
+    for i, color in zip(range(index.num_robots), colors, strict=True):
+        addresses = {name: getattr(index, name)[i].tolist() for name in tables}
+        robots.append({**addresses, "color": list(ROBOT_COLORS[color % len(ROBOT_COLORS)][:3])})
     return {
         "task": env.name,
         "title": env.heading,
@@ -62,10 +61,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
         "max_steps": env.max_steps,
         "teams": [list(team) for team in env.teams],
         "commands": list(env.controller.commands),
-        "robots": [
-            {**row, "color": list(ROBOT_COLORS[color % len(ROBOT_COLORS)][:3])}
-            for row, color in zip(rows, colors, strict=True)
-        ],
+        "robots": robots,
         "track": {
             "start": scene.track.start,
             "length": scene.track.length,

@@ -1,5 +1,4 @@
-"""A task as functions of arrays by name, and their ONNX graphs: all of an episode but physics and
-random numbers.
+"""A task as functions of arrays by name, and their ONNX graphs, without physics and randomness.
 
 In an environment step the graphs run in this order; the physics steps are between `skill` and
 `judge`.
@@ -47,7 +46,7 @@ Arrays = Mapping[str, Any]
 
 
 class TaskFunctions:
-    """The functions of a task, of one environment; domain randomisation is not part of them.
+    """The functions of a task, of one environment, without domain randomisation.
 
     InputError for another control mode than `command`, or an actuator network.
 
@@ -69,32 +68,30 @@ class TaskFunctions:
             )
         if env.params.actuator_network is not None:
             raise InputError("actuator_network: not allowed; graphs of tasks need PD control")
-        if env.controller.npc and env.npc_skill not in [
-            part.name for part in env.controller.skill.parts
-        ]:
+        parts = [part.name for part in env.controller.skill.parts]
+        if env.controller.npc and env.npc_skill not in parts:
             raise InputError(
                 f"skill: {env.params.skill!r} is not allowed; graphs of tasks need that of the "
-                "NPC robots, "
-                f"{env.npc_skill!r}, alone or among several"
+                f"NPC robots, {env.npc_skill!r}, alone or among several"
             )
         self.env = env
         self._start = jax.jit(env.reset)(jax.random.PRNGKey(0))
         robots = env.read(self._start.data)
-        self.outcomes: list[str] = list(
-            env.result(self._start, robots, jnp.zeros((), bool)).by_name()
-        )
+        result = env.result(self._start, robots, jnp.zeros((), bool))
+        self.outcomes: list[str] = list(result.by_name())
         self._noise = _noise_size(lambda: env.step_npcs(self._start.data, robots, self._start.key))
 
     @property
     def control_inputs(self) -> Shapes:
+        """Shapes of the inputs of `control` by name."""
         actions = (self.env.num_agents, self.env.action_size)
         noise = {"noise": (self._noise,)} if self._noise else {}
-        return (
-            self.state_inputs | {"action": actions, "drive": actions, "driven": actions[:1]} | noise
-        )
+        own = {"action": actions, "drive": actions, "driven": actions[:1]}
+        return self.state_inputs | own | noise
 
     @property
     def judge_inputs(self) -> Shapes:
+        """Shapes of the inputs of `judge` by name."""
         return self.state_inputs | {f"before_{name}": self.state_inputs[name] for name in PHYSICS}
 
     def control(self, inputs: Arrays) -> dict[str, jax.Array]:
@@ -113,15 +110,15 @@ class TaskFunctions:
         commands = env.controller.skill_commands(action)
         npcs = env.npc_commands(state, robots)
         if npcs is not None:
-            commands = jnp.concatenate(
-                [commands, env.controller.skill.with_choice(env.npc_skill, npcs)]
-            )
+            npcs = env.controller.skill.with_choice(env.npc_skill, npcs)
+            commands = jnp.concatenate([commands, npcs])
         outputs = {"command": commands, **dict(zip(SENSED, robots.proprioception, strict=True))}
         with normal_numbers(inputs.get("noise")):
             data = env.step_npcs(state.data, robots, state.key)
         if data is not state.data:
             outputs["next_qvel"] = data.qvel
-        if (forces := env.external_forces(state)) is not None:
+        forces = env.external_forces(state)
+        if forces is not None:
             outputs["xfrc_applied"] = forces
         return outputs
 
@@ -153,11 +150,8 @@ class TaskFunctions:
     def state(self, inputs: Arrays) -> State:
         """Returns the environment's state with the arrays of the inputs."""
         start = self._start
-        task = self._start.task
         data = start.data.replace(**{name: inputs[name] for name in PHYSICS})
-        task = jax.tree.map(
-            lambda x, like: x.astype(like.dtype), fill_arrays("task", task, inputs), task
-        )
+        task = _like(fill_arrays("task", start.task, inputs), start.task)
         anchors = inputs.get("anchors", start.anchors)
         step = inputs["step"].astype(jnp.int32)
         return dataclasses.replace(start, data=data, anchors=anchors, task=task, step=step)
@@ -166,6 +160,11 @@ class TaskFunctions:
     def state_inputs(self) -> Shapes:
         """Shapes of the arrays of a state by name."""
         return {name: x.shape for name, x in state_arrays(self._start).items()}
+
+
+def _like(arrays: Any, first: Any) -> Any:
+    """Returns arrays with the types of those of `first`."""
+    return jax.tree.map(lambda x, like: x.astype(like.dtype), arrays, first)
 
 
 def state_arrays(state: State) -> dict[str, jax.Array]:
@@ -181,9 +180,7 @@ def state_arrays(state: State) -> dict[str, jax.Array]:
 
 
 def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
-    """Returns the skill of a task's robots as a function of one robot, and the shapes of its
-    inputs.
-    """
+    """Returns the skill of a task's robots as a function of one robot, and its inputs' shapes."""
     skill, params = skill_of(env)
     memory = name_arrays(skill.name, skill.init_memory())
     shapes = {
@@ -202,8 +199,9 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
 
 
 def policy_function(policy: Policy, functions: TaskFunctions) -> tuple[Function, Shapes]:
-    """Returns a policy as a function of one team, and the shapes of its inputs; it samples where
-    `policy` does.
+    """Returns a policy as a function of one team, and the shapes of its inputs.
+
+    The function samples if `policy` does.
     """
     sensed = groups_of(policy) == {ONBOARD}
     act, shapes = _act_on_readings(
@@ -213,8 +211,9 @@ def policy_function(policy: Policy, functions: TaskFunctions) -> tuple[Function,
 
 
 def readings_function(policy: Policy, size: int) -> tuple[Function, Shapes]:
-    """Returns a policy as a function of the observations `obs` (A, size) of one team; see
-    `policy_function`.
+    """Returns a policy as a function of the observations `obs` (A, size) of a team.
+
+    See `policy_function`.
     """
     return _with_noise(*_act_on_readings(policy, size))
 
@@ -226,18 +225,17 @@ def _act_on_readings(policy: Policy, size: int) -> tuple[Function, Shapes]:
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         state = jax.tree.map(lambda x: x[None], fill_arrays("memory", memory, inputs))
         action, state = policy.act(inputs["obs"][None], state, key)
-        return {"action": action[0]} | {
-            name: x[0] for name, x in name_arrays("next_memory", state).items()
-        }
+        after = {name: x[0] for name, x in name_arrays("next_memory", state).items()}
+        return {"action": action[0], **after}
 
-    return act, {"obs": (policy.agents, size)} | {
-        n: x.shape for n, x in name_arrays("memory", memory).items()
-    }
+    recurrent = {name: x.shape for name, x in name_arrays("memory", memory).items()}
+    return act, {"obs": (policy.agents, size), **recurrent}
 
 
 def _with_noise(act: Function, shapes: Shapes) -> tuple[Function, Shapes]:
-    """Returns a function whose normal numbers are the input `noise` (K,), and its inputs; itself if
-    it draws none.
+    """Returns a function whose normal numbers are the input `noise` (K,), and its inputs.
+
+    It is `act` itself if that draws none.
     """
 
     def act_with_noise(inputs: Arrays) -> dict[str, jax.Array]:
@@ -245,15 +243,17 @@ def _with_noise(act: Function, shapes: Shapes) -> tuple[Function, Shapes]:
             return dict(act(inputs))
 
     size = _noise_size(lambda: act({name: jnp.zeros(shape) for name, shape in shapes.items()}))
-    return (act_with_noise, shapes | {"noise": (size,)}) if size else (act, shapes)
+    if not size:
+        return act, shapes
+    return act_with_noise, shapes | {"noise": (size,)}
 
 
 def _sensing(choose: Function, shapes: Shapes, functions: TaskFunctions) -> tuple[Function, Shapes]:
-    """Returns the function of a state that senses and then chooses the actions of the team `team`
-    (), and its inputs.
+    """Returns the function of a state that senses and then acts for a team, and its inputs.
 
-    `choose` with its inputs is a policy that sees sensors. The recurrent states `sense_NAME` are
-    those of all agents' sensors; the last actions among them are right for the team's own.
+    The input `team` () is the number of the team. `choose` with its inputs is a policy that sees
+    sensors. The recurrent states `sense_NAME` are those of all agents' sensors; the last actions
+    among them are right for the team's own.
     """
     env = functions.env
     first = env.suite.reset()
@@ -261,37 +261,26 @@ def _sensing(choose: Function, shapes: Shapes, functions: TaskFunctions) -> tupl
 
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         arrays = {name: inputs.get(name, x) for name, x in name_arrays("sense", first).items()}
-        senses = jax.tree.map(
-            lambda x, like: x.astype(like.dtype), fill_arrays("sense", first, arrays), first
-        )
+        senses = _like(fill_arrays("sense", first, arrays), first)
         state = dataclasses.replace(functions.state(inputs), senses=senses)
-        blocks, senses = env.suite.observe(
-            env.snapshot(state, env.read(state.data)), senses, state.key
-        )
+        snapshot = env.snapshot(state, env.read(state.data))
+        blocks, senses = env.suite.observe(snapshot, senses, state.key)
         every = finite(env.groups[ONBOARD].pack(blocks, env.num_agents))
         teams = [every[team[0] : team[-1] + 1] for team in env.teams]
         outputs = choose({**inputs, "obs": jnp.where(inputs["team"] < 0.5, teams[0], teams[-1])})
-        senses = senses._replace(
-            action=jnp.tile(jnp.clip(outputs["action"], -1.0, 1.0), (len(teams), 1))
-        )
-        after = {
-            name: x.astype(jnp.float32)
-            for name, x in name_arrays("next_sense", senses).items()
-            if x.size
-        }
-        return {**outputs, **after}
+        action = jnp.tile(jnp.clip(outputs["action"], -1.0, 1.0), (len(teams), 1))
+        after = name_arrays("next_sense", senses._replace(action=action))
+        return {**outputs, **{n: x.astype(jnp.float32) for n, x in after.items() if x.size}}
 
-    return act, functions.state_inputs | {"team": ()} | {
-        n: x for n, x in shapes.items() if n != "obs"
-    } | own
+    others = {name: shape for name, shape in shapes.items() if name != "obs"}
+    return act, {**functions.state_inputs, "team": (), **others, **own}
 
 
 @contextlib.contextmanager
 def normal_numbers(
     noise: jax.Array | None, used: Callable[[int], None] = lambda size: None
 ) -> Iterator[None]:
-    """Within it, `jax.random.normal` returns the numbers of `noise` (K,) in order, or zeros without
-    them.
+    """Within it, `jax.random.normal` returns the numbers of `noise` (K,) in order, or zeros.
 
     `uniform` and `bernoulli` are made of such numbers. A graph has no random keys, so its noise is
     an input. Nothing is compiled within, as JAX would keep it.
@@ -312,9 +301,8 @@ def normal_numbers(
         minval: Any = 0.0,
         maxval: Any = 1.0,
     ) -> jax.Array:
-        return minval + (maxval - minval) * 0.5 * (
-            1.0 + jax.lax.erf(normal(key, shape, dtype) / math.sqrt(2.0))
-        )
+        part = 1.0 + jax.lax.erf(normal(key, shape, dtype) / math.sqrt(2.0))
+        return minval + (maxval - minval) * 0.5 * part
 
     def bernoulli(key: jax.Array, p: Any, shape: tuple[int, ...]) -> jax.Array:
         return uniform(key, shape) < p

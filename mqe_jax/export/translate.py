@@ -28,10 +28,16 @@ def _select(which: jax.Array, *cases: jax.Array) -> jax.Array:
     return jax.lax.select_n(which, *cases)
 
 
+def _remainder(x: jax.Array, y: jax.Array) -> jax.Array:
+    if x.dtype == jnp.float32:
+        return x - y * jnp.trunc(x / y)
+    return x - y * jax.lax.div(x, y)
+
+
 REPLACED: dict[str, Callable[..., jax.Array]] = {
     "clamp": lambda low, x, high: jax.lax.min(jax.lax.max(x, low), high),
     "select_n": _select,
-    "rem": lambda x, y: x - y * (jnp.trunc(x / y) if x.dtype == jnp.float32 else jax.lax.div(x, y)),
+    "rem": _remainder,
 }
 """Operations that jax2onnx rejects for a symbolic axis, or onnxruntime for some types."""
 
@@ -48,15 +54,16 @@ def translate(
     name, without N, and `properties` the metadata of the model. InputError for an operation that
     jax2onnx cannot translate.
     """
+    specs = {key: jax.ShapeDtypeStruct(tuple(shape), np.float32) for key, shape in inputs.items()}
+
+    def copied(values: Mapping[str, Any]) -> Any:
+        # An output that is an input would have two names.
+        return jax.tree.map(jnp.copy, function(values))
+
     # Traced here, as jax2onnx replaces functions of jax.numpy while it traces, some of which fail
     # under `vmap`.
-    specs = {key: jax.ShapeDtypeStruct(tuple(shape), np.float32) for key, shape in inputs.items()}
-    # An output that is an input would have two names, so it is copied.
-    copied = jax.make_jaxpr(
-        lambda values: jax.tree.map(jnp.copy, function(values)), return_shape=True
-    )
     with jax.disable_jit():  # also unrolls scans, in which jax2onnx loses N
-        closed, outputs = copied(specs)
+        closed, outputs = jax.make_jaxpr(copied, return_shape=True)(specs)
 
     def evaluate_batch(*values: jax.Array) -> tuple[jax.Array, ...]:
         leaves = jax.tree.leaves(dict(zip(specs, values, strict=True)))
@@ -77,8 +84,9 @@ def translate(
 
 
 def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-    """Evaluates a jaxpr, at once where equations do not depend on the inputs; jax2onnx fails for
-    some of these.
+    """Evaluates a jaxpr; equations that do not depend on the inputs become constants.
+
+    jax2onnx fails for some of these.
     """
     known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *inputs), strict=True))
 
@@ -96,35 +104,30 @@ def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[Any]) -> 
         if all(0 in getattr(x, "shape", ()) for x in outputs):  # graphs have no empty arrays
             results = [np.zeros(x.shape, x.dtype) for x in outputs]
         elif inner is not None and name != "reduce":  # whose jaxpr is that of its operator
-            results = _evaluate(
-                getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values
-            )
-        elif any(isinstance(x, jax.core.Tracer) for x in values):
-            results = (
-                REPLACED[name](*values)
-                if name in REPLACED
-                else equation.primitive.bind(*values, **params)
-            )
-        else:
+            consts = getattr(inner, "consts", ())
+            results = _evaluate(getattr(inner, "jaxpr", inner), consts, values)
+        elif not any(isinstance(x, jax.core.Tracer) for x in values):
             with jax.ensure_compile_time_eval():
                 results = equation.primitive.bind(*values, **params)
-        results = results if isinstance(results, list | tuple) else [results]
+        elif name in REPLACED:
+            results = REPLACED[name](*values)
+        else:
+            results = equation.primitive.bind(*values, **params)
+        if not isinstance(results, list | tuple):
+            results = [results]
         known.update(zip(equation.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Stores large constants that float16 represents exactly as such, with a cast: half the
-    size.
-    """
+    """Stores large constants as float16, with a cast, if that represents them exactly."""
     for stored in graph.initializer:
         array = numpy_helper.to_array(stored)
-        half = (
-            array.astype(np.float16) if array.dtype == np.float32 and array.size > 1000 else array
-        )
-        if half is not array and np.array_equal(half, array):
+        if array.dtype != np.float32 or array.size <= 1000:
+            continue
+        half = array.astype(np.float16)
+        if np.array_equal(half, array):
             whole = stored.name
             stored.CopyFrom(numpy_helper.from_array(half, f"{whole}_half"))
-            graph.node.insert(
-                0, helper.make_node("Cast", [stored.name], [whole], to=TensorProto.FLOAT)
-            )
+            cast = helper.make_node("Cast", [stored.name], [whole], to=TensorProto.FLOAT)
+            graph.node.insert(0, cast)
