@@ -51,8 +51,11 @@ def task_env(
         InputError: for an argument that is not allowed.
     """
     if isinstance(task, QuadrupedEnv):
-        if overrides or max_steps is not None:
-            names = ", ".join([*overrides, *([limit] if max_steps is not None else [])])
+        passed = [*overrides]
+        if max_steps is not None:
+            passed.append(limit)
+        if passed:
+            names = ", ".join(passed)
             raise InputError(f"task: overrides ({names}) need the id of a task, not an environment")
         env = task
     else:
@@ -72,23 +75,20 @@ def agent_names(env: TaskEnv) -> list[str]:
 
 
 def team_reward(env: TaskEnv, reward: Any) -> Any:
-    """Returns the mean reward (...) of team 0 from rewards (..., A): of all agents in cooperative
-    tasks.
-    """
+    """Returns the mean reward (...) of team 0, all agents in cooperative tasks, from (..., A)."""
     return reward[..., np.array(env.teams[0])].mean(-1)
 
 
 def select(
     env: TaskEnv, choose: jax.Array, first: State, second: State, kept: tuple[str, ...] = ()
 ) -> State:
-    """Returns `first` where `choose` () is true, else `second`, whose fields `kept` and shared
-    buffers stay.
+    """Returns `first` where `choose` () is true, else `second`.
+
+    The fields `kept` and shared buffers are those of `second`.
     """
     names = {field.name for field in dataclasses.fields(second)}.difference(kept, ("data",))
-    fields = {name: (getattr(first, name), getattr(second, name)) for name in names}
-    merged = {
-        n: jax.tree.map(lambda a, b: jnp.where(choose, a, b), *pair) for n, pair in fields.items()
-    }
-    return dataclasses.replace(
-        second, data=env.physics.merge(choose, first.data, second.data), **merged
-    )
+    merged: dict[str, Any] = {"data": env.physics.merge(choose, first.data, second.data)}
+    for name in names:
+        pair = (getattr(first, name), getattr(second, name))
+        merged[name] = jax.tree.map(lambda a, b: jnp.where(choose, a, b), *pair)
+    return dataclasses.replace(second, **merged)

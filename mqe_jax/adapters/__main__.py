@@ -1,5 +1,6 @@
-"""`python -m mqe_jax.adapters SCRIPT [ARGUMENT...]` runs a script of another library in which the
-tasks are registered.
+"""`python -m mqe_jax.adapters SCRIPT [ARGUMENT...]` runs another library's script.
+
+The tasks are registered in it.
 
 The script creates a task by the `make` of its library: `ENV_NAME=go1gate` for the baselines of
 JaxMARL.
@@ -15,9 +16,8 @@ from mqe_jax.core.errors import InputError
 
 if __name__ == "__main__":
     if not sys.argv[1:] or not Path(sys.argv[1]).is_file():
-        sys.exit(
-            f"{sys.argv[1:2]}: SCRIPT must be a Python file: python -m mqe_jax.adapters SCRIPT ..."
-        )
+        usage = "SCRIPT must be a Python file: python -m mqe_jax.adapters SCRIPT ..."
+        sys.exit(f"{sys.argv[1:2]}: {usage}")
     for library in ("gymnasium", "pettingzoo", "brax", "jaxmarl"):
         with contextlib.suppress(InputError):  # not installed
             importlib.import_module(f"mqe_jax.adapters.{library}")

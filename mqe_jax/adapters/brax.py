@@ -1,5 +1,4 @@
-"""Brax: `Env` over the joint observations and actions of all agents, flattened, and a wrapper for
-training.
+"""Brax: `Env` over the joint observations and actions of all agents, and a training wrapper.
 
 Importing this module registers every task under its id, for `brax.envs.get_environment` and
 `brax.envs.create`.
@@ -11,7 +10,7 @@ environment from the same initial state.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -49,8 +48,9 @@ def register() -> None:
 
 
 class Env(BraxEnv):
-    """One environment: observation (A * O,), action (A * action_size,) in [-1, 1], agent after
-    agent.
+    """One environment: observation (A * O,), action (A * action_size,) in [-1, 1].
+
+    Agents follow each other in both.
 
     With an `opponent`, A counts the agents of team 0 and the reward is their mean. `done` is 1 on
     termination; time limits are left to Brax's EpisodeWrapper. `info["truncation"]` is 1 in the
@@ -59,8 +59,9 @@ class Env(BraxEnv):
     """
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
-        """Creates the environment from a task id or an environment; see `task_env` for the
-        overrides.
+        """Creates the environment from a task id or an environment.
+
+        The overrides are those of `task_env`.
         """
         self.env: TaskEnv = task_env(task, **overrides)
         self.episode_length: int = self.env.max_steps
@@ -72,14 +73,7 @@ class Env(BraxEnv):
         info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
         pipeline: Any = state  # any pytree, although Brax's annotation is narrower
         zero = jnp.zeros(())
-        return State(
-            pipeline_state=pipeline,
-            obs=obs,
-            reward=zero,
-            done=zero,
-            metrics=info_of(state),
-            info=info,
-        )
+        return State(pipeline, obs, reward=zero, done=zero, metrics=info_of(state), info=info)
 
     @single
     def step(self, state: State, action: jax.Array) -> State:
@@ -144,9 +138,8 @@ class AutoReset(Wrapper):
 
         def restart(own: TaskState, done: jax.Array) -> TaskState:
             # EpisodeWrapper may end an episode earlier than the task's time limit.
-            return autoreset(
-                task, dataclasses.replace(own, truncated=done.astype(bool) & ~own.terminated)
-            )
+            truncated = done.astype(bool) & ~own.terminated
+            return autoreset(task, dataclasses.replace(own, truncated=truncated))
 
         reached: Any = after.pipeline_state
         own = jax.vmap(restart)(reached, after.done)
@@ -161,14 +154,10 @@ def wrap(
     action_repeat: int = 1,
     randomization_fn: Callable[..., Any] | None = None,
 ) -> Wrapper:
-    """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, automatic reset to
-    new episodes.
-    """
-    if not isinstance(getattr(env, "unwrapped", env), Env):
-        raise InputError(
-            f"env: {type(getattr(env, 'unwrapped', env)).__name__} is not a "
-            "mqe_jax.adapters.brax.Env"
-        )
+    """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, new episodes."""
+    inner = getattr(env, "unwrapped", env)
+    if not isinstance(inner, Env):
+        raise InputError(f"env: {type(inner).__name__} is not a mqe_jax.adapters.brax.Env")
     if randomization_fn is not None:
         raise InputError(
             "randomization_fn: not supported; pass randomization=... to the Env instead"
@@ -177,8 +166,11 @@ def wrap(
 
 
 register()
-# trainers of Brax 0.14.2 call what jax 0.10 has removed
-if not hasattr(jax, "device_put_replicated"):
-    jax.device_put_replicated = lambda tree, devices: jax.tree.map(  # pyright: ignore[reportAttributeAccessIssue]
-        lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree
-    )
+
+
+def _replicate(tree: Any, devices: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(devices)), tree)
+
+
+if not hasattr(jax, "device_put_replicated"):  # removed in jax 0.10; Brax 0.14.2 calls it
+    jax.device_put_replicated = _replicate  # pyright: ignore[reportAttributeAccessIssue]

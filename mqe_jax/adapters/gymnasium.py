@@ -87,8 +87,9 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """N environments stepped in one compiled call: observations (N, A, O), actions (N, A,
-    action_size).
+    """N environments stepped in one compiled call.
+
+    Observations are (N, A, O), actions (N, A, action_size).
 
     Environment i of `reset(seed=s)` equals the single environment reset with seed s + i, through
     automatic resets too.
@@ -114,11 +115,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except Exception:  # also of the `repr` of a value, which Gymnasium writes
-            fail(
-                "autoreset_mode",
-                autoreset_mode,
-                f"one of {', '.join(mode.value for mode in AutoresetMode)}",
-            )
+            allowed = ", ".join(mode.value for mode in AutoresetMode)
+            fail("autoreset_mode", autoreset_mode, f"one of {allowed}")
         self.render_mode = render_mode
         num_envs = check("num_envs", num_envs, Environments)
         if not isinstance(task, QuadrupedEnv):
@@ -147,25 +145,23 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         `seed` is that of environment 0 (environment i: seed + i), or one per environment; None
         continues the stream.
         """
-        super().reset(
-            seed=check("seed", seed, Seed) if isinstance(seed, int | np.integer) else None
-        )
+        single = isinstance(seed, int | np.integer)
+        super().reset(seed=check("seed", seed, Seed) if single else None)
         mask = _reset_mask(options, self.num_envs)
-        seeds: list[int | None]
-        if isinstance(seed, int | np.integer):
-            seeds = [int(seed) + i for i in range(self.num_envs)]
-        elif seed is None:
-            seeds = [None] * self.num_envs
-        elif (
-            isinstance(seed, Sequence | np.ndarray)
-            and not isinstance(seed, str)
-            and len(seed) == self.num_envs
-        ):
-            seeds = list(seed)
-        else:
-            fail("seed", seed, f"an integer, {self.num_envs} integers or None")
+        seeds = self._seeds(seed)
         self._ended &= ~mask
         return self._host.reset(seeds, self.np_random, mask), {}
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        """Returns the seed of each environment, or None."""
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + i for i in range(self.num_envs)]
+        if seed is None:
+            return [None] * self.num_envs
+        many = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
+        if not many or len(seed) != self.num_envs:
+            fail("seed", seed, f"an integer, {self.num_envs} integers or None")
+        return list(seed)
 
     def step(
         self, actions: np.ndarray
@@ -189,13 +185,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             infos = _mask_infos(metrics, ~self._ended)
         self._ended = ended.copy()
-        return (
-            out.obs,
-            team_reward(self.env, out.reward.astype(float)),
-            out.terminated,
-            out.truncated,
-            infos,
-        )
+        reward = team_reward(self.env, out.reward.astype(float))
+        return out.obs, reward, out.terminated, out.truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns an image (H, W, 3) uint8 of each environment, or None without a render mode."""
@@ -204,9 +195,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def _mask_infos(values: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
-    """Returns infos in Gymnasium's form: arrays, zero outside of the mask, and the mask under
-    `_name`.
-    """
+    """Returns infos in Gymnasium's form: arrays, zero outside of the mask, and masks `_name`."""
     if not mask.any():
         return {}
     infos: dict[str, Any] = {}

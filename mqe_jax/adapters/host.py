@@ -1,6 +1,4 @@
-"""A batch of environments stepped from the host with numpy arrays, for the Gymnasium and PettingZoo
-adapters.
-"""
+"""Environments stepped from the host with numpy arrays, for Gymnasium and PettingZoo."""
 
 import dataclasses
 import functools
@@ -31,16 +29,17 @@ RENDER_MODES = ("rgb_array",)
 
 
 class Step(NamedTuple):
-    """Output of one step of N environments, before any reset but for `obs`; the arrays are writable
-    copies.
+    """Output of one step of N environments, before any reset but for `obs`.
+
+    The arrays are writable copies.
     """
 
-    obs: np.ndarray  # (N, A, O)
-    final_obs: np.ndarray  # (N, A, O)
-    reward: np.ndarray  # (N, A)
-    terminated: np.ndarray  # (N,) bool
-    truncated: np.ndarray  # (N,) bool
-    info: dict[str, np.ndarray]  # metrics and outcome by name, (N,) each
+    obs: Any  # (N, A, O)
+    final_obs: Any  # (N, A, O)
+    reward: Any  # (N, A)
+    terminated: Any  # (N,) bool
+    truncated: Any  # (N,) bool
+    info: dict[str, Any]  # metrics and outcome by name, (N,) each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,8 +100,9 @@ class HostEnvs:
         generator: np.random.Generator,
         mask: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Resets the masked environments (N,) bool and returns observations; None as seed continues
-        the PRNG stream.
+        """Resets the masked environments (N,) bool and returns observations.
+
+        An environment whose seed is None continues its PRNG stream.
         """
         if self.state is None:
             seeds = [int(generator.integers(2**31)) if seed is None else seed for seed in seeds]
@@ -129,10 +129,8 @@ class HostEnvs:
         except (TypeError, ValueError, OverflowError, np.exceptions.ComplexWarning):
             fail("action", action, "an array of numbers")
         if action.shape != shape:
-            raise InputError(
-                f"action: shape {action.shape}; expected {shape} (environments, agents, action "
-                "size)"
-            )
+            axes = "(environments, agents, action size)"
+            raise InputError(f"action: shape {action.shape}; expected {shape} {axes}")
         if not np.isfinite(action).all():
             raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
         self.state, out = self._programs[1](self.state, action, reset)
@@ -145,9 +143,8 @@ class HostEnvs:
         if self.state is None:
             raise InputError("render: reset the environment first")
         data = self.state.data
-        pose = (
-            np.asarray(x)[index : index + 1] for x in (data.qpos, data.mocap_pos, data.mocap_quat)
-        )
+        arrays = (data.qpos, data.mocap_pos, data.mocap_quat)
+        pose = [np.asarray(x)[index : index + 1] for x in arrays]
         episode = Episode(*pose, dt=self._task.dt)
         if self._camera is None:
             model = rendering_model(self._task.mj_model, episode)
@@ -162,8 +159,9 @@ def info_of(state: State) -> dict[str, jax.Array]:
 
 @functools.lru_cache(maxsize=16)
 def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[State, Step]]]:
-    """Returns the compiled reset, and the step with the resets that its last argument names, for
-    any batch size.
+    """Returns the compiled reset, and the step with the resets that its last argument names.
+
+    Both are for any batch size.
     """
     env = kind.env
 
@@ -175,27 +173,28 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
         fresh = dataclasses.replace(fresh, key=jnp.where(seeded, fresh.key, key))
         return select(env, chosen, fresh, state)
 
-    def step(reset: AutoresetMode, state: State, action: jax.Array) -> tuple[State, Step]:
-        shown = after = env.step(state, action)
+    def advance(reset: AutoresetMode, state: State, action: jax.Array) -> tuple[State, Step]:
+        shown = env.step(state, action)
+        after = shown
         if reset is not AutoresetMode.DISABLED:
-            same = reset is AutoresetMode.SAME_STEP
+            ended = shown if reset is AutoresetMode.SAME_STEP else state
             # A new episode continues the PRNG stream, as in `autoreset`.
-            key, reset_key = jax.random.split(shown.key if same else state.key)
+            key, reset_key = jax.random.split(ended.key)
             fresh = dataclasses.replace(env.reset(reset_key, shown.assistance), key=key)
-            ended = shown if same else state
             after = select(env, ended.terminated | ended.truncated, fresh, shown)
-            shown = shown if same else after
-        out: Any = (
-            after.obs,
-            shown.final_obs,
-            shown.reward,
-            shown.terminated,
-            shown.truncated,
-            info_of(shown),
+        if reset is AutoresetMode.NEXT_STEP:
+            shown = after
+        step = Step(
+            obs=after.obs,
+            final_obs=shown.final_obs,
+            reward=shown.reward,
+            terminated=shown.terminated,
+            truncated=shown.truncated,
+            info=info_of(shown),
         )
-        return after, Step(*out)
+        return after, step
 
     def steps(state: State, action: jax.Array, reset: AutoresetMode) -> tuple[State, Step]:
-        return jax.vmap(functools.partial(step, reset))(state, action)
+        return jax.vmap(functools.partial(advance, reset))(state, action)
 
     return jax.jit(jax.vmap(begin)), jax.jit(steps, static_argnums=2)

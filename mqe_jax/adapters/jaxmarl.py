@@ -37,24 +37,22 @@ Arrays = dict[str, jax.Array]
 
 
 def register() -> None:
-    """Makes every task known to `jaxmarl.make`, which has no registry for others' environments,
-    under its id.
+    """Makes `jaxmarl.make` know every task under its id, as it has no registry for others' tasks.
 
-    Replaces that function by one that creates an `Env` for a task and calls the original for other
+    Another function replaces it, which creates an `Env` for a task and calls the original for other
     ids.
     """
-    jaxmarl.registered_envs.extend(
-        task for task in envs.tasks() if task not in jaxmarl.registered_envs
-    )
+    known = jaxmarl.registered_envs
+    known.extend(task for task in envs.tasks() if task not in known)
     if getattr(jaxmarl.make, "knows_tasks", False):
         return
     original = jaxmarl.make
 
     @functools.wraps(original)
     def make(env_id: str, **env_kwargs: Any) -> MultiAgentEnv:
-        return (
-            Env(env_id, **env_kwargs) if env_id in envs.tasks() else original(env_id, **env_kwargs)
-        )
+        if env_id in envs.tasks():
+            return Env(env_id, **env_kwargs)
+        return original(env_id, **env_kwargs)
 
     make.__dict__["knows_tasks"] = True
     jaxmarl.make = registration.make = make
@@ -73,8 +71,9 @@ class Env(MultiAgentEnv):
     def __init__(
         self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any
     ) -> None:
-        """Creates the environment of a task's id, or adapts a given one; `overrides` are those of
-        `task_env`.
+        """Creates the environment of a task's id, or adapts a given one.
+
+        The overrides are those of `task_env`.
 
         With `discrete`, actions are integers, as JaxMARL's MAPPO and Q-learning need. 0 is the zero
         action. 2 i + 1 is +1 and 2 i + 2 is -1 in dimension i, with zero in all others.
@@ -83,9 +82,8 @@ class Env(MultiAgentEnv):
         super().__init__(self.env.num_agents)
         size = self.env.action_size
         self.agents = agent_names(self.env)
-        self.observation_spaces = {
-            a: Box(-jnp.inf, jnp.inf, (self.env.observation_size,)) for a in self.agents
-        }
+        seen = Box(-jnp.inf, jnp.inf, (self.env.observation_size,))
+        self.observation_spaces = dict.fromkeys(self.agents, seen)
         self.action_table: np.ndarray | None = None  # the action of each integer
         if discrete:
             self.action_table = np.zeros((1 + 2 * size, size), np.float32)
@@ -115,11 +113,10 @@ class Env(MultiAgentEnv):
         actions: Mapping[str, jax.Array],
         reset_state: State | None = None,
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
-        """Advances by one environment step and resets an ended environment, to `reset_state` if
-        passed.
+        """Advances by one environment step and resets an ended environment.
 
-        The base class selects between whole states; contact buffers of Warp are shared by all
-        environments.
+        It becomes `reset_state` if that is passed. The base class selects between whole states, but
+        on Warp all environments share contact buffers.
         """
         for one in (state, reset_state):
             if one is not None:
@@ -148,24 +145,15 @@ class Env(MultiAgentEnv):
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
-        """Advances by one environment step without a reset; the key replaces the state's own random
-        key.
-        """
+        """Advances by one environment step without a reset; the key replaces the state's key."""
         action = jnp.stack([self._continuous(action) for action in self._checked(actions).values()])
         after = self.env.step(dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated
         values = {"truncation": after.truncated.astype(jnp.float32), **info_of(after)}
-        infos = {
-            name: jnp.broadcast_to(value, (self.num_agents,)) for name, value in values.items()
-        }
+        infos = {name: jnp.broadcast_to(x, (self.num_agents,)) for name, x in values.items()}
         rewards = {agent: after.reward[i] for i, agent in enumerate(self.agents)}
-        return (
-            self.get_obs(after),
-            after,
-            rewards,
-            {**dict.fromkeys(self.agents, done), "__all__": done},
-            infos,
-        )
+        dones = {**dict.fromkeys(self.agents, done), "__all__": done}
+        return self.get_obs(after), after, rewards, dones, infos
 
     def get_obs(self, state: State) -> Arrays:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Returns the agents' observations (O,)."""
@@ -177,9 +165,7 @@ class Env(MultiAgentEnv):
     def get_avail_actions(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, state: State
     ) -> Arrays:
-        """Returns all true, (action_size,) bool or one per discrete action: all are always
-        available.
-        """
+        """Returns all true, (action_size,) bool or one per discrete action."""
         size = self.env.action_size if self.action_table is None else len(self.action_table)
         return {agent: jnp.ones(size, bool) for agent in self.agents}
 
@@ -200,8 +186,9 @@ class Env(MultiAgentEnv):
         return self.action_spaces[check("agent", agent, Literal[tuple(self.agents)])]
 
     def _checked(self, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the agents' actions in their order; InputError if one is missing or of another
-        kind.
+        """Returns the agents' actions in their order.
+
+        InputError if one is missing or of another kind.
         """
         if not set(self.agents) <= set(actions):
             raise InputError(
@@ -211,31 +198,25 @@ class Env(MultiAgentEnv):
         count = len(self.action_table) if self.action_table is not None else 0
         size = self.env.action_size
         shapes, kind = ([(), (1,)], jnp.integer) if count else ([(size,)], jnp.number)
+        allowed = f"an integer below {count}" if count else f"{size} numbers"
         arrays = {}
         for agent in self.agents:
             with contextlib.suppress(Exception):  # of the `repr` of a value too
-                arrays[agent] = action = jnp.asarray(actions[agent])
-                # without waiting for a device
+                action = jnp.asarray(actions[agent])
+                arrays[agent] = action
+                # Reading an array of JAX would wait for a device.
                 known = isinstance(actions[agent], int | np.integer | np.ndarray)
                 outside = count and known and not 0 <= int(actions[agent]) < count
                 if action.shape in shapes and jnp.issubdtype(action.dtype, kind) and not outside:
                     continue
-            fail(
-                f"actions.{agent}",
-                actions[agent],
-                f"an integer below {count}" if count else f"{size} numbers",
-            )
+            fail(f"actions.{agent}", actions[agent], allowed)
         return arrays
 
     def _continuous(self, action: jax.Array) -> jax.Array:
-        """Returns the action (action_size,) of an integer () or (1,), or a continuous action
-        unchanged.
-        """
-        return (
-            action
-            if self.action_table is None
-            else jnp.asarray(self.action_table)[jnp.reshape(action, ())]
-        )
+        """Returns the action (action_size,) of an integer () or (1,); others stay as they are."""
+        if self.action_table is None:
+            return action
+        return jnp.asarray(self.action_table)[jnp.reshape(action, ())]
 
 
 register()

@@ -5,7 +5,7 @@ Importing this module registers every task as `mqe/TASK-v0`, for `pettingzoo.mak
 and `pettingzoo.make("aec", id)`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import gymnasium
@@ -30,23 +30,25 @@ except ImportError as error:
 def register() -> None:
     """Registers every task as `mqe/TASK-v0`; call it again after `mqe_jax.envs.register_task`."""
     for task in envs.tasks():
-        if f"mqe/{task}-v0" not in pettingzoo.parallel_registry:
-            pettingzoo.register(
-                "parallel", f"mqe/{task}-v0", f"{__name__}:parallel_env", kwargs={"task": task}
-            )
-            pettingzoo.register("aec", f"mqe/{task}-v0", f"{__name__}:env", kwargs={"task": task})
+        name = f"mqe/{task}-v0"
+        if name not in pettingzoo.parallel_registry:
+            kwargs = {"task": task}
+            pettingzoo.register("parallel", name, f"{__name__}:parallel_env", kwargs=kwargs)
+            pettingzoo.register("aec", name, f"{__name__}:env", kwargs=kwargs)
 
 
 def parallel_env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> "QuadrupedParallelEnv":
-    """Returns the parallel environment of a task; the settings are those of
-    `QuadrupedParallelEnv`.
+    """Returns the parallel environment of a task.
+
+    The settings are those of `QuadrupedParallelEnv`.
     """
     return QuadrupedParallelEnv(task, **settings)
 
 
 def env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> AECEnv[str, np.ndarray, Any]:
-    """Returns the turn-based (AEC) environment; the physics advances after the last agent's
-    action.
+    """Returns the turn-based (AEC) environment.
+
+    The physics advances after the last agent's action.
     """
     return OrderEnforcingWrapper(parallel_to_aec(parallel_env(task, **settings)))
 
@@ -97,17 +99,10 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         self.possible_agents = agent_names(self.task)
         self.agents: list[str] = []
         self.teams = tuple(tuple(self.possible_agents[i] for i in team) for team in self.task.teams)
-        box = gymnasium.spaces.Box
-        self._observation_spaces, self._action_spaces = (
-            {
-                a: box(*x, dtype=np.float32)
-                for a, *x in zip(self.possible_agents, space.low, space.high, strict=True)
-            }
-            for space in (self.task.observation_space, self.task.action_space)
-        )
-        self.state_space = box(
-            -np.inf, np.inf, (self.task.privileged_observation_size,), np.float32
-        )
+        self._observation_spaces = self._by_agent(_rows(self.task.observation_space))
+        self._action_spaces = self._by_agent(_rows(self.task.action_space))
+        size = (self.task.privileged_observation_size,)
+        self.state_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)
         self._generator = np.random.default_rng()
         self._host = HostEnvs(self.task, 1, render_mode, render_size)
 
@@ -144,7 +139,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         agents = self.agents
         result = (
             self._by_agent(out.obs[0]),
-            {agent: float(reward) for agent, reward in zip(agents, out.reward[0], strict=True)},
+            self._by_agent(out.reward[0].tolist()),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
             {agent: dict(metrics) for agent in agents},
@@ -165,8 +160,14 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     def close(self) -> None:
         """No-op: no resources are held."""
 
-    def _by_agent(self, values: np.ndarray) -> dict[str, np.ndarray]:
+    def _by_agent(self, values: Iterable[Any]) -> dict[str, Any]:
         return dict(zip(self.possible_agents, values, strict=True))
+
+
+def _rows(space: gymnasium.spaces.Box) -> list[gymnasium.spaces.Box]:
+    """Returns the space of each agent's row of a joint space (A, n)."""
+    bounds = zip(space.low, space.high, strict=True)
+    return [gymnasium.spaces.Box(low, high, dtype=np.float32) for low, high in bounds]
 
 
 register()
