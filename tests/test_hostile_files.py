@@ -49,7 +49,6 @@ YAMLS = {
     "aliases": "a: &a [x, x]\n" + ALIASES,
     "depth": "a: " + "[" * 5000,
     "depth of mappings": "env: " + "{a: " * 3000 + "1" + "}" * 3000,
-    "number of values": "a: [" + "1," * limits.VALUES + "]",
     "size": "# " + "x" * limits.YAML_BYTES,
     "tag": "env: !!set {a}",
     "object": "env: !!python/object/apply:os.system [true]",
@@ -72,9 +71,7 @@ def test_bad_yaml(case: str, tmp_path: Path) -> None:
     assert str(error.value).startswith(str(path)) and len(str(error.value)) < 500
 
 
-@pytest.mark.parametrize(
-    "text", ["[" * 100_000, "[" * 33 + "]" * 33, "9" * 5000, "{", '{"a": 1} x', ""]
-)
+@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, "{", '{"a": 1} x', ""])
 def test_bad_json(text: str) -> None:
     refuses(r"^x: damaged, or not JSON", parse_json, text, "x")
 

@@ -22,8 +22,7 @@ class Entities:
     width: int
     """Number of entries of each, without its mask."""
     masked: bool = False
-    """Whether each has a last entry, 1 if it is there; all entries of one that is not there are
-    0."""
+    """Whether each has a last entry, 1 if it is there; all entries of a missing one are 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,11 +38,9 @@ class Block:
     categorical: bool = False
     """Whether the entries encode a category, such as a one-hot, and get no observation noise."""
     entities: Entities | None = None
-    """What the entries are, one entity after the other; None if they are not of several
-    entities."""
+    """What the entries are, one entity after the other; None unless they are of several ones."""
     image: tuple[int, int, int] | None = None
-    """Channels, height and width of an image, one channel after the other, each row by row from the
-    top left."""
+    """Channels, height and width of an image: channel after channel, each row by row."""
 
     @property
     def continuous(self) -> np.ndarray:
@@ -58,9 +55,8 @@ def entities(
     name: str, kind: str, count: int, width: int, meaning: str = "", *, masked: bool = False
 ) -> Block:
     """Returns the block of several entities of a kind; `by_entity` fills a masked one."""
-    return Block(
-        name, count * (width + masked), meaning, entities=Entities(kind, count, width, masked)
-    )
+    several = Entities(kind, count, width, masked)
+    return Block(name, count * (width + masked), meaning, entities=several)
 
 
 def image(name: str, height: int, width: int, meaning: str = "") -> Block:
@@ -69,12 +65,12 @@ def image(name: str, height: int, width: int, meaning: str = "") -> Block:
 
 
 def by_entity(values: jax.Array, there: jax.Array) -> jax.Array:
-    """Returns a masked block (A, count (width + 1)) from entries (A, count, width) and who is there
-    (A, count).
+    """Returns a masked block (A, count (width + 1)) from entries (A, count, width).
+
+    `there` (A, count) says which entities are there.
     """
     import jax.numpy as jnp
 
-    rows = jnp.concatenate(
-        [jnp.where(there[..., None], values, 0.0), there[..., None].astype(values.dtype)], axis=-1
-    )
+    mask = there[..., None]
+    rows = jnp.concatenate([jnp.where(mask, values, 0.0), mask.astype(values.dtype)], axis=-1)
     return rows.reshape(len(rows), -1)

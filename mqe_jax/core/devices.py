@@ -1,8 +1,9 @@
-"""One training in several processes of `jax.distributed`, each with one device and a share of the
-environments.
+"""One training in several processes of `jax.distributed`.
+
+Each process has one device and a share of the environments.
 
 The learner runs in each of them under `jax.shard_map` over the axis `AXIS`. The functions of this
-module then span all processes; anywhere else they are those of a single process: means are the
+module then span all processes. Anywhere else they are those of a single process: means are the
 identity, and rows are all rows.
 """
 
@@ -51,9 +52,7 @@ def size() -> int:
 
 
 def total(tree: PyTree) -> PyTree:
-    """Returns the sums over processes of the leaves of a pytree of one dtype, by a single
-    collective.
-    """
+    """Returns the sums over processes of a pytree's leaves of one dtype, by one collective."""
     if size() == 1:
         return tree
     flat, restore = ravel_pytree(tree)
@@ -66,8 +65,9 @@ def mean(tree: PyTree) -> PyTree:
 
 
 def mean_where(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Array:
-    """Returns the mean of the elements whose mask (same shape) is true, over an axis and processes;
-    0 without any.
+    """Returns the mean of the elements whose mask (same shape) is true, over an axis and processes.
+
+    It is 0 if no mask is true.
     """
     count = jnp.maximum(total(jnp.sum(mask.astype(jnp.float32), axis)), 1.0)
     return total(jnp.sum(jnp.where(mask, x, 0.0), axis)) / count
@@ -84,22 +84,18 @@ def variance(x: jax.Array, mask: jax.Array, axis: int | None = None) -> jax.Arra
 
 
 def rows(draw: Callable[[int], jax.Array], count: int) -> jax.Array:
-    """Returns this process's `count` rows of `draw(n)`, which returns those of all processes (n,
-    ...).
+    """Returns this process's `count` rows of `draw(n)` (n, ...), the rows of all processes.
 
     Random numbers drawn so belong to an environment, wherever it is.
     """
     if size() == 1:
         return draw(count)
-    return jax.lax.dynamic_slice_in_dim(
-        draw(count * size()), jax.lax.axis_index(AXIS) * count, count
-    )
+    first = jax.lax.axis_index(AXIS) * count
+    return jax.lax.dynamic_slice_in_dim(draw(count * size()), first, count)
 
 
 def normal(key: jax.Array, shape: Sequence[int], dtype: Any) -> jax.Array:
-    """Returns normal random numbers of a shape whose leading axis has an environment in each row;
-    see `rows`.
-    """
+    """Returns normal random numbers of a shape, with an environment in each row; see `rows`."""
     return rows(lambda n: jax.random.normal(key, (n, *shape[1:]), dtype), shape[0])
 
 
@@ -115,21 +111,19 @@ def alone() -> Iterator[None]:
 
 @contextlib.contextmanager
 def translate_errors() -> Iterator[None]:
-    """Turns JAX's error of a collective, if another process has ended, into a ConnectionError of
-    one line.
-    """
+    """Turns JAX's error of a collective, if a process has ended, into a ConnectionError."""
     try:
         yield
-    # either, by where the collective was called
-    except (jax.errors.JaxRuntimeError, ValueError) as error:
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # by where the collective was called
         if isinstance(error, InputError) or jax.process_count() == 1 or not PEER.search(str(error)):
             raise
         raise ConnectionError(f"{PEER_ENDED}; the same command with --resume continues") from None
 
 
 def share(name: str, count: int, parts: int) -> int:
-    """Returns a process's share of `count` environments; raises an InputError, naming the setting,
-    for a fraction.
+    """Returns a process's share of `count` environments.
+
+    InputError, naming the setting, for a fraction.
     """
     if count % check("parts", parts, PositiveInt):
         raise InputError(
@@ -147,32 +141,33 @@ class Processes:
     takes about 30 us per array.
     """
 
-    count: int  # number of processes
-    leads: bool  # whether this process writes the files
-    whole: PyTree  # shapes of the state of all environments
+    count: int
+    """Number of processes."""
+    leads: bool
+    """Whether this process writes the files."""
+    whole: PyTree
+    """Shapes of the state of all environments."""
 
     def __init__(self, own: PyTree, whole: PyTree) -> None:
-        """Takes the shapes of a process's part of the state and of the state of all
-        environments.
-        """
+        """Takes the shapes of a process's part of the state, and of the whole state."""
         self.count = jax.process_count()
         self.leads = jax.process_index() == 0
         self.whole = whole
-        if self.count > 1 and jax.local_device_count() > 1:
-            raise InputError(
-                f"processes: one has {jax.local_device_count()} devices; it must have one"
-            )
+        devices = jax.local_device_count()
+        if self.count > 1 and devices > 1:
+            raise InputError(f"processes: one has {devices} devices; it must have one")
         self._mesh = Mesh(np.array(jax.devices()[: self.count]), (AXIS,))
         self._specs = jax.tree.map(self._spec, own, whole)
 
     def stack(self, shared: PyTree) -> "Processes":
-        """Returns those of several states, with a leading axis on all leaves but the shared ones
-        (`SeedBatch`).
+        """Returns those of several states, with a leading axis on all leaves but the shared ones.
+
+        See `SeedBatch`.
         """
         other = object.__new__(Processes)
         vars(other).update(vars(self))
 
-        def stack(once, spec):
+        def stack(once: bool, spec: PartitionSpec) -> PartitionSpec:
             return spec if once else PartitionSpec(None, *spec)
 
         other._specs = jax.tree.map(stack, shared, self._specs)
@@ -192,12 +187,14 @@ class Processes:
             return jax.jit(function)
         given = _WHOLE if start else self._specs
         result = (self._specs, _WHOLE) if more else self._specs
-        inner = _own_empty(function)
-        return jax.jit(
-            jax.shard_map(
-                inner, mesh=self._mesh, in_specs=(given,), out_specs=result, check_vma=False
-            )
+        mapped = jax.shard_map(
+            _own_empty(function),
+            mesh=self._mesh,
+            in_specs=(given,),
+            out_specs=result,
+            check_vma=False,
         )
+        return jax.jit(mapped)
 
     def own(self, state: PyTree) -> PyTree:
         """Returns this process's part of the state, as local arrays."""
@@ -227,15 +224,15 @@ class Processes:
         return own[None] if self.count == 1 else multihost_utils.process_allgather(own)
 
     def check_equal(self, checked: object) -> None:
-        """Raises an InputError unless the text of an object is that of all processes; called by all
-        of them.
+        """Raises an InputError unless the text of an object is that of all processes.
+
+        All processes must call it.
         """
         sums = self.gather([zlib.crc32(repr(checked).encode()) >> 1])  # 31 bits
         if np.any(sums != sums[0]):
             raise InputError(
                 "run_dir: processes have different settings or see different checkpoints; start "
-                "the same command on "
-                "all hosts, with a run folder that all of them see"
+                "the same command on all hosts, with a run folder that all of them see"
             )
 
     def _spec(self, own: Any, whole: Any) -> PartitionSpec:
@@ -249,8 +246,9 @@ class Processes:
         return multihost_utils.host_local_array_to_global_array(state, self._mesh, specs)
 
     def _local(self, x: jax.Array, spec: PartitionSpec) -> jax.Array:
-        """Returns this process's part of an array of all processes; programs give the whole of an
-        empty one to each.
+        """Returns this process's part of an array of all processes.
+
+        Programs give the whole of an empty array to each process.
         """
         own = x.addressable_data(0)
         return self._rows(own, spec) if not x.size and own.shape == x.shape else own
@@ -260,16 +258,15 @@ class Processes:
             return x
         axis = spec.index(AXIS)
         length = x.shape[axis] // self.count
-        return jax.lax.slice_in_dim(
-            x, jax.process_index() * length, (jax.process_index() + 1) * length, axis=axis
-        )
+        first = jax.process_index() * length
+        return jax.lax.slice_in_dim(x, first, first + length, axis=axis)
 
 
 def _own_empty(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Returns a function that makes the empty arrays of its argument and of what it closes over.
 
-    There are some for whatever a model does not have; in a program of several processes they crash
-    the compiler of jaxlib 0.11.2.
+    A model has empty arrays for whatever it lacks. In a program of several processes they crash the
+    compiler of jaxlib 0.11.2.
     """
 
     def own(x: Any) -> Any:
@@ -278,9 +275,8 @@ def _own_empty(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def call(argument: Any) -> Any:
         closed, result = jax.make_jaxpr(function, return_shape=True)(argument)
         evaluate = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, list(map(own, closed.consts))))
-        return jax.tree.unflatten(
-            jax.tree.structure(result), evaluate(*map(own, jax.tree.leaves(argument)))
-        )
+        found = evaluate(*map(own, jax.tree.leaves(argument)))
+        return jax.tree.unflatten(jax.tree.structure(result), found)
 
     return call
 

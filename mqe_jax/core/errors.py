@@ -47,7 +47,7 @@ def warn(message: str) -> None:
     level = 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
         frame = frame.f_back
-        level = level + 1
+        level += 1
     warnings.warn(message, stacklevel=level)
 
 
@@ -73,8 +73,9 @@ def brief(text: str) -> str:
 
 
 def known_name(wrong: str, name: str, known: Collection[str]) -> str:
-    """Returns a name if it is known; raises an InputError that begins with `wrong` and suggests the
-    nearest one.
+    """Returns a name if it is known.
+
+    Otherwise raises an InputError that begins with `wrong` and suggests the nearest name.
     """
     if name not in known:
         raise InputError(f"{wrong} {name!r}{nearest(name, known)}; allowed: {', '.join(known)}")

@@ -1,5 +1,6 @@
-"""Files and folders: bounded readers (`mqe_jax.core.limits`), atomic writes, errors that name the
-file, locks.
+"""Files and folders: bounded readers, atomic writes, errors that name the file, locks.
+
+The bounds are in `mqe_jax.core.limits`.
 """
 
 import contextlib
@@ -29,19 +30,18 @@ _TAGS = {
 }
 LOCK = ".mqe.lock"
 """Name of the file that a process locks in a run folder."""
-# folders that this process has locked, with the lock file of each
 _locks: dict[Path, os.stat_result] = {}
-
+"""Folders that this process has locked, with the lock file of each."""
 
 # -- writers: below a locked folder they write only while the folder's path still leads to it
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a new file of the same folder, which it creates, and suffix, renamed to `path` at the
-    end.
+    """Yields a new file, which is renamed to `path` at the end.
 
-    The file is removed if this fails, or a signal ends the process. An OSError names `path`.
+    It has the suffix and the folder of `path`, which is created if missing. The file is removed if
+    this fails, or a signal ends the process. An OSError names `path`.
     """
     temporary = path.with_name(f".mqe-{secrets.token_hex(8)}.tmp{path.suffix}")
     check_locks(path)
@@ -69,9 +69,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file atomically: under a temporary name in the same folder, flushed to disk, then
-    renamed.
-    """
+    """Writes a file under a temporary name, flushes it to disk, and renames it."""
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
@@ -81,11 +79,11 @@ def write_atomically(path: Path, content: bytes) -> None:
 def append(path: Path, content: bytes) -> None:
     """Appends to a file, which it creates if missing; an OSError names it, even for a link."""
     check_locks(path)
-    no_links = getattr(os, "O_NOFOLLOW", 0)
-    with (
-        naming(path),
-        open(path, "ab", opener=lambda name, flags: os.open(name, flags | no_links, 0o666)) as file,
-    ):
+
+    def open_no_link(name: str, flags: int) -> int:
+        return os.open(name, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+    with naming(path), open(path, "ab", opener=open_no_link) as file:
         file.write(content)
 
 
@@ -108,8 +106,7 @@ def check_locks(path: Path) -> None:
             )
 
 
-# -- readers: every failure of a parser is an InputError that names the file; no file costs more
-# than its limit --------
+# -- readers: every failure of a parser is an InputError that names the file
 
 
 def check_file(path: Path, limit: int) -> None:
@@ -127,9 +124,7 @@ def check_file(path: Path, limit: int) -> None:
 
 @contextlib.contextmanager
 def parsing(path: Path | str, what: str) -> Iterator[None]:
-    """Turns what a parser raises for a damaged or hostile file, of any type, into an InputError
-    that names the path.
-    """
+    """Turns what a parser raises for a damaged or hostile file into an InputError that names it."""
     try:
         yield
     except InputError:
@@ -147,62 +142,37 @@ def read_text(path: Path, limit: int, what: str) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Reads a JSON file, nested at most `limits.DEPTH` deep."""
+    """Reads a JSON file."""
     return parse_json(read_text(path, limits.JSON_BYTES, "JSON"), str(path))
 
 
 def parse_json(text: str, name: str) -> Any:
-    """Returns the value of a JSON text, nested at most `limits.DEPTH` deep; errors start with its
-    name.
-    """
+    """Returns the value of a JSON text; errors start with its name."""
     with parsing(name, "JSON"):
-        value = json.loads(text)
-        level = [value]
-        for _ in range(limits.DEPTH):
-            inner = [
-                list(x.values()) if isinstance(x, dict) else x
-                for x in level
-                if isinstance(x, dict | list)
-            ]
-            level = [x for values in inner for x in values]
-        if level:
-            raise ValueError(f"nested more than {limits.DEPTH} deep")
-        return value
+        return json.loads(text)
 
 
 class _Loader(yaml.SafeLoader):
-    """Loader of a text, whose depth and number of values it counts while it reads.
+    """Loader of a text without aliases, foreign tags, dates, and names that are given twice.
 
     PyYAML itself keeps the last of two values of one name, and lets aliases make a few bytes as
     large as memory.
     """
 
-    depth = values = 0
-
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("aliases (*name) are not allowed")
-        self.depth = self.depth + 1
-        self.values = self.values + 1
-        if self.depth > limits.DEPTH or self.values > limits.VALUES:
-            raise yaml.YAMLError(
-                f"more than {limits.DEPTH} deep, or more than {limits.VALUES} values"
-            )
-        node = super().compose_node(parent, index)
-        self.depth -= 1
-        if node is not None and node.tag not in _TAGS:
+        node: Any = super().compose_node(parent, index)
+        if node.tag not in _TAGS:
             raise yaml.YAMLError(f"the tag {node.tag} is not allowed")
-        if (
-            node is not None
-            and node.tag.endswith((":int", ":float"))
-            and re.search(r"^[-+]?0[0-7_]|:", node.value)
-        ):
+        number = node.tag.endswith((":int", ":float"))
+        if number and re.search(r"^[-+]?0[0-7_]|:", node.value):
             node.tag = "tag:yaml.org,2002:str"  # 010 and 1:30, which YAML 1.1 reads as 8 and 90
         return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         names: set[str] = set()
-        for key, _ in node.value if isinstance(node, yaml.MappingNode) else []:
+        for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in names:
                 raise yaml.YAMLError(f"{key.value!r} is given twice")
             names.add(str(key.value))
@@ -236,8 +206,9 @@ def read_rows(path: Path) -> Iterator[list[str]]:
 
 
 def read_tensors(file: Path, what: str) -> "dict[str, np.ndarray]":
-    """Reads a safetensors file of finite floating-point weights; an InputError says `what` it
-    should be.
+    """Reads a safetensors file of finite floating-point weights.
+
+    An InputError says `what` the file should be.
     """
     import numpy as np
     from safetensors.numpy import load_file
@@ -254,8 +225,7 @@ def read_tensors(file: Path, what: str) -> "dict[str, np.ndarray]":
 def linear_layers(
     what: str, arrays: "Mapping[str, np.ndarray]", sizes: Mapping[str, tuple[int, int]]
 ) -> "dict[str, dict[str, np.ndarray]]":
-    """Returns the arrays LAYER.weight (outputs, inputs) and LAYER.bias (outputs,) by layer, as
-    float32.
+    """Returns the float32 arrays LAYER.weight (outputs, inputs) and LAYER.bias (outputs,) by layer.
 
     `sizes` holds inputs and outputs of each layer. An InputError says what is wrong with `what`.
     """
@@ -269,25 +239,26 @@ def linear_layers(
             raise InputError(f"{what}: {name} is missing; expected {', '.join(shapes)}")
         if name not in shapes:
             raise InputError(f"{what}: {name} is not expected; expected {', '.join(shapes)}")
-        if tuple(arrays[name].shape) != shapes[name]:
-            raise InputError(
-                f"{what}: {name} has shape {tuple(arrays[name].shape)}; expected {shapes[name]}"
-            )
-        if (most := float(np.abs(arrays[name].astype(np.float64)).max())) > limits.WEIGHT:
+        shape = tuple(arrays[name].shape)
+        if shape != shapes[name]:
+            raise InputError(f"{what}: {name} has shape {shape}; expected {shapes[name]}")
+        most = float(np.abs(arrays[name].astype(np.float64)).max())
+        if most > limits.WEIGHT:
             raise InputError(
                 f"{what}: {name} holds magnitudes to {most:g}; at most {limits.WEIGHT:g} is allowed"
             )
-    kinds = ("weight", "bias")
-    return {
-        layer: {kind: np.asarray(arrays[f"{layer}.{kind}"], np.float32) for kind in kinds}
-        for layer in sizes
-    }
+    layers = {}
+    for layer in sizes:
+        weight = np.asarray(arrays[f"{layer}.weight"], np.float32)
+        layers[layer] = {"weight": weight, "bias": np.asarray(arrays[f"{layer}.bias"], np.float32)}
+    return layers
 
 
 @contextlib.contextmanager
 def archive(path: Path, limit: int, what: str) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip file of at most `limit` bytes, unpacked too; errors while it is open are those of
-    `parsing`.
+    """Opens a zip file of at most `limit` bytes, packed and unpacked.
+
+    Errors while it is open are those of `parsing`.
     """
     check_file(path, limit)
     with parsing(path, what), zipfile.ZipFile(path) as opened:
@@ -311,8 +282,9 @@ def user_cache() -> Path:
 
 
 def check_folder(folder: Path, field: str = "run_dir", file: Path | None = None) -> None:
-    """Raises an InputError that names the field unless a folder, for a file, can be written, or
-    created.
+    """Raises an InputError that names the field unless a folder can be created and written.
+
+    With `file`, the folder must accept that file.
     """
     try:
         there = next(
@@ -328,8 +300,9 @@ def check_folder(folder: Path, field: str = "run_dir", file: Path | None = None)
 
 
 def check_output(path: Path, field: str = "output") -> None:
-    """Raises an InputError that names the field unless a file can be written, in a folder that need
-    not exist.
+    """Raises an InputError that names the field unless a file can be written.
+
+    Its folder need not exist.
     """
     check_folder(path.parent, field, path)
     if not path.name or (path.exists() and not path.is_file()):
@@ -340,11 +313,12 @@ def check_output(path: Path, field: str = "output") -> None:
 
 @contextlib.contextmanager
 def lock(folder: Path) -> Iterator[None]:
-    """Creates a folder and holds a lock on it, which ends with the process; InUseError if it is
-    locked already.
+    """Creates a folder and holds a lock on it, which ends with the process.
 
-    Below it, nothing is written once its path leads to another folder or to none. Folders made and
-    left empty go again.
+    InUseError if it is locked already.
+
+    Below it, nothing is written once its path leads to another folder or to none. Folders that it
+    created are removed again if they stay empty.
     """
     import filelock  # 30 ms, which most commands need not wait for
 

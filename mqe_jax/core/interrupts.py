@@ -64,8 +64,9 @@ def install() -> None:
 
 @contextlib.contextmanager
 def defer() -> Iterator[Callable[[], int]]:
-    """Yields a function that returns the signal that came since, or 0; a later one ends the process
-    at once.
+    """Yields a function that returns the signal that came since, or 0.
+
+    A later signal ends the process at once.
 
     Without `install`, as in a notebook, only SIGINT is deferred, and a later one raises
     KeyboardInterrupt.

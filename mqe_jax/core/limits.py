@@ -62,17 +62,14 @@ Port = Annotated[int, Gt(0), Lt(65536)]
 TEXT = 4096  # characters of a name or a path, none of which is a control character
 FILE_NAME = 255  # bytes of a part of a path
 SHOWN = 200  # characters of a value in a message
-DEPTH = 32  # nesting of YAML and JSON; YAML has no aliases
-VALUES = 20_000  # in one YAML file
+DEPTH = 32  # nesting of settings
 YAML_BYTES = 2**17
 JSON_BYTES = 2**26
 CSV_BYTES = 2**27
-# of skills and actuator networks; in a TorchScript archive, all members and all tensors
-WEIGHTS_BYTES = 2**27
+WEIGHTS_BYTES = 2**27  # of skills and actuator networks; all members and all tensors of an archive
 POLICY_BYTES = 2**28
 CHECKPOINT_BYTES = 2**34
-# magnitude of a weight of a policy, a skill or an actuator network; trained ones are below 10
-WEIGHT = 1e4
+WEIGHT = 1e4  # magnitude of a policy's or a skill's weight; trained ones are below 10
 RECORDING_BYTES = 2**28  # all members
 
 # -- memory, checked before it is allocated
@@ -81,8 +78,9 @@ MEMORY_SHARE = 0.5  # of the free memory, for the states of all environments or 
 
 
 def bounds(kind: Any) -> tuple[float, float]:
-    """Returns the lowest and the highest allowed number of a kind; an exclusive bound is the first
-    number inside.
+    """Returns the lowest and the highest allowed number of a kind.
+
+    An exclusive bound is the first integer inside.
     """
     low = -float("inf")
     high = float("inf")

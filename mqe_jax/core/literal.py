@@ -1,5 +1,6 @@
-"""Texts of others (paths, names, settings, errors), shown as they are: in a terminal, HTML,
-Markdown, or a figure.
+"""Texts of others (paths, names, settings, errors), shown as they are.
+
+They go to a terminal, HTML, Markdown, or a figure.
 """
 
 import html

@@ -1,6 +1,4 @@
-"""Memory that a batch of environments or a rollout would need, compared with what is free before it
-is allocated.
-"""
+"""Memory that environments or a rollout would need, compared with what is free."""
 
 import math
 from pathlib import Path
@@ -27,20 +25,21 @@ def free_memory() -> float:
         return stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)
     free = math.inf
     meminfo = Path("/proc/meminfo")
-    group = Path("/sys/fs/cgroup")
     if meminfo.is_file():
         lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
         free = 1024.0 * int(lines["MemAvailable"].split()[0])
-    if (group / "memory.max").is_file() and (
-        text := (group / "memory.max").read_text().strip()
-    ).isdecimal():
-        free = min(free, int(text) - int((group / "memory.current").read_text()))
+    group = Path("/sys/fs/cgroup")
+    allowed = group / "memory.max"
+    most = allowed.read_text().strip() if allowed.is_file() else ""
+    if most.isdecimal():
+        free = min(free, int(most) - int((group / "memory.current").read_text()))
     return free
 
 
 def check_memory(name: str, value: object, needed: float) -> None:
-    """Raises an InputError if a setting needs more bytes than `limits.MEMORY_SHARE` of the free
-    memory.
+    """Raises an InputError if a setting needs too many bytes.
+
+    It may need `limits.MEMORY_SHARE` of the free memory.
     """
     allowed = limits.MEMORY_SHARE * free_memory()
     if needed > allowed:

@@ -11,8 +11,7 @@ R = TypeVar("R")
 
 
 def single(function: Callable[P, R]) -> Callable[P, R]:
-    """Makes a function compute in float32 and int32, also if a caller traces it with
-    `jax_enable_x64`.
+    """Makes a function compute in float32 and int32, even in a trace with `jax_enable_x64`.
 
     It broadcasts shapes, also with `jax_numpy_rank_promotion`.
 

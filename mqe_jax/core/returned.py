@@ -1,5 +1,6 @@
-"""Checks of what methods of tasks and sensors return; a ValueError names the method, the value and
-what is expected.
+"""Checks of what methods of tasks and sensors return.
+
+A ValueError names the method, the value and what is expected.
 """
 
 from collections.abc import Iterable, Mapping
@@ -25,25 +26,16 @@ def weights_of(params: Any) -> Any:
 def check_names(method: str, values: Any, names: Iterable[str]) -> None:
     """Checks that values are a mapping of these names."""
     if not isinstance(values, Mapping) or set(values) != set(names):
-        _fail(
-            method,
-            sorted(values) if isinstance(values, Mapping) else _kind(values),
-            f"by name: {sorted(names)}",
-        )
+        found = sorted(values) if isinstance(values, Mapping) else _kind(values)
+        _fail(method, found, f"by name: {sorted(names)}")
 
 
 def check_shape(method: str, value: Any, *shapes: tuple[int, ...], dtype: Any = None) -> jax.Array:
     """Returns an array of one of these shapes, and of a dtype if one is given."""
-    if (
-        value is None
-        or jnp.shape(value) not in shapes
-        or dtype not in (None, getattr(value, "dtype", type(value)))
-    ):
-        _fail(
-            method,
-            _kind(value),
-            " or ".join(map(str, shapes)) + ("" if dtype is None else f" {dtype.__name__}"),
-        )
+    same_shape = value is not None and jnp.shape(value) in shapes
+    if not same_shape or dtype not in (None, getattr(value, "dtype", type(value))):
+        expected = " or ".join(map(str, shapes))
+        _fail(method, _kind(value), expected if dtype is None else f"{expected} {dtype.__name__}")
     return jnp.asarray(value)
 
 

@@ -168,8 +168,7 @@ def is_text(value: str) -> bool:
 
 
 def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a function check some of its arguments, each against a type, as settings classes check
-    their fields.
+    """Makes a function check some of its arguments, each against a type, as settings are checked.
 
     `annotated` are names of arguments that are checked against their annotations.
     """
@@ -192,9 +191,7 @@ def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]],
 
 
 def check(name: str, value: Any, kind: Any) -> Any:
-    """Returns a value converted to a type; raises the InputError of `fail` if that is not
-    possible.
-    """
+    """Returns a value converted to a type; raises the InputError of `fail` if that fails."""
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return value if isinstance(value, kind) else fail(name, value, f"a {kind.__name__}")
     try:
@@ -217,15 +214,17 @@ def is_settings(kind: object) -> bool:
 
 
 def fail(name: str, value: object, allowed: str) -> NoReturn:
-    """Raises the `InputError` of a value that is not allowed: `name: value is not allowed; it must
-    be ...`.
+    """Raises the `InputError` of a value that is not allowed.
+
+    Its text is `name: value is not allowed; it must be ...`.
     """
     raise InputError(f"{name}: {short_repr(value)} is not allowed; it must be {allowed}")
 
 
 def build(kind: type[T], values: Mapping[str, Any]) -> T:
-    """Builds settings from names and values, nested (`{"ppo": {"clip": 0.1}}`) or dotted
-    (`{"ppo.clip": 0.1}`).
+    """Builds settings from names and values.
+
+    They may be nested (`{"ppo": {"clip": 0.1}}`) or dotted (`{"ppo.clip": 0.1}`).
 
     InputError for a value that is not allowed or an unknown name, with the nearest known one.
     """
@@ -255,18 +254,10 @@ def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
     twice.
     """
     made = merge({}, changes)  # which rejects what is nested too deep
-    for name, following in itertools.pairwise(sorted(_names(changes))):
+    for name, following in itertools.pairwise(sorted(name for name, _ in leaves(changes))):
         if name == following:
             raise InputError(f"{name}: is given twice")
     return made
-
-
-def _names(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the dotted names of all values that are no mappings."""
-    for key, value in values.items():
-        yield from (
-            _names(value, f"{prefix}{key}.") if isinstance(value, Mapping) else (f"{prefix}{key}",)
-        )
 
 
 def differences(settings: Any, default: Any) -> dict[str, Any]:
@@ -293,8 +284,9 @@ def leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 def merge(
     first: Mapping[str, Any], second: Mapping[str, Any], depth: int = limits.DEPTH
 ) -> dict[str, Any]:
-    """Returns two mappings merged at every depth, dotted names as nested ones; the second's values
-    count.
+    """Returns two mappings merged at every depth, dotted names as nested ones.
+
+    The second's values count.
 
     Settings with a `name`, which selects one of several classes, are replaced as a whole.
     InputError for mappings that are nested more than `depth` deep.
@@ -307,17 +299,18 @@ def merge(
             if not depth:
                 fail(name, value, f"nested at most {limits.DEPTH} deep")
             now = _fields(both.get(name))
-            other = is_settings(both.get(name)) and value.get("name", now.get("name")) != now.get(
-                "name"
-            )
-            value = merge({} if other else now, value, depth - 1)
+            kind = now.get("name")
+            if is_settings(both.get(name)) and value.get("name", kind) != kind:
+                now = {}
+            value = merge(now, value, depth - 1)
         both[name] = value
     return both
 
 
 def to_mapping(settings: Any) -> dict[str, Any]:
-    """Returns settings as nested mappings, lists and scalars for YAML and JSON; InputError for any
-    other value.
+    """Returns settings as nested mappings, lists and scalars for YAML and JSON.
+
+    InputError for any other value.
     """
 
     def plain(value: Any) -> Any:
@@ -335,8 +328,9 @@ def to_mapping(settings: Any) -> dict[str, Any]:
 
 
 def load_yaml(path: str | Path) -> dict[str, Any]:
-    """Reads names and values from a YAML file, which may be empty; InputError, naming it, if it is
-    no mapping.
+    """Reads names and values from a YAML file, which may be empty.
+
+    InputError, naming it, if it is no mapping.
     """
     values = read_yaml(Path(check("path", path, PathText)))
     if values is None:
@@ -355,9 +349,7 @@ def hints_of(kind: Any) -> dict[str, Any]:
 
 
 def _accept_yaml(hint: Any) -> Any:
-    """Returns an annotated type that also accepts YAML's spellings, and rejects booleans as
-    numbers.
-    """
+    """Returns an annotated type that accepts YAML's spellings, and rejects booleans as numbers."""
     origin = typing.get_origin(hint)
     parts = typing.get_args(hint)
     if origin is Annotated and parts[0] in (int, float):
@@ -367,16 +359,16 @@ def _accept_yaml(hint: Any) -> Any:
         return Annotated[(kind, *parts[1:], *conversions)]  # type: ignore[return-value]
     if origin in (typing.Union, types.UnionType):
         union = typing.Union[tuple(_accept_yaml(part) for part in parts)]  # noqa: UP007
-        return (
-            Annotated[union, pydantic.BeforeValidator(_none)] if types.NoneType in parts else union
-        )
+        if types.NoneType not in parts:
+            return union
+        return Annotated[union, pydantic.BeforeValidator(_none)]
     if origin is tuple:
         return tuple[tuple(part if part is Ellipsis else _accept_yaml(part) for part in parts)]  # type: ignore[misc]
     if origin in (Mapping, Sequence, list):
         made = origin[tuple(map(_accept_yaml, parts))]  # type: ignore[index]
-        return (
-            Annotated[made, pydantic.AfterValidator(FrozenMapping)] if origin is Mapping else made
-        )
+        if origin is not Mapping:
+            return made
+        return Annotated[made, pydantic.AfterValidator(FrozenMapping)]
     if hint in (int, float):
         return _add_bounds(Annotated[hint, None])
     before = {bool: _boolean, str: _text, Path: _text}.get(hint)
@@ -406,9 +398,8 @@ def _number(kind: type, value: Any) -> Any:
 
 
 def _text(value: Any) -> Any:
-    if isinstance(value, bytes | bytearray) or (
-        isinstance(value, str | Path) and not is_text(str(value))
-    ):
+    unprintable = isinstance(value, str | Path) and not is_text(str(value))
+    if unprintable or isinstance(value, bytes | bytearray):
         raise ValueError(f"a text, {TEXT}")
     return _expand_home(value)
 
@@ -430,9 +421,8 @@ def _settings_in(hint: Any) -> Any:
     """Returns the settings class within an annotated or optional type, or None."""
     if is_settings(hint):
         return hint
-    return next(
-        (found for part in typing.get_args(hint) if (found := _settings_in(part)) is not None), None
-    )
+    inner = map(_settings_in, typing.get_args(hint))
+    return next((found for found in inner if found is not None), None)
 
 
 def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
@@ -441,7 +431,8 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     places = [brief(str(part)) for part in first["loc"]]
     value = first["input"]
     context = first.get("ctx", {})
-    if isinstance(raised := context.get("error"), InputError):
+    raised = context.get("error")
+    if isinstance(raised, InputError):
         named = places and re.match(rf"{re.escape(places[-1])}[:.]", str(raised))
         return InputError(".".join([*(places[:-1] if named else places), str(raised)]))
     if first["type"] == "unexpected_keyword_argument":
@@ -452,14 +443,9 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
         return InputError(f"{'.'.join(places)}: unknown name (value {short_repr(value)}){hint}")
     if first["type"] == "missing":
         return InputError(f"{'.'.join(places)}: is missing")
-    allowed = (
-        first["msg"]
-        .replace("Input should be", "it must be")
-        .replace("Value error, ", "it must be ")
-    )
-    allowed = allowed.replace("a valid tuple", "a list").replace(
-        "a valid dictionary", "a mapping of names to values"
-    )
+    allowed = first["msg"]
+    for theirs, ours in _WORDS.items():
+        allowed = allowed.replace(theirs, ours)
     if first["type"].startswith("dataclass"):
         allowed = "it must be a mapping of names to values"
     choices = [word.strip("'") for word in re.split(", | or ", context.get("expected", "")) if word]
@@ -467,3 +453,12 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
         f"{'.'.join(places)}: {short_repr(value)} is not allowed; "
         f"{allowed}{nearest(value, choices)}"
     )
+
+
+_WORDS = {
+    "Input should be": "it must be",
+    "Value error, ": "it must be ",
+    "a valid tuple": "a list",
+    "a valid dictionary": "a mapping of names to values",
+}
+"""Words of pydantic's messages, and ours."""

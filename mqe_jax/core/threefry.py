@@ -15,8 +15,9 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 
 def threefry(key0: Any, key1: Any, x0: Any, x1: Any) -> tuple[Any, Any]:
-    """Returns the random bits of two counters, by Threefry-2x32 with 20 rounds (Salmon et al.
-    2011); all uint32.
+    """Returns the random bits of two counters, by Threefry-2x32 with 20 rounds; all uint32.
+
+    Source: Salmon et al. 2011.
     """
     if key0.size == 1 < x0.size:
         # The barrier keeps the splits that a key comes from out of the loop over its numbers, which

@@ -53,17 +53,14 @@ def _raw_key(implementation: str) -> Any:
 
 
 def _level(value: Any) -> Any:
-    traced = isinstance(value, Tracer)
     dtype = getattr(value, "dtype", None)
-    kinds = (jnp.integer, jnp.floating)
-    number = (
-        isinstance(value, int | float)
-        if dtype is None
-        else any(jnp.issubdtype(dtype, kind) for kind in kinds)
-    )
+    if dtype is None:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+    else:
+        number = jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)
+    traced = isinstance(value, Tracer)
     # By numpy: under jit comparisons are traced even if an array is a captured constant.
-    inside = number and not np.shape(value) and (traced or 0 <= np.asarray(value) <= 1)
-    if isinstance(value, bool) or not inside:
+    if not number or np.shape(value) or not (traced or 0 <= np.asarray(value) <= 1):
         raise ValueError("a number in [0, 1]")
     return value
 
@@ -72,9 +69,9 @@ def _having(names: str, allowed: str, *, lacks: str = "", callables: bool = Fals
     """Returns the validator of objects with some attributes, or of functions too."""
 
     def validate(value: Any) -> Any:
-        whole = all(hasattr(value, name) for name in names.split()) and not (
-            lacks and hasattr(value, lacks)
-        )
+        whole = all(hasattr(value, name) for name in names.split())
+        if lacks and hasattr(value, lacks):
+            whole = False
         if isinstance(value, type) or not (whole or (callables and callable(value))):
             raise ValueError(allowed)
         return value
@@ -88,8 +85,7 @@ _POLICY = "a policy, such as that of mqe_jax.load_policy"
 _ACT = f"{_POLICY}, or a function act(obs, memory, key)"
 RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
 RandomKeys = Annotated[Any, pydantic.AfterValidator(_keys)]  # one for each environment of a batch
-# of a curriculum, a number or an array () in [0, 1]
-Level = Annotated[Any, pydantic.AfterValidator(_level)]
+Level = Annotated[Any, pydantic.AfterValidator(_level)]  # of a curriculum, in [0, 1]
 AnyEnvironment = Annotated[Any, _having(_ENV, "an environment, such as that of mqe_jax.make")]
 AnySingle = Annotated[
     Any, _having(_ENV, "one environment, such as that of mqe_jax.make", lacks="num_envs")
@@ -106,8 +102,9 @@ Teams = tuple[tuple[int, ...], ...]
 
 
 class VectorEnv(Protocol):
-    """N environments of A agents with automatic reset; `reset` and `step` are pure and may be
-    jitted.
+    """N environments of A agents with automatic reset.
+
+    `reset` and `step` are pure and may be jitted.
 
     `reset(key) -> state`, `step(state, action (N, A, action_size)) -> state`. The policy samples
     unbounded actions, which the environment clips. A state is any pytree with these fields, all
@@ -155,11 +152,11 @@ class VectorEnv(Protocol):
 
 
 class Matchmaker(Protocol):
-    """Gives the environments their opponents between updates of the learner state, a `TrainState`;
-    pure.
+    """Gives the environments their opponents between updates of the learner.
 
-    `begin(state)` returns the first value of `TrainState.extra`; `seat(state)` gives new
-    environments the opponents that it names; `after(state) -> (state, metrics)` follows an update.
+    Its methods are pure. `state` is the learner's, a `TrainState`. `begin(state)` returns the first
+    value of `TrainState.extra`. `seat(state)` gives new environments the opponents that it names.
+    `after(state) -> (state, metrics)` follows an update.
     """
 
     def begin(self, state: Any) -> PyTree: ...
@@ -169,21 +166,25 @@ class Matchmaker(Protocol):
 
 def where_rows(condition: jax.Array, yes: PyTree, no: PyTree) -> PyTree:
     """Selects rows of two pytrees: condition (N,) bool, leaves (N, ...)."""
-    return jax.tree.map(
-        lambda a, b: jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b), yes, no
-    )
+
+    def select(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(condition.reshape(-1, *(1,) * (b.ndim - 1)), a, b)
+
+    return jax.tree.map(select, yes, no)
 
 
 def reset_memory(memory: "NetworkMemory", is_first: jax.Array) -> "NetworkMemory":
-    """Zeroes the recurrent state of environments that start an episode: leaves (N, ...), is_first
-    (N,) bool.
+    """Zeroes the recurrent state of environments that start an episode.
+
+    Leaves are (N, ...), `is_first` (N,) bool.
     """
     return where_rows(is_first, jax.tree.map(jnp.zeros_like, memory), memory)
 
 
 def replace_fields(state: Any, **fields: jax.Array) -> Any:
-    """Returns a state, which is a dataclass, a NamedTuple or has a method `replace`, with fields
-    replaced.
+    """Returns a state with fields replaced.
+
+    It is a dataclass, a NamedTuple or has a method `replace`.
     """
     if dataclasses.is_dataclass(state) and not isinstance(state, type):
         return dataclasses.replace(state, **fields)
@@ -198,34 +199,29 @@ def replace_fields(state: Any, **fields: jax.Array) -> Any:
 
 def shapes_of(tree: PyTree) -> Any:
     """Returns the structure of a pytree, and the shape of each leaf, None of what is no array."""
-    return jax.tree.structure(tree), [
-        getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)
-    ]
+    shapes = [getattr(leaf, "shape", None) for leaf in jax.tree.leaves(tree)]
+    return jax.tree.structure(tree), shapes
 
 
 def check_act(
     name: str, returned: Any, shape: tuple[int, ...], memory: Memory
 ) -> tuple[jax.Array, Memory]:
-    """Returns what a policy's `act` returned: actions of a shape, and a recurrent state like its
-    `memory`.
+    """Returns what a policy's `act` returned: actions, and a recurrent state like its `memory`.
 
-    InputError, naming the argument that the policy is, for anything else.
+    Actions have the passed shape. InputError, naming the argument that the policy is, for anything
+    else.
     """
     if not isinstance(returned, tuple | list) or len(returned) != 2:
-        found = f"returns {type(returned).__name__}"
-        expected = "returns (action, memory)"
-    elif shapes_of(returned[0]) != shapes_of(
-        jax.ShapeDtypeStruct(shape, jnp.float32)
-    ) or is_typed_key(returned[0]):
-        given = getattr(returned[0], "shape", type(returned[0]).__name__)
-        found = f"returns actions {given}"
-        expected = f"returns {shape}"
-    elif shapes_of(returned[1]) != shapes_of(memory):
-        found = "changes the structure of its memory"
-        expected = "keeps it"
-    else:
-        return returned[0], returned[1]
-    fail(name, f"a function that {found}", f"one that {expected}")
+        found = f"a function that returns {type(returned).__name__}"
+        fail(name, found, "one that returns (action, memory)")
+    action, after = returned
+    expected = shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32))
+    if shapes_of(action) != expected or is_typed_key(action):
+        given = getattr(action, "shape", type(action).__name__)
+        fail(name, f"a function that returns actions {given}", f"one that returns {shape}")
+    if shapes_of(after) != shapes_of(memory):
+        fail(name, "a function that changes the structure of its memory", "one that keeps it")
+    return action, after
 
 
 def raw_keys(tree: PyTree) -> PyTree:
@@ -248,16 +244,17 @@ def teams_of(env: VectorEnv) -> Teams:
 class Outcome:
     """How an episode ended, for K teams; before its last step, as if it ended there.
 
-    Any leading axes.
+    Any leading axes. `win`, `draw` and `loss` are None unless the task is a match.
     """
 
     success: Any = None
-    """Success of each team, from 0 to 1 (K,); in a match 1 for the winner. None without such a
-    measure."""
-    # whether each team of a match won (K,), 0 or 1; None of another task, and so draw and loss
+    """Success of each team, from 0 to 1 (K,), in a match 1 for the winner; None if unmeasured."""
     win: Any = None
-    draw: Any = None  # whether it was a draw (K,)
-    loss: Any = None  # whether each team lost (K,)
+    """Whether each team of a match won (K,), 0 or 1."""
+    draw: Any = None
+    """Whether the match was a draw (K,)."""
+    loss: Any = None
+    """Whether each team lost (K,)."""
     further: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     """Further results of each team by name (K,), such as a distance, m."""
     ending: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
@@ -272,23 +269,18 @@ class Outcome:
         """Returns the outcome with all arrays (..., K) changed."""
         teams = {name: getattr(self, name) for name in ("success", *RESULTS)}
         teams = {name: change(x) for name, x in teams.items() if x is not None}
-        return dataclasses.replace(
-            self, **teams, further={name: change(x) for name, x in self.further.items()}
-        )
+        further = {name: change(x) for name, x in self.further.items()}
+        return dataclasses.replace(self, **teams, further=further)
 
     def by_name(self) -> dict[str, jax.Array]:
-        """Returns the values by the names under which they are logged: `success`, `team0/win`,
-        `ending/fall`, ...
-        """
+        """Returns the values by the names of logs: `success`, `team0/win`, `ending/fall`, ..."""
         values = {} if self.success is None else {"success": self.success[..., 0]}
         if self.win is None:
             values |= {f"success/{name}": x[..., 0] for name, x in self.further.items()}
         else:
             results = {**{name: getattr(self, name) for name in RESULTS}, **self.further}
-            teams = range(self.win.shape[-1])
-            values |= {
-                f"team{team}/{name}": x[..., team] for team in teams for name, x in results.items()
-            }
+            for team in range(self.win.shape[-1]):
+                values |= {f"team{team}/{name}": x[..., team] for name, x in results.items()}
         return values | {f"ending/{name}": x for name, x in self.ending.items()}
 
 
@@ -297,15 +289,17 @@ class Outcome:
 class Observations:
     """What agents see: the input of a policy. Leading axis N, or none for a single environment."""
 
-    obs: jax.Array  # observations of the group `policy` (N, A, O)
-    active: jax.Array | None = None  # which agents take part (N, A) bool; None: all
+    obs: jax.Array
+    """Observations of the group `policy` (N, A, O)."""
+    active: jax.Array | None = None
+    """Which agents take part (N, A) bool; None: all."""
     groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
     """Observations of further groups by name (N, A, O_g)."""
 
     def of(self, agents: slice) -> "Observations":
         """Returns what some of the agents see."""
 
-        def cut(x):
+        def cut(x: jax.Array) -> jax.Array:
             return x[..., agents, :]
 
         active = None if self.active is None else self.active[..., agents]
@@ -329,9 +323,7 @@ class Observations:
 
     @classmethod
     def at(cls, seen: Any) -> "Observations":
-        """Returns the observations of an environment's state; an array is that of the group
-        `policy`.
-        """
+        """Returns the observations of a state; an array is that of the group `policy`."""
         return seen if isinstance(seen, Observations) else cls(seen)
 
 
@@ -361,10 +353,14 @@ RESULTS = ("win", "draw", "loss")
 class Cast(NamedTuple):
     """The environments of a training, and who else plays in them."""
 
-    env: Any  # environments in which the policy learns
-    eval_env: Any = None  # environments of evaluations during training; None without
-    league: Matchmaker | None = None  # gives the environments their opponents between updates
-    teacher: Any = None  # the policy that imitation imitates
+    env: Any
+    """Environments in which the policy learns."""
+    eval_env: Any = None
+    """Environments of evaluations during training, or None."""
+    league: Matchmaker | None = None
+    """Gives the environments their opponents between updates."""
+    teacher: Any = None
+    """The policy that imitation imitates."""
 
 
 class NetworkMemory(NamedTuple):
@@ -377,28 +373,36 @@ class NetworkMemory(NamedTuple):
 class Transition(NamedTuple):
     """One step of a rollout; stacked by the scan to a leading axis T."""
 
-    memory: NetworkMemory  # recurrent state before this step, zeroed at an episode's first step
-    is_first: jax.Array  # whether the step is the first of its episode (N,) bool
-    obs: jax.Array  # observations (N, A, O)
-    privileged_obs: jax.Array  # privileged observations (N, P)
-    # observations of the state reached (N, A, O), or None if the critic does not read them
+    memory: NetworkMemory
+    """Recurrent state before this step, zeroed at an episode's first step."""
+    is_first: jax.Array
+    """Whether the step is the first of its episode (N,) bool."""
+    obs: jax.Array
+    """Observations (N, A, O)."""
+    privileged_obs: jax.Array
+    """Privileged observations (N, P)."""
     final_obs: jax.Array | None
-    # privileged observations of the state reached (N, P), or None
+    """Observations of the state reached (N, A, O), or None if the critic does not read them."""
     final_privileged_obs: jax.Array | None
-    action: jax.Array  # actions as sampled: unscaled and unclipped (N, A, D)
-    log_prob: jax.Array  # log-probabilities of the actions (N, A, D)
-    reward: jax.Array  # rewards (N, A)
-    active: jax.Array  # which agents took part (N, A) bool
-    terminated: jax.Array  # whether the episode terminated (N,) bool
-    done: jax.Array  # whether it was terminated or truncated (N,) bool
-    # actions of the teacher, as the environment would get them (N, A, D); empty without one
+    """Privileged observations of the state reached (N, P), or None."""
+    action: jax.Array
+    """Actions as sampled: unscaled and unclipped (N, A, D)."""
+    log_prob: jax.Array
+    """Log-probabilities of the actions (N, A, D)."""
+    reward: jax.Array
+    """Rewards (N, A)."""
+    active: jax.Array
+    """Which agents took part (N, A) bool."""
+    terminated: jax.Array
+    """Whether the episode terminated (N,) bool."""
+    done: jax.Array
+    """Whether the episode was terminated or truncated (N,) bool."""
     teacher_action: Any = ()
+    """The teacher's actions, as the environment would get them (N, A, D); empty without one."""
 
 
 class Batch(NamedTuple):
-    """Chunks of L steps (L, C, ...), with the recurrent state at each chunk's first step (C,
-    ...).
-    """
+    """Chunks of L steps (L, C, ...), with the recurrent state at a chunk's first step (C, ...)."""
 
     memory: NetworkMemory
     is_first: jax.Array
@@ -406,10 +410,15 @@ class Batch(NamedTuple):
     privileged_obs: jax.Array
     action: jax.Array
     log_prob: jax.Array
-    advantage: jax.Array  # advantages (L, C, V)
-    target: jax.Array  # value targets, normalised (L, C, V)
-    old_value: jax.Array  # normalised values at collection (L, C, V)
-    active: jax.Array  # which agents took part (L, C, A) bool
-    learners: jax.Array  # active agents from whose samples the loss learns (L, C, A) bool
-    # the first D' entries of the teacher's actions, unscaled (L, C, A, D'); empty without one
+    advantage: jax.Array
+    """Advantages (L, C, V)."""
+    target: jax.Array
+    """Value targets, normalised (L, C, V)."""
+    old_value: jax.Array
+    """Normalised values at collection (L, C, V)."""
+    active: jax.Array
+    """Which agents took part (L, C, A) bool."""
+    learners: jax.Array
+    """Active agents from whose samples the loss learns (L, C, A) bool."""
     teacher_action: Any = ()
+    """The first D' entries of the teacher's actions, unscaled (L, C, A, D'); empty without one."""
