@@ -107,7 +107,8 @@ class FakeEnv:
         names = ("reward/progress", "average_step_reward", "diverged", "overflow")
         metrics: dict[str, jax.Array] = dict.fromkeys(names, zero)
         results = Outcome(zero[None]), metrics
-        seen = obs, obs[:, 0], obs, obs[:, 0]
+        groups = {"policy": obs}
+        seen = groups, obs[:, 0], groups, obs[:, 0]
         return FakeState(*seen, jnp.zeros(2), false, false, *results, jnp.int32(0), zero, key, data)
 
     def step(self, state: FakeState, action: jax.Array) -> FakeState:
@@ -124,9 +125,9 @@ class FakeEnv:
         end = state.step >= 9
         data = dataclasses.replace(state.data, qpos=qpos)
         seen = {
-            "obs": obs,
+            "groups": {"policy": obs},
             "privileged_obs": obs[:, 0],
-            "final_obs": obs,
+            "final_groups": {"policy": obs},
             "final_privileged_obs": obs[:, 0],
         }
         seen |= {
@@ -170,7 +171,7 @@ class FakeVectorEnv:
             obs = jnp.where(done, fresh.obs, state.obs)
             step = jnp.where(done, 0, state.step)
             return dataclasses.replace(
-                state, data=data, obs=obs, privileged_obs=obs[:, 0], step=step
+                state, data=data, groups={"policy": obs}, privileged_obs=obs[:, 0], step=step
             )
 
         return jax.vmap(one)(state, action)

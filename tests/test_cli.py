@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.presets import resolve
 from mqe_jax.runs import build
+from mqe_jax.train import checkpoint
 from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import SETTINGS
@@ -55,6 +57,23 @@ def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFi
         cli.main([*command, "--help"])
     assert not stop.value.code
     assert "usage: mqe" in capfd.readouterr().out
+
+
+def test_a_checkpoint_with_environments_of_an_earlier_version_is_rejected_by_name(
+    run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Version 0.3 stored the observations as `obs`."""
+    run = Path(shutil.copytree(run_folder, tmp_path / "run"))
+    path = checkpoint.list_checkpoints(run)[-1]
+    arrays, about = checkpoint._read(path, "checkpoint")
+    own = "rollout/env_state/groups/policy"
+    arrays["rollout/env_state/obs"] = arrays.pop(own)
+    checkpoint.save_tree(path, arrays, about, kind="checkpoint")
+    words = ["train", "fake", "--run-dir", str(run), *SMALL, "--resume", "--total-steps", "128"]
+    assert cli.main(words) == 2
+    assert f"{path}: {own} is missing; the file has other settings or is of another version" in (
+        capfd.readouterr().err
+    )
 
 
 def test_eval_prints_one_object_and_nothing_else(

@@ -141,7 +141,7 @@ def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
         network.policy_params(random_params(network)), statistics, needs, config, {}, True
     )
     env = make("go1gate", impl="c", num_envs=1, skill=("walk", "agile"), **SENSES)
-    layout = env.groups["onboard"]
+    layout = env.layouts["onboard"]
     met = load_as("opponent", policy, env)
     assert layout.size == needs.dims.observation + 1
     memory = met.initial_memory(3)

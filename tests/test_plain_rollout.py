@@ -408,9 +408,8 @@ def test_both_teams_of_a_mirrored_match_get_what_is_theirs() -> None:
     state = env.reset(KEY).match
     numbers = jnp.arange(3.0)
     metrics = {name: numbers + 1 for name in state.metrics}
+    obs = {"groups": state.obs + 1, "final_groups": state.final_obs + 2}
     rows = {
-        "obs": state.obs + 1,
-        "final_obs": state.final_obs + 2,
         "reward": jnp.arange(6.0).reshape(3, 2),
     }
     rows |= {
@@ -422,13 +421,16 @@ def test_both_teams_of_a_mirrored_match_get_what_is_theirs() -> None:
         "truncated": jnp.array([False, True, False]),
     }
     more = {"step": jnp.array([3, 1, 2], jnp.int32), "assistance": numbers / 4, "metrics": metrics}
+    groups = {name: {"policy": value} for name, value in obs.items()}
     seen = env._team_state(
-        dataclasses.replace(state, **rows, **flags, **more), jnp.zeros((3, 2, 12))
+        dataclasses.replace(state, **groups, **rows, **flags, **more), jnp.zeros((3, 2, 12))
     )
     for i in range(6):
         match, team = divmod(i, 2)
-        for name in ("obs", "final_obs", "reward"):
-            np.testing.assert_array_equal(getattr(seen, name)[i, 0], rows[name][match, team])
+        for name, expected in obs.items():
+            found = getattr(seen, name)["policy"]
+            np.testing.assert_array_equal(found[i, 0], expected[match, team])
+        np.testing.assert_array_equal(seen.reward[i, 0], rows["reward"][match, team])
         for name in ("privileged_obs", "final_privileged_obs"):
             np.testing.assert_array_equal(
                 getattr(seen, name)[i], [*np.asarray(rows[name][match]), team]

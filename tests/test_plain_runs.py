@@ -81,7 +81,9 @@ class Help:
         obs = jnp.zeros((N, 1, 1))
         done = jnp.ones(N, bool)
         rest = Outcome(), {"pay": assistance}, jnp.zeros(N, jnp.int32), assistance, KEY
-        return Fields(obs, obs[:, 0], obs, obs[:, 0], assistance[:, None], done, ~done, *rest)
+        groups = {"policy": obs}
+        reward = assistance[:, None]
+        return Fields(groups, obs[:, 0], groups, obs[:, 0], reward, done, ~done, *rest)
 
 
 def test_environments_get_the_assistance_of_the_schedule() -> None:
@@ -236,10 +238,10 @@ class Matches:
             jnp.stack([(result == i) * 1.0, jnp.zeros(12)], axis=-1) for i in range(3)
         )
         outcome = Outcome(win=win, draw=draw, loss=loss)
-        obs = jnp.zeros((12, 2, 1))
+        groups = {"policy": jnp.zeros((12, 2, 1))}
         none = jnp.zeros((12, 1))
         rest = jnp.zeros((12, 2)), done, jnp.zeros(12, bool), outcome, {}, step, none[:, 0], KEY
-        return Fields(obs, none, obs, none, *rest)
+        return Fields(groups, none, groups, none, *rest)
 
 
 def test_a_tournament_counts_the_first_episode_of_every_match() -> None:

@@ -204,7 +204,7 @@ def test_scripted_robots_are_silent() -> None:
 )
 def test_sensors_that_cannot_work_are_named(task: str, senses: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        _ = make(task, impl="c", senses=senses).groups
+        _ = make(task, impl="c", senses=senses).layouts
 
 
 def test_a_group_without_its_sensors_is_named() -> None:

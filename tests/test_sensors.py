@@ -203,7 +203,7 @@ def test_senses_add_a_group_and_change_nothing_else() -> None:
         x, y, _, _, _, yaw = jnp.moveaxis(
             jax.vmap(env.own_frame)(jax.vmap(env.read)(state.data).base_info), -1, 0
         )
-        return env.groups["onboard"].split(state.groups["onboard"]), jnp.stack(
+        return env.layouts["onboard"].split(state.groups["onboard"]), jnp.stack(
             [x, y, jnp.cos(yaw), jnp.sin(yaw)], -1
         )
 
@@ -222,7 +222,7 @@ def test_senses_add_a_group_and_change_nothing_else() -> None:
         np.testing.assert_allclose(read["odometry"], pose, atol=1e-4)
         np.testing.assert_allclose(read["action"][0], 0.0 if count == 2 else 0.3)
         assert seeing.final_groups["onboard"].shape == (2, 2, env.group_sizes["onboard"])
-    assert states[0].senses == () and "onboard" not in blind.groups
+    assert states[0].senses == () and "onboard" not in blind.layouts
 
 
 def test_a_pipeline_delays_drops_and_keeps_readings() -> None:
@@ -329,7 +329,7 @@ def test_senses_are_settings() -> None:
 )
 def test_bad_senses_are_named(senses: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        _ = make("go1gate", impl="c", senses=senses).groups
+        _ = make("go1gate", impl="c", senses=senses).layouts
 
 
 @settings_class

@@ -137,7 +137,7 @@ class Env(MultiAgentEnv):
         if reset_state is None:
             after = autoreset(task, after)
         else:
-            after = select(self.env, dones["__all__"], reset_state, after, kept=("final_obs",))
+            after = select(self.env, dones["__all__"], reset_state, after, kept=("final_groups",))
         return self.get_obs(after), after, rewards, dones, infos
 
     @single

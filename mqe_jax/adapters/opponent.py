@@ -143,9 +143,8 @@ class TeamEnv:
     def with_observations(self, state: TeamEnvState, groups: Sequence[str] = ()) -> TeamEnvState:
         """Returns the state with the observations of both teams that belong to it."""
         seen: Any = self.match.with_observations(state, groups)
-        return dataclasses.replace(
-            seen, obs=seen.obs[: self.num_agents], rival_obs=seen.obs[self.num_agents :]
-        )
+        own = {name: obs[: self.num_agents] for name, obs in seen.groups.items()}
+        return dataclasses.replace(seen, groups=own, rival_obs=seen.obs[self.num_agents :])
 
     def _of_team(self, state: TeamEnvState) -> TeamEnvState:
         """Reduces rewards, outcome and metrics of all agents to those of team 0."""

@@ -17,12 +17,11 @@ from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, check_arguments, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.state import State
+from mqe_jax.envs.state import FINAL, State, with_final
 from mqe_jax.sensors.suite import ONBOARD
 
-SEEN = ("obs", "privileged_obs", "groups")
-"""Fields of observations. They describe the state after a reset; `VectorEnv.final` adds those from
-before it."""
+SEEN = ("groups", "privileged_obs")
+"""Fields of observations, which describe the state after a reset."""
 
 KEPT = (
     "assistance",
@@ -31,7 +30,8 @@ KEPT = (
     "truncated",
     "outcome",
     "metrics",
-    *(f"final_{name}" for name in SEEN),
+    "final_groups",
+    "final_privileged_obs",
 )
 """Fields that an auto-reset keeps; all but the first describe the last step."""
 
@@ -114,18 +114,18 @@ class VectorEnv(EnvBatch):
         ```
     """
 
-    groups: tuple[str, ...] = ()
-    """Groups that are observed besides `policy`."""
+    groups: tuple[str, ...] = ("policy",)
+    """Groups that are observed, `policy` among them."""
 
     def __init__(
-        self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = SEEN
+        self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = FINAL
     ) -> None:
         """Creates the batch.
 
         `copies` is the number of batches under an outer `vmap`, such as one per seed; buffers are
-        sized for all. `final` names the fields in `SEEN` that a step also returns as they were
-        before any reset (`final_obs`, ...). A critic needs those that it reads, and each takes
-        time.
+        sized for all. `final` says which observations a step also returns as they were before any
+        reset: `obs`, those of all groups, and `privileged_obs`. A critic needs those that it
+        reads, and each takes time.
         """
         if not isinstance(env, QuadrupedEnv):
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
@@ -135,8 +135,8 @@ class VectorEnv(EnvBatch):
         self.num_envs = num_envs
         self.copies = copies
         self.final = tuple(final)
-        if not {*final} <= {*SEEN}:
-            fail("final", final, f"some of {', '.join(SEEN)}")
+        if not {*final} <= {*FINAL}:
+            fail("final", final, f"some of {', '.join(FINAL)}")
         if num_envs * copies > _SMALL:
             state = jax.eval_shape(functools.partial(VectorEnv.reset, self), jax.random.PRNGKey(0))
             check_memory(
@@ -155,12 +155,12 @@ class VectorEnv(EnvBatch):
         """Returns the batch that also observes further groups; InputError for one that the task
         does not have.
         """
+        wanted = {"policy", *names}
+        for name in sorted(wanted.difference(self.group_sizes)):
+            hint = f"; the task parameter senses adds {ONBOARD}" if name == ONBOARD else ""
+            fail("group", name, f"one of {self.name}: {', '.join(self.group_sizes)}{hint}")
         other = copy.copy(self)
-        other.groups = tuple(sorted({*names} - {"policy"}))
-        for name in other.groups:
-            if name not in self.group_sizes:
-                hint = f"; the task parameter senses adds {ONBOARD}" if name == ONBOARD else ""
-                fail("group", name, f"one of {self.name}: {', '.join(self.group_sizes)}{hint}")
+        other.groups = tuple(name for name in self.group_sizes if name in wanted)
         return other
 
     @check_arguments(key=RandomKey)
@@ -188,15 +188,8 @@ class VectorEnv(EnvBatch):
 
     @single
     def _reset(self, key: jax.Array) -> State:
-        return self._with_final(self.env.with_observations(self.env.begin(key), self.groups))
-
-    def _with_final(self, state: State) -> State:
-        """Returns a state whose observations, as far as `final` names them, are also those at the
-        end of its step.
-        """
-        return dataclasses.replace(
-            state, **{f"final_{name}": getattr(state, name) for name in self.final}
-        )
+        state = self.env.with_observations(self.env.begin(key), self.groups)
+        return with_final(state, self.final)
 
     @single
     def _step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
@@ -205,6 +198,6 @@ class VectorEnv(EnvBatch):
         """
         state = self.env.advance(state, action)
         if self.final:
-            seen = self._with_final(self.env.with_observations(state, self.groups))
+            seen = with_final(self.env.with_observations(state, self.groups), self.final)
             state = dataclasses.replace(seen, senses=state.senses)  # sensors observe once a step
         return autoreset(self.env, state, start, self.groups)

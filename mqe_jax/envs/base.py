@@ -210,13 +210,12 @@ class QuadrupedEnv(Task[S, P]):
         data = self.sizes.park(data, active)
         robot_state = self.read(data, active)
         no = jnp.zeros((), bool)
-        empty = jnp.zeros((0,))
         nothing: Any = None
         state = State(
             data=data,
-            obs=empty,
-            privileged_obs=empty,
-            final_obs=None,
+            groups={},
+            privileged_obs=jnp.zeros((0,)),
+            final_groups=None,
             final_privileged_obs=None,
             reward=jnp.zeros(self.num_agents),
             terminated=no,
@@ -309,37 +308,31 @@ class QuadrupedEnv(Task[S, P]):
 
     @jax.named_scope("task")
     def with_observations(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
-        """Returns the state with its observations, also of further groups; once a step, as sensors
-        have memory.
+        """Returns the state with its observations of the group `policy` and further groups.
+
+        Call it once a step, as sensors have memory.
         """
         robots = self.read(state.data, state.active)
         noise = self.params.randomization.observation_noise
         seen = {}
         there = self.there(state) if self.varies else {}
-        for number, (name, layout) in enumerate(
-            {"policy": self.observation_layout, **self.groups}.items()
-        ):
-            if name != "policy" and name not in groups:
+        for number, (name, layout) in enumerate(self.layouts.items()):
+            if name not in ("policy", *groups):
                 continue
             if name == ONBOARD:
                 key = jax.random.fold_in(state.key, _SENSING)
                 blocks, senses = self.suite.observe(self.snapshot(state, robots), state.senses, key)
                 state = dataclasses.replace(state, senses=senses)
             else:
-                blocks = (
-                    self.observe(state, robots)
-                    if name == "policy"
-                    else self.observe_group(name, state, robots)
-                )
+                blocks = self.observe_group(name, state, robots)
             obs = layout.pack(blocks, self.num_agents)
             if noise:
                 key = jax.random.fold_in(state.key, _NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
             obs = hide(layout, obs, there) if there else obs
             seen[name] = jnp.where(self.observed(state)[:, None], finite(obs), 0.0)
-        privileged = self.observe_privileged(state, robots)
-        seen = {"obs": seen.pop("policy"), "privileged_obs": finite(privileged), "groups": seen}
-        return dataclasses.replace(state, **seen)
+        privileged = finite(self.observe_privileged(state, robots))
+        return dataclasses.replace(state, groups=seen, privileged_obs=privileged)
 
     def judge(
         self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False

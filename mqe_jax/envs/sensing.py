@@ -28,7 +28,7 @@ class Sensing:
     impl: str
     dt: float
     teams: Any
-    groups: Any
+    layouts: Any
     read: Any
 
     @property
@@ -89,7 +89,7 @@ class Sensing:
 
     def marks(self, state: State[Any]) -> tuple[Marks, ...]:
         """Returns what shows the readings in a state that has the group `onboard`."""
-        readings = self.groups[ONBOARD].split(state.groups[ONBOARD])
+        readings = self.layouts[ONBOARD].split(state.groups[ONBOARD])
         return self.suite.draw(
             self.snapshot(state, self.read(state.data, state.active)), state.senses, readings
         )

@@ -1,6 +1,7 @@
 """The state of an environment, which `reset` and `step` return."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import jax
@@ -28,13 +29,14 @@ class EnvironmentState:
     axes.
     """
 
-    obs: jax.Array
-    """The agents' observations (A, O); after an auto-reset, those of the new episode."""
+    groups: dict[str, jax.Array]
+    """The agents' observations by group (A, O_g), `policy` among them; after an auto-reset, those
+    of the new episode."""
     privileged_obs: jax.Array
     """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new
     episode."""
-    final_obs: Any
-    """Observations at the end of the last step (A, O), which differ from `obs` only after an
+    final_groups: Any
+    """Observations at the end of the last step by group, which differ from `groups` only after an
     auto-reset; None in a batch without them (`VectorEnv.final`)."""
     final_privileged_obs: Any
     """Privileged observation at the end of the last step (P,), or None."""
@@ -57,10 +59,16 @@ class EnvironmentState:
     """Random key."""
     active: Any = dataclasses.field(default=None, kw_only=True)
     """Which agents take part (A,) bool; the others count nowhere. None: all."""
-    groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict, kw_only=True)
-    """Observations of further groups by name (A, O_g); `obs` is the group `policy`."""
-    final_groups: Any = dataclasses.field(default=None, kw_only=True)
-    """Those at the end of the last step, or None."""
+
+    @property
+    def obs(self) -> jax.Array:
+        """Observations of the group `policy` (A, O)."""
+        return self.groups["policy"]
+
+    @property
+    def final_obs(self) -> Any:
+        """Observations of the group `policy` at the end of the last step (A, O), or None."""
+        return None if self.final_groups is None else self.final_groups["policy"]
 
 
 @jax.tree_util.register_dataclass
@@ -98,14 +106,17 @@ class State(EnvironmentState, Generic[S]):
     """What sensors keep between steps (`SensorState`), empty without sensors."""
 
 
-def with_final(state: Any) -> Any:
-    """Returns a state whose observations are also those at the end of its step."""
-    final = {
-        "final_obs": state.obs,
-        "final_privileged_obs": state.privileged_obs,
-        "final_groups": state.groups,
-    }
-    return dataclasses.replace(state, **final)
+FINAL = ("obs", "privileged_obs")
+"""What `with_final` keeps: the agents' observations of all groups, and the privileged one."""
+
+
+def with_final(state: Any, names: Sequence[str] = FINAL) -> Any:
+    """Returns a state whose observations are also those at the end of its step, as `names` say."""
+    return dataclasses.replace(
+        state,
+        final_groups=state.groups if "obs" in names else None,
+        final_privileged_obs=state.privileged_obs if "privileged_obs" in names else None,
+    )
 
 
 class Moment(NamedTuple, Generic[S]):

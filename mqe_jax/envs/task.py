@@ -193,7 +193,7 @@ class Task(Sensing, Generic[S, P]):
         return box(np.inf, (self.num_agents, self.observation_size))
 
     def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
-        """Returns the observation's blocks by name (A, width)."""
+        """Returns the blocks of `observation_layout` by name (A, width)."""
         raise NotImplementedError(f"{type(self).__name__}: observe() is not defined")
 
     @property
@@ -208,31 +208,31 @@ class Task(Sensing, Generic[S, P]):
         return self.observe(state, robot_state)
 
     @property
-    def groups(self) -> Mapping[str, ObservationLayout]:
-        """Layouts of further groups of observations by name, which are computed if a policy or a
-        critic names them.
+    def layouts(self) -> Mapping[str, ObservationLayout]:
+        """Layouts of all groups of observations by name.
+
+        The group `policy` is always observed, the others if a policy or a critic names them.
         """
-        sensed = {ONBOARD: ObservationLayout(self.suite.blocks)} if self.params.senses else {}
-        sized = {ENTITIES: entity_layout(self.sized_layout)} if self.variable_num_agents else {}
-        return {
+        layouts = {
+            "policy": self.observation_layout,
             "proprioception": proprioception_layout(self.robot.num_joints),
-            **sensed,
-            **sized,
         }
+        if self.params.senses:
+            layouts[ONBOARD] = ObservationLayout(self.suite.blocks)
+        if self.variable_num_agents:
+            layouts[ENTITIES] = entity_layout(self.sized_layout)
+        return layouts
 
     @property
     def group_sizes(self) -> dict[str, int]:
         """Lengths of an agent's observations by group."""
-        return {
-            "policy": self.observation_size,
-            **{name: layout.size for name, layout in self.groups.items()},
-        }
+        return {name: layout.size for name, layout in self.layouts.items()}
 
     def describe(self, group: str) -> dict[str, Any]:
         """Returns what policies that see a group of observations need of the task, beside its name
         and sizes.
         """
-        layout = {"policy": self.observation_layout, **self.groups}[group]
+        layout = self.layouts[group]
         blocks = tuple(dataclasses.replace(block, meaning="") for block in layout.blocks)
         senses = (
             tuple(to_mapping(sensor) for sensor in self.params.senses) if group == ONBOARD else ()
@@ -243,7 +243,9 @@ class Task(Sensing, Generic[S, P]):
     def observe_group(
         self, name: str, state: State[S], robot_state: RobotState
     ) -> dict[str, jax.Array]:
-        """Returns the blocks of one of `groups` by name (A, width)."""
+        """Returns the blocks of a group by name (A, width), but for `onboard`, which has memory."""
+        if name == "policy":
+            return self.observe(state, robot_state)
         if name == ENTITIES:
             blocks = self.observe_sized(state, robot_state)
             there = self.there(state) if self.varies else {}

@@ -144,8 +144,8 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
 
 def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
     """Returns the metadata of a policy's graph."""
-    seen = {"policy": env.observation_layout, **env.groups}[policy.needs.group]
-    layout = [[block.name, block.width, block.meaning] for block in seen.blocks]
+    blocks = env.layouts[policy.needs.group].blocks
+    layout = [[block.name, block.width, block.meaning] for block in blocks]
     return {
         "mqe_jax": mqe_jax.__version__,
         "opset": str(OPSET),

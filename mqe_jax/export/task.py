@@ -265,7 +265,7 @@ def _sensing(choose: Function, shapes: Shapes, functions: TaskFunctions) -> tupl
         state = dataclasses.replace(functions.state(inputs), senses=senses)
         snapshot = env.snapshot(state, env.read(state.data))
         blocks, senses = env.suite.observe(snapshot, senses, state.key)
-        every = finite(env.groups[ONBOARD].pack(blocks, env.num_agents))
+        every = finite(env.layouts[ONBOARD].pack(blocks, env.num_agents))
         teams = [every[team[0] : team[-1] + 1] for team in env.teams]
         outputs = choose({**inputs, "obs": jnp.where(inputs["team"] < 0.5, teams[0], teams[-1])})
         action = jnp.tile(jnp.clip(outputs["action"], -1.0, 1.0), (len(teams), 1))

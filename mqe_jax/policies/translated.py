@@ -112,7 +112,7 @@ def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
             controller = dataclasses.replace(env.controller, commands=own.commands)
             # as it was trained
             check_policy(policy, _changed(env, params=params, controller=controller), name)
-            layout = {"policy": env.observation_layout, **env.groups}[needs.group]
+            layout = env.layouts[needs.group]
             sensed = layout.slice("action") if needs.senses and "action" in layout.names else None
             if sensed is not None and sensed.stop - sensed.start != env.controller.action_size:
                 raise InputError(

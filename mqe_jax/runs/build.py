@@ -182,10 +182,7 @@ def environments(
     task = task or config.task or ""
     episodes = config.evaluation.episodes
     opponents = config.opponents
-    final = [
-        "groups" if name == "obs" and config.group != "policy" else name
-        for name in config.network.critic_reads
-    ]
+    final = config.network.critic_reads
     both, started = make_env(task, impl, config.training_env, config.num_envs, seeds, final)
     _check_teams(both, config)
     others = (

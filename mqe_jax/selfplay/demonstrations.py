@@ -19,6 +19,7 @@ from mqe_jax.core.settings import fail
 from mqe_jax.core.types import PyTree, observations
 from mqe_jax.envs import QuadrupedEnv, State, VectorEnv
 from mqe_jax.envs.autoreset import KEPT, SEEN
+from mqe_jax.envs.state import FINAL
 from mqe_jax.physics.engines import STATE_FIELDS
 
 NUM_ENVS = 128
@@ -51,7 +52,7 @@ class Demonstrated(VectorEnv):
         demonstrator: Seats,
         copies: int = 1,
         *,
-        final: Sequence[str] = SEEN,
+        final: Sequence[str] = FINAL,
     ) -> None:
         """Creates the batch, as `VectorEnv`; `demonstrator` acts in it."""
         super().__init__(env, num_envs, copies, final=final)

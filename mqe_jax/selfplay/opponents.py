@@ -88,7 +88,7 @@ class OneTeam(Outer):
         """Returns the state of the environments: fields of agents (N, A, ...) and others (N, ...)
         mapped, or `own`.
         """
-        agents = ("obs", "final_obs", "reward", "active", "groups", "final_groups")
+        agents = ("groups", "final_groups", "reward", "active")
         others = (
             "privileged_obs",
             "final_privileged_obs",

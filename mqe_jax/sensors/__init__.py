@@ -42,7 +42,7 @@ class Sensor:
             def observe(self, scene, snapshot, memory, key):
                 return {"height": snapshot.height[:, None]}, memory
 
-        print(mqe_jax.make("go1gate", senses=["altimeter"]).groups["onboard"])
+        print(mqe_jax.make("go1gate", senses=["altimeter"]).layouts["onboard"])
         ```
     """
 

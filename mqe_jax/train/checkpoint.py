@@ -38,7 +38,7 @@ _RANGES: tuple[tuple[str, float, float], ...] = (
     (r"(^|/)params/(?!critic)", -limits.WEIGHT, limits.WEIGHT),
 )
 """Lowest and highest value of arrays by patterns of their names; of others any finite number."""
-_ANY = re.compile(r"/env_state/(?!.*(arrays|before)/)(?!.*(obs|qpos|qvel)$)")
+_ANY = re.compile(r"/env_state/(?!.*(arrays|before)/)(?!.*(obs|qpos|qvel|groups/[^/]+)$)")
 """Names of arrays in which NaN may be meant."""
 
 

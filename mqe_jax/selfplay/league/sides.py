@@ -39,8 +39,6 @@ class BothSides(Wrapper):
             return jnp.concatenate([privileged, changed[:, None].astype(privileged.dtype)], axis=1)
 
         return {
-            "obs": self._swap(inner.obs),
-            "final_obs": jax.tree.map(self._swap, inner.final_obs),
             "privileged_obs": add_side(inner.privileged_obs),
             "final_privileged_obs": jax.tree.map(add_side, inner.final_privileged_obs),
             "reward": self._swap(inner.reward),
