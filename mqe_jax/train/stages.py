@@ -25,6 +25,16 @@ _ADAPTATION = 1.5
 class Stages:
     """The stages of PPO, pure functions; a subclass that overrides some of them is another
     algorithm (`mqe_jax.train.algorithms`).
+
+    Example:
+        ```python
+        from mqe_jax.train.stages import Stages
+
+        class Logged(Stages):
+            def loss(self, params, batch, now):
+                loss, metrics = super().loss(params, batch, now)
+                return loss, {**metrics, "loss/whole": loss}
+        ```
     """
 
     def __init__(self, network: Network, config: TrainConfig) -> None:
