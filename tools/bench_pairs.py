@@ -1,17 +1,17 @@
-"""Compares the throughput of checkouts or parameters on one machine: medians and ratios of
-interleaved timings.
+"""Compares the throughput of checkouts or parameters on one machine.
 
-    python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --pairs 5 --csv
-    FILE
+    python tools/bench_pairs.py --trees before=PATH after=PATH --cases go1gate:c:256 --csv FILE
 
-starts one process per checkout and case, waits for compilation, and times them in turn: drifts of
-the machine's speed affect all equally. A case is TASK:ENGINE:ENVIRONMENTS. Each timing is that of
-`mqe bench`: the median of a few calls of 50 environment steps, whole step and bare physics.
-`PATH,senses=onboard` is a checkout with a task parameter.
+starts one process per checkout and case, waits for compilation, and times them in turn. Drifts of
+the machine's speed then affect all equally. It prints medians and ratios of the pairs. A case is
+TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few calls of 50
+environment steps, whole step and bare physics. `PATH,senses=onboard` is a checkout with a task
+parameter.
 """
 
 import argparse
 import csv
+import itertools
 import json
 import os
 import subprocess
@@ -27,9 +27,7 @@ RATES = ("env_steps_per_s", "bare_env_steps_per_s")
 
 
 def work(case: str, *, steps: int, repeats: int, cpu_time: bool, params: dict[str, Any]) -> None:
-    """Process of one checkout and case: compiles, then answers each line on standard input with one
-    timing.
-    """
+    """Compiles one case in one checkout, then answers each line on standard input with a timing."""
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print
 
@@ -64,21 +62,20 @@ def work(case: str, *, steps: int, repeats: int, cpu_time: bool, params: dict[st
     print(json.dumps({"ready": mqe_jax.__file__}), file=output, flush=True)
     for _ in sys.stdin:
         figures = {RATES[0]: round(rate(whole, carry), 1), RATES[1]: round(rate(bare, data), 1)}
-        print(
-            json.dumps({**figures, "device": device, "jax": jax.__version__}),
-            file=output,
-            flush=True,
-        )
+        about = {"device": device, "jax": jax.__version__}
+        print(json.dumps(figures | about), file=output, flush=True)
 
 
 def start(place: str, case: str, **options: Any) -> subprocess.Popen[str]:
     """Starts the process that times one case in one checkout, PATH or PATH,PARAMETER=VALUE,..."""
     folder, *pairs = place.split(",")
     tree = Path(folder)
-    params = {name: yaml.safe_load(value) for name, value in (pair.split("=") for pair in pairs)}
-    path = os.pathsep.join([str(tree.resolve()), os.environ.get("PYTHONPATH", "")]).rstrip(
-        os.pathsep
-    )
+    params = {}
+    for pair in pairs:
+        name, value = pair.split("=")
+        params[name] = yaml.safe_load(value)
+    places = [str(tree.resolve()), os.environ.get("PYTHONPATH", "")]
+    path = os.pathsep.join(filter(None, places))
     command = [sys.executable, str(Path(__file__).resolve()), "--work", case]
     command.append(json.dumps({**options, "params": params}))
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -86,16 +83,18 @@ def start(place: str, case: str, **options: Any) -> subprocess.Popen[str]:
 
 
 def answer(worker: subprocess.Popen[str], ask: bool = True) -> dict[str, Any]:
-    """Waits for the next answer of a process, a timing if it is asked for one; exits if the process
-    died.
+    """Returns the next answer of a process, a timing if it is asked for one.
+
+    Exits if the process has died.
     """
     assert worker.stdin is not None and worker.stdout is not None
     if ask:
         worker.stdin.write("\n")
         worker.stdin.flush()
-    if line := worker.stdout.readline():
-        return json.loads(line)
-    raise SystemExit(f"{worker.args}: the benchmark process ended")
+    line = worker.stdout.readline()
+    if not line:
+        raise SystemExit(f"{worker.args}: the benchmark process ended")
+    return json.loads(line)
 
 
 def main() -> int:
@@ -122,11 +121,9 @@ def main() -> int:
         return 0
     trees = dict(pair.split("=", 1) for pair in arguments.trees)
     options = {name: getattr(arguments, name) for name in ("steps", "repeats", "cpu_time")}
-    workers = {
-        (case, name): start(tree, case, **options)
-        for case in arguments.cases
-        for name, tree in trees.items()
-    }
+    workers = {}
+    for case, name in itertools.product(arguments.cases, trees):
+        workers[case, name] = start(trees[name], case, **options)
     for worker in workers.values():
         answer(worker, ask=False)
     rows: list[dict[str, Any]] = []
@@ -143,16 +140,15 @@ def main() -> int:
     for case in arguments.cases:
         result: dict[str, Any] = {"case": case}
         for rate in RATES:
-            values = {
-                name: [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)]
-                for name in trees
-            }
-            first = next(iter(values.values()))
-            result[rate] = {name: median(found) for name, found in values.items()}
-            ratios = {
-                name: [a / b for a, b in zip(x, first, strict=True)] for name, x in values.items()
-            }
-            result[f"{rate}/ratio"] = {name: round(median(x), 4) for name, x in ratios.items()}
+            result[rate] = {}
+            result[f"{rate}/ratio"] = {}
+            first: list[float] = []
+            for name in trees:
+                values = [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)]
+                first = first or values
+                ratios = [own / other for own, other in zip(values, first, strict=True)]
+                result[rate][name] = median(values)
+                result[f"{rate}/ratio"][name] = round(median(ratios), 4)
         print(json.dumps(result), flush=True)
     return 0
 

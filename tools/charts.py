@@ -1,7 +1,9 @@
 """Charts of docs/drawings, drawn from results/ by tools/drawings.py."""
 
 import csv
+import itertools
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,8 +47,9 @@ def curves() -> Figure:
 
 
 def students() -> Figure:
-    """Success of training episodes while teams with sensors imitate the shipped ones:
-    results/students.csv.
+    """Success of training episodes while teams with sensors imitate the shipped ones.
+
+    Source: results/students.csv.
     """
     return _curves(read_rows("students.csv"), [*TITLES], 4.6, (70, 101))
 
@@ -57,21 +60,18 @@ def _curves(
     """Draws the success of each task over its environment steps: each seed and their mean."""
     figure = Figure((WIDTH / 100, height), layout="constrained")
     columns = min(3, len(tasks))
-    panels = figure.subplots(
-        -(-len(tasks) // columns), columns, sharex=True, sharey=True, squeeze=False
-    )
+    lines = math.ceil(len(tasks) / columns)
+    panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
     for axes, task in zip(panels.flat, tasks, strict=True):
         own = [row for row in rows if row["task"] == task]
         table: dict[float, list[float]] = {}
         for seed in sorted({row["seed"] for row in own}):
-            points = [
-                (float(x["env_steps"]) / 1e6, 100 * float(x["success"]))
-                for x in own
-                if x["seed"] == seed
-            ]
-            axes.plot(*zip(*points, strict=True), color=BLUE, alpha=0.35, lw=1.2)
-            for step, success in points:
-                table.setdefault(step, []).append(success)
+            curve = [row for row in own if row["seed"] == seed]
+            steps = [float(row["env_steps"]) / 1e6 for row in curve]
+            rates = [100 * float(row["success"]) for row in curve]
+            axes.plot(steps, rates, color=BLUE, alpha=0.35, lw=1.2)
+            for step, rate in zip(steps, rates, strict=True):
+                table.setdefault(step, []).append(rate)
         axes.plot([*table], [np.mean(values) for values in table.values()], color=BLUE, lw=2.4)
         axes.set_title(TITLES[task], fontsize=12, color=INK, loc="left", weight="bold")
         axes.set(xlim=(0, None), ylim=limits)
@@ -98,15 +98,8 @@ def levers() -> Figure:
         axes.text(-2, place - 0.22, f"{TITLES[task]}: {change}", fontsize=10.5, color=INK)
         for name, color, shift in (("", BLUE, 0.0), (change, ORANGE, 0.24)):
             values = seeds[task, name]
-            axes.plot(
-                values,
-                [place + shift] * len(values),
-                "o",
-                color=color,
-                ms=7,
-                alpha=0.65,
-                mec="none",
-            )
+            heights = [place + shift] * len(values)
+            axes.plot(values, heights, "o", color=color, ms=7, alpha=0.65, mec="none")
     axes.set(xlim=(-3, 103), ylim=(len(changes) - 0.55, -0.6), yticks=[])
     axes.set_xlabel("success, %; a dot is a seed, dots may coincide", fontsize=10.5)
     axes.grid(axis="x", alpha=0.3)
@@ -118,21 +111,19 @@ def levers() -> Figure:
 
 
 def sizes() -> Figure:
-    """Robot steps/s: by engine against the number of robots, and on Warp against the number of
-    environments.
-    """
+    """Robot steps/s: by engine over the number of robots, on Warp over that of environments."""
     entries = read_measurements()
-    # by engine and task, number of robots, number of environments
-    rates: dict[tuple[str, int, int], list[float]] = {}
-    for row in (row for name in ("c", "mjx", "warp") for row in entries[f"sizes/{name}"]["rows"]):
+    rates: dict[tuple[str, int, int], list[float]] = {}  # by engine and task, robots, environments
+    tables = [entries[f"sizes/{name}"]["rows"] for name in ("c", "mjx", "warp")]
+    for row in itertools.chain(*tables):
         kind = f"{row['impl']} {row['task']}"
         robots = row["num_agents"]
+        rate = robots * row["env_steps_per_s"]
         sparse = row.get("sparse_solver", False)
-        default = sparse == (row["impl"] == "warp" and robots > 4)
-        for case in [kind] * default + [f"{kind} false"] * (row.get("sparse_solver") is False):
-            rates.setdefault((case, robots, row["num_envs"]), []).append(
-                robots * row["env_steps_per_s"]
-            )
+        if sparse == (row["impl"] == "warp" and robots > 4):  # the default
+            rates.setdefault((kind, robots, row["num_envs"]), []).append(rate)
+        if row.get("sparse_solver") is False:
+            rates.setdefault((f"{kind} false", robots, row["num_envs"]), []).append(rate)
     football = "go1football-1vs1"
     engines = {
         (f"warp {football}", 2048): ("Warp, football", VIOLET),
@@ -140,10 +131,10 @@ def sizes() -> Figure:
         (f"c {football}", 64): ("C, football", BLUE),
         (f"jax {football}", 4): ("MJX, football", ORANGE),
     }
-    colors = {2: GREY, 16: VIOLET, 64: INK}
     sized = {
-        (f"warp {football}", number): (f"{number} robots", color)
-        for number, color in colors.items()
+        (f"warp {football}", 2): ("2 robots", GREY),
+        (f"warp {football}", 16): ("16 robots", VIOLET),
+        (f"warp {football}", 64): ("64 robots", INK),
     }
     figure = Figure((WIDTH / 100, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -153,18 +144,16 @@ def sizes() -> Figure:
     ):
         for (kind, fixed), (label, color) in lines.items():
             for case, style in ((f"{kind} false", "o--"), (kind, "o-")):
-                own = {
-                    x[varied]: rate
-                    for x, rate in sorted(rates.items())
-                    if (x[0], x[3 - varied]) == (case, fixed)
-                }
+                own = {}
+                for key, values in sorted(rates.items()):
+                    if (key[0], key[3 - varied]) == (case, fixed):
+                        own[key[varied]] = np.median(values)
                 look = {"color": color, "ms": 4, "label": label if case == kind else None}
-                axes.plot([*own], [np.median(values) for values in own.values()], style, **look)
+                axes.plot([*own.keys()], [*own.values()], style, **look)
         axes.set(xscale="log", yscale="log")
         axes.set_xlabel(title, fontsize=10.5)
-        ticks = sorted(
-            {x[varied] for x in rates if varied == 1 or x[:2] == (f"warp {football}", 2)}
-        )
+        shown = [key for key in rates if varied == 1 or key[:2] == (f"warp {football}", 2)]
+        ticks = sorted({key[varied] for key in shown})
         axes.set_xticks(ticks, [str(tick) for tick in ticks], fontsize=9)
         axes.minorticks_off()
         axes.grid(alpha=0.3)
@@ -177,14 +166,11 @@ def sizes() -> Figure:
 
 
 def performance() -> Figure:
-    """Environment steps/s of Narrow Gate by hardware and engine, with the slowest and the fastest
-    call.
-    """
+    """Environment steps/s of Narrow Gate by hardware and engine, with slowest and fastest calls."""
     entries = read_measurements()
     walk = [row for row in entries["bench_idle"]["rows"] if row["skill"] == "walk"]
-    warp = sorted(
-        tuple(row[x] for x in ("num_envs", "env_steps_per_s", "slowest", "fastest")) for row in walk
-    )
+    names = ("num_envs", "env_steps_per_s", "slowest", "fastest")
+    warp = sorted(tuple(row[name] for name in names) for row in walk)
     rows = [row for row in entries["bench_h100"] if row["impl"] == "jax"]
     mjx = sorted((int(row["num_envs"]), *[float(row["env_steps_per_s"])] * 3) for row in rows)
     cores = [(environments, *[rate] * 3) for environments, rate, _ in entries["bench_c16"]["sizes"]]
@@ -206,12 +192,10 @@ def performance() -> Figure:
         look = {"ha": side, "va": "center", "weight": "bold", "fontsize": 14, "color": color}
         axes.annotate(label, at, shift, textcoords="offset points", **look)
     axes.set(xscale="log", yscale="log", xlim=(215, 5000), ylim=(9e3, 1.6e6))
-    axes.set_xticks(
-        ticks := [256, 512, 1024, 2048, 4096], [str(tick) for tick in ticks], fontsize=14
-    )
-    axes.set_yticks(
-        ticks := [10_000, 100_000, 1_000_000], [f"{tick:,}" for tick in ticks], fontsize=14
-    )
+    ticks = [256, 512, 1024, 2048, 4096]
+    axes.set_xticks(ticks, [str(tick) for tick in ticks], fontsize=14)
+    ticks = [10_000, 100_000, 1_000_000]
+    axes.set_yticks(ticks, [f"{tick:,}" for tick in ticks], fontsize=14)
     axes.minorticks_off()
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

@@ -1,5 +1,4 @@
-"""Renders the clips of the documentation: typical episodes of the shipped policies, and of scripted
-teams of any size.
+"""Renders the clips of the documentation, of shipped policies and of scripted teams of any size.
 
 `python tools/clips.py [NAME ...]` writes docs/clips/NAME.webp of each task or entry of `SIZES`
 (without names, of all), and docs/teams.webp from all clips, side by side. Each shows how the median
@@ -26,14 +25,12 @@ from mqe_jax.viz.recording import record_episodes, typical
 from mqe_jax.viz.render import render_frames
 
 DOCS = Path(__file__).parents[1] / "docs"
-# AFTER: duration shown after the success, s
 EPISODES = 48
 SECONDS = 4.4
-AFTER = 1.2
+AFTER = 1.2  # duration shown after the success, s
 FPS = 10.0
-# SMALL: of clips with many moving bodies
 SIZE = (640, 360)
-SMALL = (480, 270)
+SMALL = (480, 270)  # of clips with many moving bodies
 TILE = (240, 135)
 COLUMNS = 4
 SIZES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -53,20 +50,15 @@ def write(name: str) -> None:
     policy = scripted if name in SIZES else load_policy(task, env)
     seats = Seats.of_teams(env, *[policy, scripted][: len(env.teams)])
     limit = env.params.episode_length
-    episode = typical(
-        record_episodes(env, seats, jax.random.PRNGKey(0), episodes=EPISODES, seconds=limit)
-    )
+    key = jax.random.PRNGKey(0)
+    episode = typical(record_episodes(env, seats, key, episodes=EPISODES, seconds=limit))
     end = min(round(max(episode.settled + AFTER, SECONDS) / episode.dt), len(episode))
-    shown = episode.cut(
-        slice(max(0, end - round(SECONDS / episode.dt)), end, round(1 / (FPS * episode.dt)))
-    )
+    start = max(0, end - round(SECONDS / episode.dt))
+    shown = episode.cut(slice(start, end, round(1 / (FPS * episode.dt))))
     size = SMALL if name in SIZES else SIZE
     views = cameras(rendering_model(env.mj_model, shown), shown, "near", size[0] / size[1])
-    write_clip(
-        DOCS / "clips" / f"{name}.webp",
-        map(legend(env, size), render_frames(env, shown, views, size)),
-        FPS,
-    )
+    frames = map(legend(env, size), render_frames(env, shown, views, size))
+    write_clip(DOCS / "clips" / f"{name}.webp", frames, FPS)
 
 
 def tiles(name: str) -> list[np.ndarray]:
@@ -78,12 +70,10 @@ def tiles(name: str) -> list[np.ndarray]:
     with Image.open(DOCS / "clips" / f"{name}.webp") as clip:
         for frame in ImageSequence.Iterator(clip):
             tile = frame.convert("RGB").resize(TILE, Image.Resampling.LANCZOS)
-            ImageDraw.Draw(tile).rectangle(
-                (0, TILE[1] - 17, font.getlength(title) + 9, TILE[1]), fill=(28, 32, 40)
-            )
-            ImageDraw.Draw(tile).text(
-                (5, TILE[1] - 9), title, fill=(246, 246, 242), font=font, anchor="lm"
-            )
+            draw = ImageDraw.Draw(tile)
+            plate = (0, TILE[1] - 17, font.getlength(title) + 9, TILE[1])
+            draw.rectangle(plate, fill=(28, 32, 40))
+            draw.text((5, TILE[1] - 9), title, fill=(246, 246, 242), font=font, anchor="lm")
             found.append(np.asarray(tile))
     return found
 
@@ -94,9 +84,9 @@ if __name__ == "__main__":
         write(name)
     TILES = list(map(tiles, [*SHOWN[: len(SHOWN) // COLUMNS * COLUMNS], *SIZES]))
     length = max(map(len, TILES))  # a tile that ends early keeps its last frame
-    # (tasks, T, height, width, 3)
     still = np.array([tile + tile[-1:] * (length - len(tile)) for tile in TILES])
-    rows = [
-        np.concatenate(list(still[i : i + COLUMNS]), axis=2) for i in range(0, len(still), COLUMNS)
-    ]
+    rows = []
+    for first in range(0, len(still), COLUMNS):
+        row = list(still[first : first + COLUMNS])  # (T, height, width, 3) each
+        rows.append(np.concatenate(row, axis=2))
     write_clip(DOCS / "teams.webp", iter(np.concatenate(rows, axis=1)), FPS)

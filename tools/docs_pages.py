@@ -1,4 +1,4 @@
-"""MkDocs hooks: documentation pages generated from the code, and conversion of links and formulas.
+"""MkDocs hooks: pages generated from the code, and conversion of links and formulas.
 
 Generated: the pages `FILES`, one page per task (clip, sizes, observation, rewards, parameters) with
 an overview, and the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes
@@ -41,55 +41,50 @@ SETTINGS = {
 
 def on_files(files: Any, config: Any) -> Any:
     """Adds the generated pages, and the files of the page of `mqe play-site`."""
-    (reference,) = (
-        section["API reference"] for section in config["nav"] if "API reference" in section
-    )
+    named = "API reference"
+    (reference,) = (section[named] for section in config["nav"] if named in section)
     modules = {path: f"mqe_jax.{Path(path).stem}" for path in reference}
-    references = {
-        path: reference_page(module, {*modules.values()}) for path, module in modules.items()
-    }
-    for path, content in (pages() | references).items():
-        head = "".join(
-            f"---\n{text}\n---\n" for start, text in SETTINGS.items() if path.startswith(start)
-        )
+    made = pages()
+    for path, module in modules.items():
+        made[path] = reference_page(module, {*modules.values()})
+    for path, content in made.items():
+        settings = [text for start, text in SETTINGS.items() if path.startswith(start)]
+        head = "".join(f"---\n{text}\n---\n" for text in settings)
         files.append(File.generated(config, path, content=head + content))
-    for file in filter(Path.is_file, PLAY.rglob("*") if _playable() else ()):
-        path = f"play/{file.relative_to(PLAY).as_posix()}"
-        files.append(File.generated(config, path, abs_src_path=str(file)))
+    if _playable():
+        for file in filter(Path.is_file, PLAY.rglob("*")):
+            path = f"play/{file.relative_to(PLAY).as_posix()}"
+            files.append(File.generated(config, path, abs_src_path=str(file)))
     return files
 
 
 def repository() -> str:
-    """Returns the repository's address, `[project.urls]` in pyproject.toml; empty if it is not
-    set.
-    """
+    """Returns the repository's address, `[project.urls]` in pyproject.toml; empty if missing."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return project.get("urls", {}).get("Repository", "").rstrip("/")
 
 
 def on_config(config: Any) -> Any:
     """Sets the repository's address, from which the theme makes the link in the header."""
-    if address := repository():
+    address = repository()
+    if address:
         config["repo_url"] = address
         config["repo_name"] = "/".join(address.split("/")[-2:])
     return config
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Converts links and formulas of a page; the one about playing leads to the page of `mqe
-    play-site`.
-    """
+    """Converts links and formulas of a page; the page about playing gets its link."""
     if page.file.src_uri == "play.md":
         markdown = play_link(markdown, _playable())
     return formulas(links(markdown, repository(), posixpath.dirname(page.file.src_uri)))
 
 
 def links(markdown: str, address: str = "", folder: str = "") -> str:
-    """Leads links to files outside docs/, from a page in a folder of it, to the repository's
-    address.
+    """Leads links to files outside docs/ to the repository's address.
 
-    Notebooks get links to Colab and Kaggle too, if the address is on GitHub. Without an address
-    links become the file's name and path.
+    The page is in a folder of docs/. Notebooks get links to Colab and Kaggle too, if the address is
+    on GitHub. Without an address links become the file's name and path.
     """
 
     def resolve(match: re.Match[str]) -> str:
@@ -101,9 +96,8 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
         if name in FILES:
             return f"[{text}]({posixpath.relpath(FILES[name], folder or '.')}{mark}{heading})"
         if not address:
-            return (
-                text if path.endswith(text.replace("\\", "").rstrip("/")) else f"{text} (`{path}`)"
-            )
+            named = path.endswith(text.replace("\\", "").rstrip("/"))
+            return text if named else f"{text} (`{path}`)"
         link = f"[{text}]({address}/blob/main/{path})"
         hub = address.partition("https://github.com/")[2]
         colab = f"https://colab.research.google.com/github/{hub}/blob/main/{path}"
@@ -115,15 +109,18 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
 
 
 def play_link(markdown: str, present: bool) -> str:
-    """Puts the link to the page of `mqe play-site` below the title, or how to build it if it is
-    missing.
+    """Puts the link to the page of `mqe play-site` below the title.
+
+    If the page is missing, the text says how to build it.
     """
-    absent = (
+    text = (
         "This copy of the documentation was built without the page: run `make docs`, or the "
         "commands below."
     )
+    if present:
+        text = "**[Open the page](play/index.html)**"
     title, _, rest = markdown.partition("\n")
-    return f"{title}\n\n{'**[Open the page](play/index.html)**' if present else absent}\n{rest}"
+    return f"{title}\n\n{text}\n{rest}"
 
 
 def _playable() -> bool:
@@ -134,11 +131,8 @@ def formulas(markdown: str) -> str:
     """Replaces $$...$$ and $...$ outside of code by MathML."""
 
     def block(match: re.Match[str]) -> str:
-        return (
-            "\n"
-            + latex2mathml.converter.convert(match.group(1).replace("\n", " "), display="block")
-            + "\n"
-        )
+        latex = match.group(1).replace("\n", " ")
+        return f"\n{latex2mathml.converter.convert(latex, display='block')}\n"
 
     def inline(match: re.Match[str]) -> str:
         return latex2mathml.converter.convert(match.group(1))
@@ -171,8 +165,9 @@ def reference_page(module: str, pages: set[str]) -> str:
 
 
 def front(readme: str) -> str:
-    """Returns a file of the repository as a page: its links as from docs/, tasks linked to their
-    pages.
+    """Returns a file of the repository as a page of docs/.
+
+    Its links are as from docs/, and tasks lead to their pages.
     """
     page = re.sub(r"\]\((?![a-z]+:)([^)]+)\)", r"](../\1)", readme).replace("](../docs/", "](")
     return re.sub(
@@ -185,32 +180,25 @@ def overview(tasks: Mapping[str, Any]) -> str:
     kinds: dict[str, list[str]] = {"Cooperative": [], "Competitive": [], "For tests": []}
     for name, task in tasks.items():
         env = task(num_envs=1, impl="c")
-        kind = (
-            "Competitive"
-            if len(env.teams) > 1
-            else "For tests"
-            if name == "go1plane"
-            else "Cooperative"
-        )
-        image = (
-            f"[![{task.title}: {task.aim}]({_clip(name)})]({name}.md)<br>" if _clip(name) else ""
-        )
+        kind = "Competitive" if len(env.teams) > 1 else "Cooperative"
+        if name == "go1plane":
+            kind = "For tests"
+        clip = _clip(name)
+        image = f"[![{task.title}: {task.aim}]({clip})]({name}.md)<br>" if clip else ""
         robots = " vs ".join(str(len(team)) for team in env.teams)
         sizes = (
             f"{robots} robots, {env.observation_size} numbers observed by each, "
             f"{env.params.episode_length:g} s"
         )
         kinds[kind].append(f"- {image}[**{task.title}**]({name}.md) `{name}`: {sizes}")
-    galleries = [(kind, "\n".join(items)) for kind, items in kinds.items()]
     parts = [
-        f'## {kind}\n\n<div class="gallery" markdown>\n\n{items}\n\n</div>'
-        for kind, items in galleries
-    ]
-    head = (
         "# Tasks\n\nEach page has a task's observation, rewards and parameters, which are read "
         "from the code."
-    )
-    return "\n\n".join([head, *parts]) + "\n"
+    ]
+    for kind, items in kinds.items():
+        gallery = "\n".join(items)
+        parts.append(f'## {kind}\n\n<div class="gallery" markdown>\n\n{gallery}\n\n</div>')
+    return "\n\n".join(parts) + "\n"
 
 
 def task_page(task: Any) -> str:
@@ -225,14 +213,14 @@ def task_page(task: Any) -> str:
     body = next(filter(None, bodies))  # that of a base class if the task's is one line
     body = re.sub(r"see `\w+Rewards`", "the terms below", body)
     policy = "shipped" if name in zoo.names() else "scripted" if name in SCRIPTED else "forward"
-    flags, against = (
-        (" --opponent scripted", " against the scripted one") if len(env.teams) > 1 else ("", "")
-    )
-    caption = (
-        f"A typical success of the {policy} policy{against}: [how good it "
-        "is](../results/strength.md)."
-    )
-    media = [f"![{task.title}: {task.aim}]({_clip(name)})", caption] if _clip(name) else []
+    match = len(env.teams) > 1
+    flags = " --opponent scripted" if match else ""
+    against = " against the scripted one" if match else ""
+    media = []
+    if _clip(name):
+        success = f"A typical success of the {policy} policy{against}"
+        media.append(f"![{task.title}: {task.aim}]({_clip(name)})")
+        media.append(f"{success}: [how good it is](../results/strength.md).")
     commands = {
         f"mqe render {name}{flags} -o clip.webp": f"a clip of the {policy} policy",
         f"mqe view {name}{flags}": "live, in the browser",
@@ -288,8 +276,9 @@ def _meanings(cls: type[Any]) -> dict[str, str]:
 def _fields(
     kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None
 ) -> str:
-    """Returns a table of a settings class's fields, those of its base last, with the meanings that
-    docstrings give.
+    """Returns a table of a settings class's fields, those of its base last.
+
+    Docstrings give the meanings.
 
     Values are defaults, or those `given`.
     """
@@ -300,23 +289,26 @@ def _fields(
     values |= given or {}
     rows = []
     for name in sorted(values, key=lambda name: name in meanings[-1]):
-        parts = {name: (values[name], next((own[name] for own in meanings if name in own), ""))}
-        if dataclasses.is_dataclass(values[name]):  # an object of the scene
-            inner = values[name]
-            texts = _meanings(type(values[name]))
-            parts = {
-                f"{name}.{f.name}": (getattr(inner, f.name), texts[f.name])
-                for f in dataclasses.fields(inner)
-            }
-        for part, (value, text) in parts.items():
-            meaning = " ".join(text.split()).replace("|", "\\|")
-            rows.append(f"| `{part}` | {_shown(value)} | {meaning} |")
+        value = values[name]
+        if dataclasses.is_dataclass(value):  # an object of the scene
+            texts = _meanings(type(value))
+            for field in dataclasses.fields(value):
+                part = f"{name}.{field.name}"
+                rows.append(_row(part, getattr(value, field.name), texts[field.name]))
+        else:
+            rows.append(_row(name, value, next((own[name] for own in meanings if name in own), "")))
     return f"| name | {column} | meaning |\n|---|---|---|\n" + "\n".join(rows)
 
 
+def _row(name: str, value: Any, text: str) -> str:
+    meaning = " ".join(text.split()).replace("|", "\\|")
+    return f"| `{name}` | {_shown(value)} | {meaning} |"
+
+
 def _shared(kind: type[Any], base: type[Any]) -> tuple[str, ...]:
-    """Returns the fields that a settings class has from another one, with the same default, and
-    groups of settings.
+    """Returns the fields that a settings class shares with another one, and groups of settings.
+
+    Shared fields have the same default.
     """
     known = {field.name: field.default for field in dataclasses.fields(base)}
     same = [

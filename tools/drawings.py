@@ -64,37 +64,21 @@ def box(
     axes: Axes, corner: Size, size: Size, title: str, body: str, color: str, room: str = ""
 ) -> None:
     """Draws a box with a title, what it does, and the folder of its code."""
-    (x, y) = corner
-    (width, height) = size
-    style = FancyBboxPatch(
-        (x, y), width, height, "round,pad=0,rounding_size=8", fc=f"{color}18", ec=color, lw=1.6
-    )
-    axes.add_patch(style)
-    write(
-        axes, (x + 12, y + height - 24), title, 14, color, ha="left", va="baseline", weight="bold"
-    )
+    x, y = corner
+    width, height = size
+    form = "round,pad=0,rounding_size=8"
+    axes.add_patch(FancyBboxPatch(corner, width, height, form, fc=f"{color}18", ec=color, lw=1.6))
+    left = (x + 12, y + height - 24)
+    right = (x + width - 10, y + height - 24)
+    write(axes, left, title, 14, color, ha="left", va="baseline", weight="bold")
     write(axes, (x + 12, y + height - 38), body, 10.5, ha="left", va="top")
-    write(
-        axes,
-        (x + width - 10, y + height - 24),
-        room,
-        9.5,
-        FAINT,
-        ha="right",
-        va="baseline",
-        family="monospace",
-    )
+    write(axes, right, room, 9.5, FAINT, ha="right", va="baseline", family="monospace")
 
 
 def arrow(axes: Axes, start: Point, end: Point, color: str = INK, **look: object) -> None:
     """Draws an arrow."""
-    style = {
-        "arrowstyle": "-|>",
-        "mutation_scale": 15,
-        "lw": 1.8,
-        "shrinkA": 0,
-        "shrinkB": 0,
-    } | look
+    style = {"arrowstyle": "-|>", "mutation_scale": 15, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
+    style |= look
     axes.add_patch(FancyArrowPatch(start, end, color=color, **style))  # pyright: ignore[reportArgumentType]
 
 
@@ -103,11 +87,10 @@ def robot(
 ) -> None:
     """Draws a robot from above, at x, y and yaw; `scale` is the length of its trunk."""
     x, y, yaw = pose
-    outline = (
-        np.array([[-0.5, -0.25], [0.25, -0.25], [0.55, 0], [0.25, 0.25], [-0.5, 0.25]]) * scale
-    )
+    outline = np.array([[-0.5, -0.25], [0.25, -0.25], [0.55, 0], [0.25, 0.25], [-0.5, 0.25]])
     turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    axes.add_patch(Polygon(outline @ turn + (x, y), fc=color, ec="white", lw=1.2, zorder=4))
+    corners = scale * outline @ turn + (x, y)
+    axes.add_patch(Polygon(corners, fc=color, ec="white", lw=1.2, zorder=4))
     if name:
         write(axes, (x, y), name, 9, "white", weight="bold", zorder=5)
 
@@ -121,125 +104,48 @@ def architecture() -> Figure:
     top = 436
     middle = 256
     bottom = 76
-    boxes = (
-        (
-            left,
-            top,
-            "Learner",
-            "train/",
-            VIOLET,
-            "PPO: improves the policy.\nKnows no task, no robot,\nno physics.",
-        ),
-        (
-            right,
-            top,
-            "Opponents",
-            "selfplay/",
-            VIOLET,
-            "Act for the other team:\nscripted, trained, or\nearlier versions.",
-        ),
-        (
-            left,
-            middle,
-            "Policy",
-            "train/",
-            BLUE,
-            "Maps each robot's\nobservation to its action,\nin [-1, 1].",
-        ),
-        (
-            right,
-            middle,
-            "Skill",
-            "skills/",
-            BLUE,
-            "Turns an action into a\nvelocity command, then\ninto joint targets.",
-        ),
-        (
-            left,
-            bottom,
-            "Task",
-            "envs/",
-            GREEN,
-            "Sets the scene, observes,\nrewards, ends episodes.",
-        ),
-        (right, bottom, "Engine", "physics/", GREEN, "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."),
-    )
-    for x, y, title, room, color, body in boxes:
-        box(axes, (x, y), size, title, body, color, room)
+    body = "PPO: improves the policy.\nKnows no task, no robot,\nno physics."
+    box(axes, (left, top), size, "Learner", body, VIOLET, "train/")
+    body = "Act for the other team:\nscripted, trained, or\nearlier versions."
+    box(axes, (right, top), size, "Opponents", body, VIOLET, "selfplay/")
+    body = "Maps each robot's\nobservation to its action,\nin [-1, 1]."
+    box(axes, (left, middle), size, "Policy", body, BLUE, "train/")
+    body = "Turns an action into a\nvelocity command, then\ninto joint targets."
+    box(axes, (right, middle), size, "Skill", body, BLUE, "skills/")
+    body = "Sets the scene, observes,\nrewards, ends episodes."
+    box(axes, (left, bottom), size, "Task", body, GREEN, "envs/")
+    body = "MuJoCo C, MJX or Warp:\nfour steps of 5 ms."
+    box(axes, (right, bottom), size, "Engine", body, GREEN, "physics/")
     inner = left + size[0]
     mid = WIDTH / 2
     down = right + 70
-    # from, to, what, where that is written, whether to the left, the middle or the right
-    arrows = (
-        (
-            (inner, middle + 56),
-            (right, middle + 56),
-            BLUE,
-            "actions",
-            (mid + 12, middle + 70),
-            "center",
-        ),
-        ((down, middle), (down, bottom + 112), BLUE, "joint targets", (down + 10, 222), "left"),
-        (
-            (right, bottom + 56),
-            (inner, bottom + 56),
-            GREEN,
-            "poses,\nvelocities,\ncontacts",
-            (mid + 12, 164),
-            "center",
-        ),
-        (
-            (left + 150, bottom + 112),
-            (left + 150, middle),
-            GREEN,
-            "observations",
-            (left + 140, 222),
-            "right",
-        ),
-        (
-            (left + 40, middle + 112),
-            (left + 40, top),
-            VIOLET,
-            "observations,\nactions",
-            (left + 50, 402),
-            "left",
-        ),
-        (
-            (left + 190, top),
-            (left + 190, middle + 112),
-            VIOLET,
-            "weights",
-            (left + 200, 402),
-            "left",
-        ),
-        (
-            (inner, top + 56),
-            (right, top + 56),
-            VIOLET,
-            "copies of\nthe policy",
-            (mid + 12, top + 78),
-            "center",
-        ),
-        (
-            (down, top),
-            (down, middle + 112),
-            VIOLET,
-            "actions of the\nother team",
-            (down + 10, 402),
-            "left",
-        ),
-    )
-    for start, end, color, text, at, side in arrows:
+
+    def flow(start: Point, end: Point, color: str, text: str, at: Point, side: str) -> None:
         loop = color != VIOLET
         arrow(axes, start, end, color, lw=2.6 if loop else 1.8)
         write(axes, at, text, 11, color, ha=side, weight="bold" if loop else "normal")
-    axes.plot(
-        [left, 16, 16],
-        [bottom + 56, bottom + 56, top + 56],
-        color=VIOLET,
-        lw=1.8,
-        solid_joinstyle="round",
-    )
+
+    level = middle + 56
+    flow((inner, level), (right, level), BLUE, "actions", (mid + 12, middle + 70), "center")
+    text = "joint targets"
+    flow((down, middle), (down, bottom + 112), BLUE, text, (down + 10, 222), "left")
+    level = bottom + 56
+    text = "poses,\nvelocities,\ncontacts"
+    flow((right, level), (inner, level), GREEN, text, (mid + 12, 164), "center")
+    at = left + 150
+    flow((at, bottom + 112), (at, middle), GREEN, "observations", (at - 10, 222), "right")
+    at = left + 40
+    text = "observations,\nactions"
+    flow((at, middle + 112), (at, top), VIOLET, text, (at + 10, 402), "left")
+    at = left + 190
+    flow((at, top), (at, middle + 112), VIOLET, "weights", (at + 10, 402), "left")
+    level = top + 56
+    text = "copies of\nthe policy"
+    flow((inner, level), (right, level), VIOLET, text, (mid + 12, top + 78), "center")
+    text = "actions of the\nother team"
+    flow((down, top), (down, middle + 112), VIOLET, text, (down + 10, 402), "left")
+    heights = [bottom + 56, bottom + 56, top + 56]
+    axes.plot([left, 16, 16], heights, color=VIOLET, lw=1.8, solid_joinstyle="round")
     arrow(axes, (16, top + 56), (left, top + 56), VIOLET)
     write(axes, (29, middle + 56), "rewards", 11, VIOLET, rotation=90)
     write(axes, (mid + 12, 228), "one round:\n20 ms", 11.5, INK, weight="bold")
@@ -256,27 +162,21 @@ def observation() -> Figure:
     scale = 100
     origin = (24, 310)
 
-    def at(x, y):
+    def at(x: float, y: float) -> Size:
         return (origin[0] + scale * x, origin[1] + scale * y)
 
     colors = {"one_hot": GREY, "base": BLUE, "teammate": ORANGE, "gate": GREEN}
     width = env.params.track_width
-    axes.add_patch(
-        Rectangle(at(0, -width / 2), 6 * scale - 8, width * scale, fc="#f4f5f7", ec=LINE, lw=1)
-    )
+    corner = at(0, -width / 2)
+    axes.add_patch(Rectangle(corner, 6 * scale - 8, width * scale, fc="#f4f5f7", ec=LINE, lw=1))
     gate = (3.5, 0.3)
     for wall in env.compiled.layout.walls:
         x, y, _ = np.add(wall.center, (*gate, 0))
         low = max(y - wall.size[1] / 2, -width / 2)
         high = min(y + wall.size[1] / 2, width / 2)
-        axes.add_patch(
-            Rectangle(
-                at(x - wall.size[0] / 2, low),
-                wall.size[0] * scale,
-                (high - low) * scale,
-                fc="#c9ced6",
-            )
-        )
+        corner = at(x - wall.size[0] / 2, low)
+        size = (wall.size[0] * scale, (high - low) * scale)
+        axes.add_patch(Rectangle(corner, *size, fc="#c9ced6"))
     own = (1.3, -0.65, 0.35)
     mate = (1.9, 0.75, -0.1)
     for pose, color, name in ((own, BLUE, "0"), (mate, ORANGE, "1")):
@@ -299,22 +199,14 @@ def observation() -> Figure:
         "gate": ["x", "y"],
     }
     blocks = env.observation_layout.blocks
-    assert {block.name: block.width for block in blocks} == {
-        name: len(cells) for name, cells in names.items()
-    }
+    widths = {name: len(cells) for name, cells in names.items()}
+    assert {block.name: block.width for block in blocks} == widths
     cell = 37
     x = 24
     for block in blocks:
         color = colors[block.name]
-        write(
-            axes,
-            (x + cell * block.width / 2, 116),
-            block.name,
-            11,
-            color,
-            family="monospace",
-            weight="bold",
-        )
+        middle = (x + cell * block.width / 2, 116)
+        write(axes, middle, block.name, 11, color, family="monospace", weight="bold")
         for text in names[block.name]:
             axes.add_patch(Rectangle((x, 66), cell, 38, fc=f"{color}22", ec=color, lw=1.2))
             write(axes, (x + cell / 2, 82), text, 9.5, va="baseline")
@@ -326,60 +218,38 @@ def observation() -> Figure:
 
 
 def match_frames() -> Figure:
-    """One moment of two matches, as each team observes it: after a half turn, and after a
-    reflection.
-    """
+    """One moment of two matches as each team observes it: after a half turn, after a reflection."""
     figure, axes = canvas(590)
     football = ((4.6, 1.9, -0.5), (10.2, -0.6, 2.9))
     door = ((1.4, -0.55, 0.5), (0.95, 0.85, 0.1))
-    rows = (
-        (
-            "go1football-1vs1",
-            "Football: team 1 sees the field after a half turn",
-            572,
-            350,
-            22.0,
-            football,
-        ),
-        (
-            "go1revolvingdoor",
-            "Revolving Door: team 1 sees the field reflected",
-            280,
-            76,
-            51.0,
-            door,
-        ),
-    )
-    for name, title, top, bottom, scale, poses in rows:
-        env = mqe_jax.make(name, impl="c")
-        assert isinstance(env, Match)
-        write(axes, (WIDTH / 2, top), title, 12, weight="bold")
-        for team in (0, 1):
-            _seen_by(axes, env, team, poses, (16 + team * 316, bottom), scale)
-    write(
-        axes,
-        (WIDTH / 2, 26),
-        "Each team finds itself on the same side, so one policy can play both.",
-        11,
-        FAINT,
-    )
+    title = "Football: team 1 sees the field after a half turn"
+    write(axes, (WIDTH / 2, 572), title, 12, weight="bold")
+    for team in (0, 1):
+        _seen_by(axes, "go1football-1vs1", team, football, (16 + team * 316, 350), 22.0)
+    title = "Revolving Door: team 1 sees the field reflected"
+    write(axes, (WIDTH / 2, 280), title, 12, weight="bold")
+    for team in (0, 1):
+        _seen_by(axes, "go1revolvingdoor", team, door, (16 + team * 316, 76), 51.0)
+    text = "Each team finds itself on the same side, so one policy can play both."
+    write(axes, (WIDTH / 2, 26), text, 11, FAINT)
     return figure
 
 
 def _seen_by(
-    axes: Axes, env: Match, team: int, poses: Sequence[Sequence[float]], corner: Size, scale: float
+    axes: Axes, task: str, team: int, poses: Sequence[Sequence[float]], corner: Size, scale: float
 ) -> None:
-    """Draws a match for two from above in the frame of a team; `poses` are x, y, yaw in the frame
-    of team 0.
-    """
-    (length, width) = (
-        float(np.ptp([x.point[i] for x in env.compiled.layout.barriers])) for i in (0, 1)
-    )
+    """Draws a match for two from above in the frame of a team.
 
-    def at(point):
+    `poses` are x, y, yaw in the frame of team 0.
+    """
+    env = mqe_jax.make(task, impl="c")
+    assert isinstance(env, Match)
+    length, width = np.ptp([x.point for x in env.compiled.layout.barriers], axis=0).tolist()
+
+    def at(point: Point) -> Size:
         return (corner[0] + scale * point[0], corner[1] + scale * (point[1] + width / 2))
 
-    def seen(x, y):
+    def seen(x: float, y: float) -> np.ndarray:
         return np.asarray(env.view_points(jnp.array([x, y, 0.0])))[team, :2]
 
     axes.add_patch(Rectangle(corner, length * scale, width * scale, fc="#eef2ee", ec=LINE, lw=1))
@@ -391,9 +261,8 @@ def _seen_by(
     if "ball" in env.objects:
         axes.plot(*at(seen(6.6, 1.2)), "o", color="white", mec=INK, ms=8, zorder=5)
     if "door" in env.objects:
-        tips = [
-            at(seen(2.6 + 0.97 * np.sin(0.5) * sign, 0.97 * np.cos(0.5) * sign)) for sign in (-1, 1)
-        ]
+        tip = 0.97 * np.array([np.sin(0.5), np.cos(0.5)])
+        tips = [at(seen(2.6 + sign * tip[0], sign * tip[1])) for sign in (-1, 1)]
         axes.plot(*zip(*tips, strict=True), color=INK, lw=4, solid_capstyle="round")
     info = jnp.array([(x, y, 0.3, 0.0, 0.0, yaw) for x, y, yaw in poses])
     for number, (x, y, _, _, _, yaw) in enumerate(np.asarray(env.views(info))[team]):
@@ -405,22 +274,14 @@ def _seen_by(
     for along, name in ((np.array([34, 0]), "x"), (np.array([0, 34]), "y")):
         arrow(axes, start, start + along, mutation_scale=10)
         write(axes, start + 1.3 * along, name, 10, weight="bold")
-    write(
-        axes,
-        np.add(corner, (length * scale / 2, -15)),
-        f"as team {team} observes it",
-        11,
-        color,
-        weight="bold",
-    )
+    below = np.add(corner, (length * scale / 2, -15))
+    write(axes, below, f"as team {team} observes it", 11, color, weight="bold")
 
 
 def league() -> Figure:
-    """Whom a policy meets in a league: itself, its earlier versions, and fixed opponents, in equal
-    shares.
-    """
+    """Whom a policy meets in a league, equally often: itself, earlier versions, fixed opponents."""
     config = resolve("go1tug", "league")
-    steps = 1 * config.league.snapshot_steps / 1e6
+    steps = config.league.snapshot_steps / 1e6
     quarter = 0.25 * config.league.snapshot_steps / 1e6
     own = {"newest": BLUE, "older": VIOLET, "uniform": VIOLET}
     names = sorted(config.opponents, key=lambda name: [*own].index(name) if name in own else -1)
@@ -429,9 +290,8 @@ def league() -> Figure:
     top = 392
     left = 226
     width = 150
-    write(
-        axes, (left + width / 2, top + 22), f"{config.num_envs} matches at once", 12, weight="bold"
-    )
+    title = f"{config.num_envs} matches at once"
+    write(axes, (left + width / 2, top + 22), title, 12, weight="bold")
     for number, name in enumerate(names):
         color = own.get(name, GREEN)
         y = top - row * (number + 1)
@@ -439,20 +299,12 @@ def league() -> Figure:
         write(axes, (left + width / 2, y + row / 2), f"against {name}", 10.5, color)
     box(axes, (16, 40), (150, 346), "Policy", "plays team 0\nand learns", BLUE)
     right = 424
-    pool = (
-        f"{config.league.members} earlier versions.\nolder: one that it beats\nless often than "
-        "others\n"
-    )
-    pool += "uniform: any of them"
+    fixed = "scripted, idle, random,\nor a trained team\nfrom a file"
+    pool = f"{config.league.members} earlier versions.\n"
+    pool += "older: one that it beats\nless often than others\nuniform: any of them"
     count = sum(name not in own for name in names)
     ends = {
-        GREEN: (
-            "Fixed opponents",
-            "scripted, idle, random,\nor a trained team\nfrom a file",
-            252,
-            134,
-            range(count),
-        ),
+        GREEN: ("Fixed opponents", fixed, 252, 134, range(count)),
         BLUE: ("The policy itself", "as it is now", 184, 60, [count]),
         VIOLET: ("Pool", pool, 26, 150, range(count + 1, len(names))),
     }
@@ -460,14 +312,8 @@ def league() -> Figure:
         box(axes, (right, bottom), (200, height), title, body, color)
         for number in rows:
             y = top - row * (number + 0.5)
-            arrow(
-                axes,
-                (right, min(y, bottom + height - 10)),
-                (left + width, y),
-                color,
-                lw=1.3,
-                mutation_scale=10,
-            )
+            start = (right, min(y, bottom + height - 10))
+            arrow(axes, start, (left + width, y), color, lw=1.3, mutation_scale=10)
     arrow(axes, (166, 270), (left, 270), BLUE)
     write(axes, (196, 284), "acts", 10.5, BLUE)
     arrow(axes, (left, 210), (166, 210), BLUE)
@@ -480,30 +326,26 @@ def league() -> Figure:
 
 
 DRAWINGS: dict[str, Callable[[], Figure]] = {
-    each.__name__: each
-    for each in (
-        architecture,
-        observation,
-        match_frames,
-        league,
-        curves,
-        students,
-        levers,
-        sizes,
-        performance,
-    )
+    "architecture": architecture,
+    "observation": observation,
+    "match_frames": match_frames,
+    "league": league,
+    "curves": curves,
+    "students": students,
+    "levers": levers,
+    "sizes": sizes,
+    "performance": performance,
 }
 
 
 def main(folder: Path = FOLDER, form: str = "svg") -> None:
     """Writes all drawings into a folder, as svg or png files."""
     folder.mkdir(parents=True, exist_ok=True)
+    metadata = {"Date": None} if form == "svg" else {}
     for name, draw in DRAWINGS.items():
-        with (
-            matplotlib.rc_context({"svg.hashsalt": name}),
-            replacing(folder / f"{name}.{form}") as temporary,
-        ):
-            draw().savefig(temporary, format=form, metadata={"Date": None} if form == "svg" else {})
+        file = folder / f"{name}.{form}"
+        with matplotlib.rc_context({"svg.hashsalt": name}), replacing(file) as temporary:
+            draw().savefig(temporary, format=form, metadata=metadata)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
-"""Builds the wheel and its bill of materials, and tries the README and the quickstart with it, in
-an empty environment.
+"""Builds the wheel and its bill of materials, and tries them in an empty environment.
+
+It runs the commands of the README and the quickstart.
 
 `python tools/release.py [--tag TAG]` writes into dist/. All files must name the same version, and
 with a tag that of the tag. The commands run in another folder, from which the source tree cannot be
@@ -69,28 +70,19 @@ def main() -> None:
     (wheel,) = DIST.glob("*.whl")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        programs = new_environment(
-            folder / "venv", "-c", ROOT / "constraints.txt", f"{wheel}[render,notebook]"
-        )
+        constraints = ("-c", ROOT / "constraints.txt")
+        programs = new_environment(folder / "venv", *constraints, f"{wheel}[render,notebook]")
         tools = new_environment(folder / "tools", *project["optional-dependencies"]["release"])
-        run(
-            tools / "cyclonedx-py",
-            "environment",
-            programs / "python",
-            "--output-file",
-            wheel.with_suffix(".cdx.json"),
-        )
+        bill = ("--output-file", wheel.with_suffix(".cdx.json"))
+        run(tools / "cyclonedx-py", "environment", programs / "python", *bill)
         readme = (ROOT / "README.md").read_text(encoding="utf-8")
         for program in re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE):
             run(programs / "python", "-c", program, folder=folder)
-        run(
-            programs / "jupyter",
-            "execute",
-            ROOT / "examples" / "notebooks" / "quickstart.ipynb",
-            folder=folder,
-        )
+        notebook = ROOT / "examples" / "notebooks" / "quickstart.ipynb"
+        run(programs / "jupyter", "execute", notebook, folder=folder)
         for block in re.findall(r"^```bash\n(.*?)^```", readme, re.DOTALL | re.MULTILINE):
-            for words in (shlex.split(line, comments=True) for line in block.splitlines()):
+            for line in block.splitlines():
+                words = shlex.split(line, comments=True)
                 if words[:1] == ["mqe"]:
                     run(programs / "mqe", *words[1:], *SHORTER[words[1]].split(), folder=folder)
     print(f"release: {wheel.relative_to(ROOT)}")

@@ -1,5 +1,6 @@
-"""Ships the policy of a run for its task: measures it with the float16 weights that it ships,
-writes it with its card.
+"""Ships the policy of a run for its task, with its card.
+
+It measures the policy with the float16 weights that it ships.
 
 `python tools/ship.py RUN --mode deterministic --command "mqe train go1gate --seed 3" --date
 2026-11-27 --note "The best of five seeds, after 40.0 M steps. It trained on one H100."`
@@ -29,26 +30,21 @@ def measure(run: str, task: str, episodes: int, deterministic: bool) -> dict[str
     match = issubclass(TASKS[task], Match)
     sides = "both" if match else None
     for opponent in ("random", "idle", "scripted") if match else (None,):
-        options = {
-            "episodes": episodes,
-            "deterministic": deterministic,
-            "impl": "c",
-            "sides": sides or "first",
-        }
+        options: dict[str, Any] = {"episodes": episodes, "deterministic": deterministic}
+        options |= {"impl": "c", "sides": sides or "first"}
         found = evaluate(run, opponent=opponent, **options).to_dict()
-        rates = (
-            {f"win/{opponent}": found["win_rate"]} if match else {"success": found["success_rate"]}
-        )
-        rates |= {"loss/scripted": found["loss_rate"]} if opponent == "scripted" else {}
-        results |= {
-            x: {"value": round(rate, DIGITS), "episodes": episodes, "sides": sides}
-            for x, rate in rates.items()
-        }
-        endings = {
-            x.removeprefix("ending/"): round(found[x], DIGITS)
-            for x in found
-            if x.startswith("ending/")
-        }
+        rates = {}
+        if match:
+            rates[f"win/{opponent}"] = found["win_rate"]
+        else:
+            rates["success"] = found["success_rate"]
+        if opponent == "scripted":
+            rates["loss/scripted"] = found["loss_rate"]
+        for name, rate in rates.items():
+            value = round(rate, DIGITS)
+            results[name] = {"value": value, "episodes": episodes, "sides": sides}
+        causes = [name for name in found if name.startswith("ending/")]
+        endings = {name.removeprefix("ending/"): round(found[name], DIGITS) for name in causes}
     return {"results": results, "endings": endings}
 
 
@@ -66,7 +62,6 @@ if __name__ == "__main__":
     policy = load_policy(given.pop("run"))
     with TemporaryDirectory() as folder:
         rounded = str(save_policy(folder, policy, half=True))
-        given |= measure(
-            rounded, policy.task, given.pop("episodes"), given["mode"] == "deterministic"
-        )
+        means = given["mode"] == "deterministic"
+        given |= measure(rounded, policy.task, given.pop("episodes"), means)
     print(zoo.ship(policy, build(zoo.Card, given)))

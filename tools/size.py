@@ -1,8 +1,7 @@
-"""Count the statements of Python files: `python tools/size.py mqe_jax tests lab` prints a folder a
-line.
+"""Counts the statements of Python files: `python tools/size.py mqe_jax tests lab`.
 
-A docstring counts nothing. `a, b = x, y` counts as two statements, and a walrus counts as an
-assignment, so packing statements into one line does not make code smaller.
+It prints a folder a line. A docstring counts nothing. `a, b = x, y` counts as two statements, and a
+walrus counts as an assignment, so packing statements into one line does not make code smaller.
 """
 
 import argparse
