@@ -1,9 +1,8 @@
-"""Trains Climb on Seesaw with Brax's own PPO through the Brax adapter; prints and writes its
-evaluations.
+"""Trains Climb on Seesaw with Brax's own PPO through the Brax adapter.
 
     python examples/brax_ppo.py --csv brax_ppo.csv
 
-needs `pip install -e '.[brax]'`, in the repository's folder.
+prints and writes the evaluations. It needs `pip install -e '.[brax]'`, in the repository's folder.
 """
 
 import argparse
@@ -33,8 +32,9 @@ def train(
     num_envs: int = NUM_ENVS,
     eval_envs: int = EVAL_ENVS,
 ) -> list[dict[str, float]]:
-    """Trains once; returns rows of seed, environment steps, mean and standard error of the return,
-    length.
+    """Trains once and returns a row of each evaluation.
+
+    Its columns are seed, environment steps, mean and standard error of the return, and length.
     """
     rows = []
 

@@ -1,9 +1,8 @@
-"""A custom network: each actor's input is the agent's observation and the mean of all agents'
-encoded observations.
+"""A custom network: its actors see the mean of all agents' encoded observations.
 
-`python examples/custom_network.py` trains it for a minute on a CPU, on the environment of
-foreign_env.py. Once registered, it is selected by `network: {name: mean_field}` in YAML like the
-package's networks.
+Each actor's input is the agent's observation beside that mean. `python examples/custom_network.py`
+trains it for a minute on a CPU, on the environment of foreign_env.py. Once it is registered,
+`network: {name: mean_field}` in YAML selects it like the package's networks.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.settings import PositiveInt
-from mqe_jax.core.types import NetworkMemory
+from mqe_jax.core.types import NetworkMemory, Params
 from mqe_jax.train import nn
 from mqe_jax.train.loss import entropy, log_prob
 from mqe_jax.train.networks import ChunkResult, EnvDims, Network, NetworkSettings, register_network
@@ -35,12 +34,10 @@ class MeanField(NetworkSettings):
                 "actor": (2 * self.width, self.width, dims.action),
                 "critic": (2 * self.width, self.width, 1),
             }
-            keys = jax.random.split(key, 3)
-            params = {
-                name: nn.mlp_init(k, sizes[name], final_scale=0.1)
-                for k, name in zip(keys, sizes, strict=True)
-            }
-            return {**params, "log_std": jnp.full(dims.action, -0.5)}
+            params: Params = {"log_std": jnp.full(dims.action, -0.5)}
+            for name, own_key in zip(sizes, jax.random.split(key, 3), strict=True):
+                params[name] = nn.mlp_init(own_key, sizes[name], final_scale=0.1)
+            return params
 
         def encode(params, obs, active):
             own = nn.mlp(params["encoder"], obs, activate_last=True)
@@ -49,12 +46,10 @@ class MeanField(NetworkSettings):
 
         def act(params, memory, obs, key, active=None):
             mean = nn.mlp(params["actor"], encode(params, obs, active))
-            noise = (
-                0.0
-                if key is None
-                else jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape)
-            )
-            return mean + noise, log_prob(mean + noise, mean, params["log_std"]), memory
+            action = mean
+            if key is not None:
+                action += jnp.exp(params["log_std"]) * jax.random.normal(key, mean.shape)
+            return action, log_prob(action, mean, params["log_std"]), memory
 
         def value(params, memory, is_first, obs, privileged, active=None):
             return nn.mlp(params["critic"], encode(params, obs, active))[..., 0], memory
@@ -68,13 +63,12 @@ class MeanField(NetworkSettings):
         def policy_params(params):
             return {name: params[name] for name in ("encoder", "actor", "log_std")}
 
-        return Network(
-            init, policy_params, lambda num_envs: NetworkMemory((), ()), act, value, evaluate
-        )
+        def initial_memory(num_envs):
+            return NetworkMemory((), ())
+
+        return Network(init, policy_params, initial_memory, act, value, evaluate)
 
 
 if __name__ == "__main__":
-    history = foreign_env.main(network={"name": "mean_field", "width": 64})
-    print(
-        f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after"
-    )
+    first, *_, last = foreign_env.main(network={"name": "mean_field", "width": 64})
+    print(f"distance at the end of an episode: {first:.2f} m before, {last:.2f} m after")

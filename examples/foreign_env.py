@@ -1,8 +1,7 @@
-"""Trains on an environment outside the package: two points on a plane that must meet, without
-robots or physics engine.
+"""Trains on an environment outside the package, without robots or physics engine.
 
-`python examples/foreign_env.py` prints the distance at the end of episodes before and after; a
-minute on a CPU.
+Two points on a plane must meet. `python examples/foreign_env.py` prints the distance at the end of
+episodes before and after; a minute on a CPU.
 """
 
 from __future__ import annotations
@@ -51,8 +50,9 @@ def distance(position: jax.Array) -> jax.Array:
 
 
 class Meeting:
-    """Agents start within 1 m of the origin and move by at most 0.1 m a step; the episode is
-    truncated after 20 steps.
+    """Agents start within 1 m of the origin and move by at most 0.1 m a step.
+
+    The episode is truncated after 20 steps.
 
     Observation: one-hot agent 2, own position 2, offset to the other agent 2. Reward, shared: minus
     the distance.
@@ -83,16 +83,25 @@ class Meeting:
         done = zero > 0
         step = zero.astype(jnp.int32)
         reward = jnp.zeros((self.num_envs, 2))
-        results = self.outcome(zero), {"average_step_reward": zero}
         return State(
-            position, step, key, obs, privileged, obs, privileged, reward, done, done, *results
+            position=position,
+            step=step,
+            key=key,
+            obs=obs,
+            privileged_obs=privileged,
+            final_obs=obs,
+            final_privileged_obs=privileged,
+            reward=reward,
+            terminated=done,
+            truncated=done,
+            outcome=self.outcome(zero),
+            metrics={"average_step_reward": zero},
         )
 
     def outcome(self, apart: jax.Array) -> Outcome:
         """Returns success, and the distance, m, of the only team (N, 1) each."""
-        return Outcome(
-            success=(apart < 0.1).astype(jnp.float32)[:, None], further={"distance": apart[:, None]}
-        )
+        success = (apart < 0.1).astype(jnp.float32)
+        return Outcome(success=success[:, None], further={"distance": apart[:, None]})
 
     def step(self, state: State, action: jax.Array) -> State:
         """Moves the agents, with automatic reset."""
@@ -134,18 +143,15 @@ def main(num_envs: int = 64, updates: int = 100, **settings: object) -> list[flo
         },
     )
     distances: list[float] = []
+
+    def note(state: object, row: dict[str, float]) -> None:
+        distances.append(row["success/distance"])
+
     with tempfile.TemporaryDirectory() as folder:
-        train(
-            Meeting(num_envs),
-            config,
-            folder,
-            on_update=lambda _, row: distances.append(row["success/distance"]),
-        )
+        train(Meeting(num_envs), config, folder, on_update=note)
     return distances
 
 
 if __name__ == "__main__":
-    history = main()
-    print(
-        f"distance at the end of an episode: {history[0]:.2f} m before, {history[-1]:.2f} m after"
-    )
+    first, *_, last = main()
+    print(f"distance at the end of an episode: {first:.2f} m before, {last:.2f} m after")

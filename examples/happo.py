@@ -1,9 +1,9 @@
-"""HAPPO: each agent has its own actor, and the actors learn one after the other (Kuba et al., arXiv
-2109.11251).
+"""HAPPO: each agent has its own actor, and the actors learn one after the other.
 
 The advantage of an actor's turn is multiplied by the probability ratios of the agents that have had
-theirs, so that it responds to what they do now. `python examples/happo.py` trains Narrow Gate; a
-few minutes on a CPU. Once registered, it is selected by `stages: {name: happo}` in YAML.
+theirs, so that it responds to what they do now. Source: Kuba et al., arXiv 2109.11251. `python
+examples/happo.py` trains Narrow Gate; a few minutes on a CPU. Once registered, it is selected by
+`stages: {name: happo}` in YAML.
 """
 
 from __future__ import annotations
@@ -59,38 +59,38 @@ class Turns(Stages):
             order = jax.random.permutation(order_key, agents)
 
         def turn(before: tuple[Carry, jax.Array], inputs: tuple[jax.Array, jax.Array]) -> Any:
-            (carry, factor) = before
-            (agent, key) = inputs
+            carry, factor = before
+            agent, key = inputs
             mine = jnp.arange(agents) == agent
-            own = batch._replace(
-                advantage=batch.advantage * factor[..., None], learners=batch.learners & mine
-            )
+            advantage = batch.advantage * factor[..., None]
+            own = batch._replace(advantage=advantage, learners=batch.learners & mine)
             learned, metrics = super(Turns, self).update(carry, own, now, key)
             learned = self._of(mine, learned, carry)
             return (learned, factor * self._ratio(learned, batch)[..., agent]), metrics
 
-        start = carry, jnp.ones(batch.is_first.shape)
+        start = (carry, jnp.ones(batch.is_first.shape))
         (carry, _), metrics = jax.lax.scan(turn, start, (order, jax.random.split(key, agents)))
         return carry, jax.tree.map(jnp.mean, metrics)
 
     def _of(self, mine: jax.Array, learned: Carry, before: Carry) -> Carry:
-        """Returns what was learned, without the actors of the others (A,), whose moments would
-        still move them.
+        """Returns what was learned, without the other agents' actors; `mine` is (A,).
+
+        Adam's moments would still move those.
         """
 
         def of(new: Any, old: Any) -> Any:
-            return {**new, **where_rows(mine, *map(self.network.policy_params, (new, old)))}
+            actors = self.network.policy_params(new)
+            return {**new, **where_rows(mine, actors, self.network.policy_params(old))}
 
-        (params, adam, rate) = learned
-        (old_params, old_adam, _) = before
-        adam = adam._replace(
-            mean=of(adam.mean, old_adam.mean), square=of(adam.square, old_adam.square)
-        )
-        return of(params, old_params), adam, rate
+        params, adam, rate = learned
+        old_params, old_adam, _ = before
+        mean = of(adam.mean, old_adam.mean)
+        square = of(adam.square, old_adam.square)
+        return of(params, old_params), adam._replace(mean=mean, square=square), rate
 
     def _ratio(self, carry: Carry, batch: Batch) -> jax.Array:
         """Returns the ratios of the actions' probabilities now and at collection (L, C, A)."""
-        seen = batch.memory, batch.is_first, batch.obs, batch.privileged_obs
+        seen = (batch.memory, batch.is_first, batch.obs, batch.privileged_obs)
         new = self.network.evaluate(carry[0], *seen, batch.action, batch.active)
         ratio = jnp.exp(ratio_per_agent(new.log_prob, batch.log_prob)[..., 0])
         return jnp.where(batch.learners, ratio, 1.0)

@@ -38,9 +38,8 @@ class Pillar(TerrainBlock):
 
     def layout(self, start: float, track: Track, number: int) -> Layout:
         center = (start + self.length / 2, 0.0, track.wall_height / 2)
-        return Layout(
-            walls=(Wall(f"pillar{number}", center, (self.side, self.side, track.wall_height)),)
-        )
+        size = (self.side, self.side, track.wall_height)
+        return Layout(walls=(Wall(f"pillar{number}", center, size),))
 
 
 # Step 2: an object adds one body named `object/<name>`; its joints are its generalised coordinates.
@@ -71,9 +70,7 @@ class Mouse(Object):
 
 
 def flee(mouse: jax.Array, robot: jax.Array, speed: float, sight: float = 1.5) -> jax.Array:
-    """Returns the velocity (2,), m/s, of a mouse at (2,), m, that flees from a robot nearer than
-    `sight` m.
-    """
+    """Returns the velocity (2,), m/s, of a mouse that flees from a robot nearer than `sight`, m."""
     away = mouse - robot
     distance = jnp.maximum(jnp.linalg.norm(away), 1e-3)
     return jnp.where(distance < sight, speed * away / distance, 0.0)
@@ -134,28 +131,22 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
 
     def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
         """Sets the mouse's velocity."""
-        velocity = flee(
-            self.object_pose(data, "mouse")[:2],
-            robot_state.position_w[0, :2],
-            self.params.mouse_speed,
-        )
+        mouse = self.object_pose(data, "mouse")[:2]
+        velocity = flee(mouse, robot_state.position_w[0, :2], self.params.mouse_speed)
         return data.replace(qvel=data.qvel.at[self.objects["mouse"].qvel].set(velocity))
 
     def distance(self, state: State, robot_state: RobotState) -> jax.Array:
         """Returns the horizontal distance of the robot to the mouse (), m."""
-        return jnp.linalg.norm(
-            self.object_pose(state.data, "mouse")[:2] - robot_state.position_w[0, :2]
-        )
+        mouse = self.object_pose(state.data, "mouse")[:2]
+        return jnp.linalg.norm(mouse - robot_state.position_w[0, :2])
 
     @property
     def observation_layout(self) -> ObservationLayout:
         return ObservationLayout((Block("base", 6, BASE_INFO), Block("mouse", 2, "x, y, m")))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        return {
-            "base": robot_state.base_info,
-            "mouse": self.object_pose(state.data, "mouse")[:2][None],
-        }
+        mouse = self.object_pose(state.data, "mouse")[:2]
+        return {"base": robot_state.base_info, "mouse": mouse[None]}
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         distance = self.distance(after.state, after.robots)
@@ -180,7 +171,7 @@ class Go1Catch(QuadrupedEnv[None, CatchParams]):
 
 def plan_catch(obs: Observation) -> jax.Array:
     """Returns the robot's action (1, 3): past the pillar, then towards the mouse."""
-    (position, yaw) = pose(obs["base"])
+    position, yaw = pose(obs["base"])
     mouse = obs["mouse"]
     side = jnp.where(mouse[:, 1:] < 0, -0.7, 0.7)
     before = position[:, :1] < 3.1
@@ -196,13 +187,13 @@ def main() -> None:
     """Evaluates the scripted policy over 32 episodes and prints its success rate."""
     env = VectorEnv(make("go1catch", num_envs=32), 32)
     plan = jax.vmap(scripted_policy(env.env))
-    result = evaluate_batch(
-        env, lambda obs, memory, _: (plan(obs), memory), 32, jax.random.PRNGKey(0)
-    )
-    print(
-        f"caught {result.success_rate:.0%} of 32 mice, average step reward "
-        f"{result.average_step_reward:.3f}"
-    )
+
+    def act(obs: jax.Array, memory: object, key: jax.Array) -> tuple[jax.Array, object]:
+        return plan(obs), memory
+
+    result = evaluate_batch(env, act, 32, jax.random.PRNGKey(0))
+    reward = result.average_step_reward
+    print(f"caught {result.success_rate:.0%} of 32 mice, average step reward {reward:.3f}")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,4 @@
-"""Your own training loop: three seeds as one compiled program under `jax.vmap`, without files and
-logs.
+"""Your own training loop: three seeds as one program under `jax.vmap`, without files and logs.
 
 `python examples/own_loop.py` prints each seed's reward after every update; two minutes on a CPU.
 """

@@ -1,10 +1,10 @@
-"""Trains Climb on Seesaw with Stable-Baselines3's PPO, one policy for all agents, through
-PettingZoo and SuperSuit.
+"""Trains Climb on Seesaw with Stable-Baselines3's PPO, one policy for all agents.
 
     pip install -e '.[pettingzoo]' stable-baselines3 supersuit
     python examples/sb3_pettingzoo.py --csv sb3.csv
 
-SuperSuit steps environments sequentially: the example demonstrates compatibility, not speed.
+PettingZoo and SuperSuit connect them. SuperSuit steps environments sequentially: the example
+demonstrates compatibility, not speed.
 """
 
 import argparse
@@ -24,8 +24,9 @@ COLUMNS = {"return": "r", "episode_length": "l"}
 
 
 def vectorised(task: str, **settings: Any) -> Any:
-    """Returns agents of several environments as one Stable-Baselines3 vector environment,
-    observations normalised.
+    """Returns agents of several environments as one vector environment of Stable-Baselines3.
+
+    It normalises observations.
     """
     # Imported by name: neither library is an extra of mqe-jax.
     supersuit: Any = import_module("supersuit")
@@ -36,8 +37,9 @@ def vectorised(task: str, **settings: Any) -> Any:
 
 
 def train(env: Any, steps: int, rollout: int = ROLLOUT) -> list[dict[str, Any]]:
-    """Trains; returns rows of environment steps, and return and length of the last 100 episodes of
-    agents.
+    """Trains and returns a row of each update.
+
+    Its columns are environment steps, and return and length of the agents' last 100 episodes.
 
     Args:
         env: of `vectorised`.
@@ -57,12 +59,10 @@ def train(env: Any, steps: int, rollout: int = ROLLOUT) -> list[dict[str, Any]]:
         episodes = model.ep_info_buffer
         if episodes:
             row: dict[str, Any] = {"env_steps": model.num_timesteps // agents}
-            row |= {
-                name: round(float(np.mean([x[key] for x in episodes])), 3)
-                for name, key in COLUMNS.items()
-            }
+            for name, key in COLUMNS.items():
+                row[name] = round(float(np.mean([episode[key] for episode in episodes])), 3)
             rows.append(row)
-            print(rows[-1], flush=True)
+            print(row, flush=True)
     return rows
 
 

@@ -1,5 +1,4 @@
-"""Self-play: trains Sumo Wrestling against a frozen snapshot of the policy itself and a scripted
-opponent.
+"""Self-play: trains Sumo Wrestling against its own frozen snapshot and a scripted opponent.
 
 `python examples/self_play.py` prints the results against both, after a minute or two on a CPU.
 41,000 steps teach little: `mqe train go1wrestling` takes 150 million.
@@ -21,19 +20,23 @@ from mqe_jax.train.policy import policy_of
 
 
 def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5) -> np.ndarray:
-    """Trains, and returns wins, draws and losses against the last snapshot and the scripted policy
-    (2, 3).
-    """
-    network = {"recurrent": False, "hidden_sizes": [64, 64]}
-    settings = {"num_envs": num_envs, "rollout_steps": 64, "ppo": {"epochs": 4}, "network": network}
-    config = build(
-        TrainConfig, {**settings, "total_steps": updates * num_envs * 64, "stagger_episodes": True}
-    )
-    matches = VectorEnv(
-        make("go1wrestling", rewards={"push": 3.0, "approach": 1.0}, num_envs=num_envs), num_envs
-    )
+    """Trains, and returns wins, draws and losses (2, 3).
 
-    # for the sizes of a policy; its first snapshot is untrained
+    They are against the last snapshot and against the scripted policy.
+    """
+    settings = {
+        "num_envs": num_envs,
+        "rollout_steps": 64,
+        "total_steps": updates * num_envs * 64,
+        "stagger_episodes": True,
+        "ppo": {"epochs": 4},
+        "network": {"recurrent": False, "hidden_sizes": [64, 64]},
+    }
+    config = build(TrainConfig, settings)
+    rewards = {"push": 3.0, "approach": 1.0}
+    matches = VectorEnv(make("go1wrestling", rewards=rewards, num_envs=num_envs), num_envs)
+
+    # The first snapshot is untrained: these matches give the sizes of the policy.
     one_team = versus(matches, ["idle"])
     learner = make_learner(one_team, config)
     state = jax.jit(learner.init)(jax.random.PRNGKey(0))
@@ -51,7 +54,7 @@ def main(num_envs: int = 32, updates: int = 20, snapshot_every: int = 5) -> np.n
         state, metrics = update(state)
         print(f"update {i + 1}: average step reward {float(metrics['average_step_reward']):.4f}")
 
-    opponents = snapshot, load_policy("scripted", matches.env)
+    opponents = (snapshot, load_policy("scripted", matches.env))
     return play(matches, policy_of(state, env, config), opponents, jax.random.PRNGKey(1))
 
 

@@ -1,11 +1,11 @@
-"""Trains a task with TorchRL's multi-agent PPO, a central critic and shared parameters, through
-PettingZoo.
+"""Trains a task with TorchRL's multi-agent PPO, a central critic and shared parameters.
 
     pip install -e '.[pettingzoo]' torchrl
     python examples/torchrl_mappo.py --csv torchrl.csv
     python examples/torchrl_mappo.py --task go1tug --opponent idle
 
-TorchRL steps one environment on the host: the example demonstrates compatibility, not speed.
+PettingZoo connects them. TorchRL steps one environment on the host: the example demonstrates
+compatibility, not speed.
 """
 
 import argparse
@@ -25,8 +25,9 @@ GROUP = "robot"
 def train(
     task: str = "go1seesaw", steps: int = 26_000, batch: int = BATCH, **settings: Any
 ) -> list[float]:
-    """Trains; returns the mean return of an agent over the episodes that ended in each batch, NaN
-    without any.
+    """Trains and returns an agent's mean return over the episodes that ended in each batch.
+
+    It is NaN if none ended.
 
     Args:
         task: id.
@@ -70,9 +71,9 @@ def train(
                 )
             for part in data[torch.randperm(len(data))].chunk(MINIBATCHES):
                 values = loss(part)
-                (
-                    values["loss_objective"] + values["loss_critic"] + values["loss_entropy"]
-                ).backward()
+                total_loss = values["loss_objective"] + values["loss_critic"]
+                total_loss += values["loss_entropy"]
+                total_loss.backward()
                 torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
                 optimizer.zero_grad()
@@ -87,8 +88,9 @@ def networks(env: Any) -> tuple[Any, Any]:
     observation = (GROUP, "observation")
     action = env.full_action_spec_unbatched[env.action_key]
     agents, size = action.shape
-    settings = {"n_agent_inputs": env.observation_spec[observation].shape[-1], "n_agents": agents}
-    settings |= {
+    settings = {
+        "n_agent_inputs": env.observation_spec[observation].shape[-1],
+        "n_agents": agents,
         "share_params": True,
         "depth": 2,
         "num_cells": 64,
