@@ -7,6 +7,7 @@ plain `int` or `float` has the bounds of `Integer` or `Number`. The constants bo
 memory.
 """
 
+import math
 import typing
 from typing import Annotated, Any
 
@@ -80,21 +81,14 @@ MEMORY_SHARE = 0.5  # of the free memory, for the states of all environments or 
 def bounds(kind: Any) -> tuple[float, float]:
     """Returns the lowest and the highest allowed number of a kind.
 
-    An exclusive bound is the first integer inside.
+    An exclusive bound of an integer is the first number inside.
     """
-    low = -float("inf")
-    high = float("inf")
     step = int(typing.get_args(kind)[0] is int)
-    for limit in kind.__metadata__:
-        match limit:
-            case Ge(ge=value):
-                low = max(low, value)  # type: ignore[type-var]
-            case Gt(gt=value):
-                low = max(low, value + step)  # type: ignore[operator]
-            case Le(le=value):
-                high = min(high, value)  # type: ignore[type-var]
-            case Lt(lt=value):
-                high = min(high, value - step)  # type: ignore[operator]
-            case _:
-                pass
-    return low, high
+    given: Any = kind.__metadata__
+    low = [-math.inf]
+    low += [x.ge for x in given if hasattr(x, "ge")]
+    low += [x.gt + step for x in given if hasattr(x, "gt")]
+    high = [math.inf]
+    high += [x.le for x in given if hasattr(x, "le")]
+    high += [x.lt - step for x in given if hasattr(x, "lt")]
+    return max(low), min(high)
