@@ -166,7 +166,9 @@ TARGETS = {
     "bench": ["fake"],
     "export": ["fake", "--onnx", "a.onnx"],
     "replay": ["a.npz"],
-    "walk convert": ["a.jit", "b.jit", "-o", "w.safetensors"],
+    "skill train": ["walk"],
+    "skill eval": ["walk"],
+    "skill convert": ["walk", "a.jit", "b.jit", "-o", "w.safetensors"],
     "sweep": ["a.yaml"],
     "report": ["a"],
     "tournament": ["go1tug", "idle", "random", "-o", "cup"],
@@ -175,7 +177,7 @@ TARGETS = {
 """Positional and needed arguments of each command."""
 
 
-LONG = ("view", "walk train", "walk eval", "tournament", "exploit")
+LONG = ("view", "skill train", "skill eval", "tournament", "exploit")
 """Commands that run for long where a text happens to be allowed; they get numbers only, which never
 are."""
 

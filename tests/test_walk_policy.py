@@ -117,7 +117,9 @@ def test_converted_weights_are_rounded_to_float16_only_on_request(
     file = tmp_path / "walk.safetensors"
     parts = [str(tmp_path / f"{part}.jit") for part in layers]
     assert (
-        cli.main(["walk", "convert", *parts, "-o", str(file), *(["--float16"] if half else [])])
+        cli.main(
+            ["skill", "convert", "walk", *parts, "-o", str(file), *(["--float16"] if half else [])]
+        )
         == 0
     )
     assert (file.stat().st_size < 3.7e6) is half

@@ -11,7 +11,7 @@ import tyro
 
 from mqe_jax.cli import commands, exploit, export, programs, render, skill, study, view
 from mqe_jax.core import limits
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import known_name
 from mqe_jax.core.settings import TEXT, fail, is_text
 from mqe_jax.envs.registry import task_id
 
@@ -41,8 +41,7 @@ COMMANDS: dict[str, Any] = {
     "replay": commands.Replay,
     "bench": commands.Bench,
     "demo": commands.Demo,
-    "skill train": "Train a skill's weights, from scratch or from other weights (GPU): mqe skill "
-    "train agile.",
+    "skill train": "Train a skill's weights (GPU): mqe skill train agile.",
     "skill eval": skill.SkillEval,
     "skill convert": skill.SkillConvert,
     "sweep": study.SweepCommand,
@@ -55,28 +54,17 @@ COMMANDS: dict[str, Any] = {
 
 def overview(group: str = "") -> str:
     """Returns the text of `mqe --help`, or of a group of commands."""
-    about = {
-        name: kind if isinstance(kind, str) else (kind.__doc__ or name).splitlines()[0]
-        for name, kind in COMMANDS.items()
-    }
-    lines = "\n".join(
-        f"  {name:12} {line}" for name, line in about.items() if name.startswith(group)
-    )
-    return f"usage: mqe COMMAND ...\n\n{lines}\n\n`mqe COMMAND --help` explains every argument."
-
-
-def resolve_alias(arguments: Sequence[str]) -> list[str]:
-    """Returns the arguments with a leading `walk COMMAND ...` as `skill COMMAND walk ...`."""
-    if list(arguments[:1]) != ["walk"]:
-        return list(arguments)
-    command = [word for word in arguments[1:2] if not word.startswith("-")]
-    return ["skill", *command, *["walk" for _ in command], *arguments[1 + len(command) :]]
+    lines = []
+    for name, kind in COMMANDS.items():
+        about = kind if isinstance(kind, str) else (kind.__doc__ or name).splitlines()[0]
+        if name.startswith(group):
+            lines.append(f"  {name:12} {about}")
+    listed = "\n".join(lines)
+    return f"usage: mqe COMMAND ...\n\n{listed}\n\n`mqe COMMAND --help` explains every argument."
 
 
 def _check_words(arguments: Sequence[str]) -> None:
-    """Raises an InputError for an empty value, which would stand for this folder, and for what is
-    no text.
-    """
+    """Raises an InputError for an empty value, which would stand for this folder, or no text."""
     for flag, word in itertools.pairwise(("mqe", *arguments)):
         name, equals, value = word.partition("=")
         if not word or (word.startswith("--") and equals and not value):
@@ -86,32 +74,24 @@ def _check_words(arguments: Sequence[str]) -> None:
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Returns the parsed command that the first word or two name; its `run` returns the object of
-    `--json`.
+    """Returns the parsed command that the first word or two name.
+
+    Its `run` returns the object of `--json`.
 
     InputError for an unknown command or task; SystemExit 0 after help, 2 after tyro's message about
     a wrong argument.
     """
     _check_words(arguments)
-    given = arguments
-    arguments = resolve_alias(arguments)
     words = 2 if " ".join(arguments[:2]) in COMMANDS else 1
     name = " ".join(arguments[:words])
     rest = list(arguments[words:])
     if {"-h", "--help"}.intersection(arguments[:2]) and name not in COMMANDS:
         print(overview("" if name.startswith("-") else name))
         raise SystemExit(0)
-    if name not in COMMANDS:
-        group = given[0] if name.startswith("skill") else ""
-        known = (
-            [f"{group}{each[5:]}" for each in COMMANDS if each.startswith("skill ")]
-            if group
-            else list(COMMANDS)
-        )
-        name = " ".join(given[: 2 if group else 1])
-        raise InputError(
-            f"unknown command {name!r}{nearest(name, known)}; allowed: {', '.join(known)}"
-        )
+    if name == "skill":
+        group = [each for each in COMMANDS if each.startswith("skill ")]
+        known_name("unknown command", " ".join(arguments[:2]), group)
+    known_name("unknown command", name, COMMANDS)
     if name == "train":
         if rest and not rest[0].startswith("-"):
             task_id(rest[0])
@@ -123,9 +103,8 @@ def parse(arguments: Sequence[str]) -> Any:
         from mqe_jax.cli import skill_train
 
         return {"launch": _parse_launch, "skill train": skill_train.parse_skill_train}[name](rest)
-    command = tyro.cli(
-        COMMANDS[name], prog=f"mqe {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,)
-    )
+    options = (tyro.conf.FlagCreatePairsOff,)
+    command = tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=options)
     target = getattr(command, "target", None) or getattr(command, "task", None)
     if isinstance(target, str) and os.sep not in target and not Path(target).exists():
         task_id(target)  # before JAX and MuJoCo are imported, which take seconds
@@ -136,23 +115,12 @@ def _parse_launch(arguments: Sequence[str]) -> Any:
     """Parses the arguments of `mqe launch`, those of its command included; errors as `parse`."""
     from mqe_jax.cli.launch import Launch
 
-    names = {"walk", *(name.split()[0] for name in COMMANDS)}
+    names = {name.split()[0] for name in COMMANDS}
     start = next((i for i, word in enumerate(arguments) if word in names), len(arguments))
-    launch = tyro.cli(
-        Launch,
-        prog="mqe launch",
-        args=list(arguments[:start]),
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    launch = tyro.cli(Launch, prog="mqe launch", args=list(arguments[:start]))
     command = tuple(arguments[start:])
-    if command[:1] not in (("train",), ("sweep",)) and tuple(resolve_alias(command))[:2] != (
-        "skill",
-        "train",
-    ):
-        fail(
-            "command",
-            " ".join(command[:2]),
-            "train, skill train or sweep: mqe launch --processes 2 train go1gate",
-        )
+    if command[:1] not in (("train",), ("sweep",)) and command[:2] != ("skill", "train"):
+        allowed = "train, skill train or sweep: mqe launch --processes 2 train go1gate"
+        fail("command", " ".join(command[:2]), allowed)
     parse(command)
     return dataclasses.replace(launch, command=command)

@@ -35,15 +35,12 @@ _RATES = {
         "win/idle": "against idle",
     },
 }
-"""Rates of the shipped policies that `mqe zoo` lists: title of each table and its columns, by name
-in the cards."""
+"""Rates of shipped policies that `mqe zoo` lists: titles of tables, columns by name in cards."""
 
 
 @settings_class
 class Tasks:
-    """List the tasks with their robots, sizes and time limits; with --long, also the sizes of their
-    observations.
-    """
+    """List the tasks with their robots, sizes and time limits; --long adds observation sizes."""
 
     json: Json = False
     long: Long = False
@@ -74,22 +71,18 @@ class Tasks:
             "task": [row["task"] for row in rows],
             "title": [row["title"] for row in rows],
             "robots": [" vs ".join(map(str, task.teams)) for task in SHIPPED.values()],
-            "sizes": [
-                f"{task.sizes[0]} to {task.sizes[1]}" if task.sizes else ""
-                for task in SHIPPED.values()
-            ],
+            "sizes": [" to ".join(map(str, task.sizes or ())) for task in SHIPPED.values()],
             "time, s": [f"{row['time_limit_s']:g}" for row in rows],
         }
         if self.long:
             del columns["title"]
-            columns |= {
-                name: [str(row[name]) for row in rows] for name in ("observation", "privileged")
-            }
+            for name in ("observation", "privileged"):
+                columns[name] = [str(row[name]) for row in rows]
             columns["policy"] = ["shipped" if row["shipped_policy"] else "none" for row in rows]
-        print_columns(columns, left=3 if self.long else 4)
-        if self.long:
+            print_columns(columns, left=3)
             print("\nobservation: numbers that an agent sees; privileged: that a critic may see")
         else:
+            print_columns(columns, left=4)
             print("\nsizes: numbers N of robots for --set num_agents=N; in matches N must be even")
             print("Watch one: mqe render go1gate -o gate.gif")
         return {"tasks": rows}
@@ -109,25 +102,22 @@ class Zoo:
         from mqe_jax.envs.registry import SHIPPED
         from mqe_jax.policies import zoo
 
-        tasks = (
-            [name for name in SHIPPED if name in zoo.names()] if self.task is None else [self.task]
-        )
+        tasks = [name for name in SHIPPED if name in zoo.names()]
+        if self.task is not None:
+            tasks = [self.task]
         cards = {task: zoo.card(task) for task in tasks}
         plain = {task: _plain(card, zoo.load(task).needs) for task, card in cards.items()}
         if self.json:
             return {"policies": plain}
         if self.task is not None or self.long:
-            for number, task in enumerate(tasks):
-                print("\n" * (number > 0), end="")
-                _print_card(task, cards[task], plain[task], self.long)
+            for task, card in cards.items():
+                _print_card(task, card, plain[task])
             return {}
         for title, rates in _RATES.items():
             listed = [task for task, card in cards.items() if rates.keys() <= card.results.keys()]
             columns = {"task": listed, "title": [SHIPPED[task].title for task in listed]}
-            columns |= {
-                text: [cards[task].results[name].rate.percent for task in listed]
-                for name, text in rates.items()
-            }
+            for name, text in rates.items():
+                columns[text] = [cards[task].results[name].rate.percent for task in listed]
             print(f"{title}\n")
             print_columns(columns, left=2)
             print()
@@ -135,45 +125,36 @@ class Zoo:
         return {"policies": plain}
 
 
-def _print_card(task: str, card: Any, plain: dict[str, Any], long: bool) -> None:
-    """Prints a policy's card: its rates, skill and training; with `long` all fields."""
+def _print_card(task: str, card: Any, plain: dict[str, Any]) -> None:
+    """Prints a policy's card: its rates, skill and training."""
     from mqe_jax.acting.results import Rate
 
     shown = {"task": task}
     for name, found in sorted(card.results.items(), reverse=True):  # wins first
         sides = {"both": ", both sides", "first": ", first side"}.get(found.sides or "", "")
         shown[name] = f"{found.rate}, {found.episodes} episodes{sides}"
-    if long:
-        episodes = card.results["success" if "success" in card.results else "win/scripted"].episodes
-        shown |= {
-            f"ends by {name}": str(Rate.of(share, episodes)) for name, share in card.endings.items()
-        }
+    rated = card.results.get("success") or card.results["win/scripted"]
+    for name, share in card.endings.items():
+        shown[f"ends by {name}"] = str(Rate.of(share, rated.episodes))
     ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in plain["commands"].items())
+    minutes = "not recorded" if card.gpu_minutes is None else f"{card.gpu_minutes:g}"
     shown |= {
         "skill": f"{plain['skill']}: {', '.join(ranges)}",
         "trained": card.date,
         "command": card.command,
+        "note": card.note,
+        "GPU minutes": minutes,
+        "acts": card.mode,
+        "task version": plain["version"],
     }
-    if long:
-        minutes = "not recorded" if card.gpu_minutes is None else f"{card.gpu_minutes:g}"
-        shown |= {
-            "note": card.note,
-            "GPU minutes": minutes,
-            "acts": card.mode,
-            "task version": plain["version"],
-        }
+    wrapper = textwrap.TextWrapper(80, subsequent_indent=" " * 23, break_on_hyphens=False)
     for name, value in shown.items():
-        print(
-            textwrap.fill(
-                f"{name:<22} {value}", 80, subsequent_indent=" " * 23, break_on_hyphens=False
-            )
-        )
+        print(wrapper.fill(f"{name:<22} {value}"))
+    print()
 
 
 def _plain(card: Any, needs: Any) -> dict[str, Any]:
-    """Returns a policy's card for JSON, with what the policy needs and the interval of each
-    rate.
-    """
+    """Returns a policy's card for JSON, with what the policy needs and the rates' intervals."""
     from mqe_jax.core.settings import to_mapping
 
     results = {
@@ -185,9 +166,7 @@ def _plain(card: Any, needs: Any) -> dict[str, Any]:
 
 @settings_class
 class Eval(PolicyOptions):
-    """Evaluate a trained run, or a task's shipped or scripted policy, over complete episodes from
-    fresh resets.
-    """
+    """Evaluate a run, or a task's shipped or scripted policy, over episodes from fresh resets."""
 
     json: Json = False
     long: Long = False
@@ -215,14 +194,14 @@ class Eval(PolicyOptions):
             "num_envs": self.num_envs,
             "sides": self.sides,
             "seed": self.seed,
+            "dump_diverged": self.dump_diverged,
         }
         with self._robots() as robots:
-            result = evaluate(**self.playing | robots, **options, dump_diverged=self.dump_diverged)
+            result = evaluate(**self.playing | robots, **options)
         if result.overflow:
             echo(
                 f"mqe: warning: the engine may have dropped contacts in {result.overflow} "
-                "environment steps; "
-                "raise --set contacts_per_robot and --set constraints_per_robot"
+                "environment steps; raise --set contacts_per_robot and --set constraints_per_robot"
             )
         if not self.json:
             print(result.details() if self.long else result)
@@ -239,8 +218,8 @@ class Eval(PolicyOptions):
                     continue
                 from mqe_jax.export.robot_team import open_team
 
-                if (given := getattr(self, name)) is not None:
-                    fail(name, given, "left out beside the file of a robot")
+                if getattr(self, name) is not None:
+                    fail(name, getattr(self, name), "left out beside the file of a robot")
                 teams[name] = stack.enter_context(open_team(file, (self.seed + number) % 2**32))
             yield teams
 
@@ -296,9 +275,7 @@ class Replay:
 
 @settings_class
 class Bench(TaskOptions):
-    """Measure throughput in environment steps per second: of whole steps with skill and resets, and
-    of physics only.
-    """
+    """Measure environment steps per second: whole steps with skill and resets, and physics only."""
 
     task: tyro.conf.Positional[str] = "go1gate"
     """Id of the task."""
@@ -308,8 +285,7 @@ class Bench(TaskOptions):
     steps: Horizon = 50
     """Environment steps per timed call."""
     repeats: Horizon = 10
-    """Number of timed calls after five that warm up; their median, slowest and fastest are
-    reported."""
+    """Number of timed calls after five that warm up; shown are median, slowest and fastest."""
     seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
@@ -327,9 +303,7 @@ class Bench(TaskOptions):
 
 @settings_class
 class Demo:
-    """Train Narrow Gate from scratch on the CPU, evaluate before and after, write curve and
-    video.
-    """
+    """Train Narrow Gate from scratch on the CPU, evaluate before and after, draw curve and clip."""
 
     run_dir: Path = Path("runs/demo")
     """Run folder; an interrupted demo resumes from it."""

@@ -27,8 +27,9 @@ DEMO_TASK = "go1gate"
 
 
 def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
-    """Trains from scratch, evaluates before and after, writes curve and video; resumes an
-    interrupted run.
+    """Trains from scratch, evaluates before and after, writes curve and video.
+
+    Resumes an interrupted run.
     """
     began = time.perf_counter()
     config = build.settings(DEMO_TASK, settings)
@@ -45,7 +46,6 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
         "num_envs": config.num_envs,
         "seed": config.seed + 1000,
     }
-
     state = jax.jit(make_learner(batch, config).init)(initial_key(config))
     before = policy_of(state, batch, config)
     del state
@@ -58,18 +58,16 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     echo("mqe demo: evaluating the trained policy")
     table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
-    curves.save_figure(
-        curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU"), run_dir / "curve.png"
-    )
+    figure = curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU")
+    curves.save_figure(figure, run_dir / "curve.png")
     video = run_dir / "video.mp4"
     try:
         check_output(video)
     except InputError:
         video = run_dir / "video.gif"
     echo("mqe demo: rendering an episode")
-    render(DEMO_TASK, run.policy, **playing, seed=config.seed + 1, episodes=16, width=640).save(
-        video
-    )
+    clip = render(DEMO_TASK, run.policy, **playing, seed=config.seed + 1, episodes=16, width=640)
+    clip.save(video)
     print(f"before training: {_summary(table['before'])}")
     print(f"after training:  {_summary(table['after'])}")
     print(
@@ -81,12 +79,8 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
 
 
 def _summary(result: Mapping[str, Any]) -> str:
-    named = {"both robots through": "success_rate", "at least one": "success/one"}
-    rates = {
-        text: Rate.of(result[name], result["episodes"])
-        for text, name in named.items()
-        if name in result
-    }
-    parts = [f"{text} {rate}" for text, rate in rates.items()]
-    parts.append(f"average step reward {result['average_step_reward']:.3f}")
-    return f"{', '.join(parts)} ({result['episodes']} episodes)"
+    episodes = result["episodes"]
+    both = Rate.of(result["success_rate"], episodes)
+    one = Rate.of(result["success/one"], episodes)
+    reward = f"average step reward {result['average_step_reward']:.3f}"
+    return f"both robots through {both}, at least one {one}, {reward} ({episodes} episodes)"

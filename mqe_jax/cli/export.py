@@ -16,9 +16,7 @@ from mqe_jax.core.settings import settings_class
 
 @settings_class
 class Export:
-    """Write a trained policy as one ONNX graph: of a team, together with the walk policy, or of one
-    robot.
-    """
+    """Write a trained policy as one ONNX graph: of a team with its walk policy, or of one robot."""
 
     run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK|RUN")]
     """Task with a shipped policy, run folder, or policy file."""
@@ -33,9 +31,7 @@ class Export:
     json: Json = False
 
     def run(self) -> dict[str, Any]:
-        """Writes the graph if it agrees with JAX; prints a table, or returns the object for
-        `--json`.
-        """
+        """Writes the graph if it agrees with JAX; prints a table, or returns the JSON object."""
         from mqe_jax.policies import load_policy
         from mqe_jax.runs.build import make_env
 
@@ -69,20 +65,17 @@ class Export:
         result = {"task": task, "control": env.control, "largest_error": error, **sizes}
         if not self.json:
             for kind, values in sizes.items():
-                print_table(
-                    {
-                        f"{kind[:-1]} {name}": " x ".join(map(str, shape))
-                        for name, shape in values.items()
-                    }
-                )
+                for name, shape in values.items():
+                    print_table({f"{kind[:-1]} {name}": " x ".join(map(str, shape))})
             print_table({"largest error against JAX": f"{error:.1e}, of {STEPS} steps"})
         return result
 
 
 @settings_class
 class PlaySite:
-    """Write a web page on which policies play in the reader's browser; any server of files can
-    serve it.
+    """Write a web page on which policies play in the reader's browser.
+
+    Any server of files can serve it.
     """
 
     runs: Annotated[tyro.conf.Positional[list[str]], tyro.conf.arg(metavar="TASK|RUN")] = field(
@@ -108,10 +101,8 @@ class PlaySite:
             self.runs, self.output, self.libraries, lambda text: echo(f"mqe: {text}")
         )
         size = sum(file.stat().st_size for file in self.output.rglob("*") if file.is_file())
-        echo(
-            f"mqe: wrote {self.output}, {size / 1e6:.0f} MB: "
-            f"{', '.join(entry.name for entry in found)}"
-        )
+        names = ", ".join(entry.name for entry in found)
+        echo(f"mqe: wrote {self.output}, {size / 1e6:.0f} MB: {names}")
         if not self.json:
             print(
                 f"serve it: python -m http.server --bind 127.0.0.1 --directory {self.output} 8000"

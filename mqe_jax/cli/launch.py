@@ -1,6 +1,4 @@
-"""The command `launch`: a training in several processes, one for each device of one or many
-hosts.
-"""
+"""The command `launch`: a training in several processes, one for each device."""
 
 import os
 import re
@@ -11,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +17,7 @@ import tyro
 from mqe_jax.core import interrupts
 from mqe_jax.core.devices import PEER, PEER_ENDED
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import NonNegativeInt, PositiveInt
+from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail, settings_class
 
@@ -51,32 +48,27 @@ _NOISE = re.compile(
     r"[IWEF]\d{4} \d\d:\d\d:\d\d|\[Gloo\] Rank |\[external/gloo"
     r"|Additional GRPC error|:[A-Z_]+:|=== Source Location Trace|external/xla|\s*$"
 )
-"""Lines of JAX's coordination service and collectives; several of a lost connection if the training
-has ended."""
+"""Lines of JAX's coordination service and collectives, also after the end of a training."""
 
 
 @settings_class
 class Launch:
-    """Train in several processes, one per device, on one host or many: `mqe launch --processes 2
-    train go1gate`.
+    """Train in several processes, one per device: mqe launch --processes 2 train go1gate.
 
-    Flags of `launch` come before the command, which is train, skill train or sweep. A sweep's
-    processes train different cells. Started by SLURM's srun or Open MPI's mpirun, it needs no flags
-    and is one process of the training.
+    The processes may be on one host or many. Flags of `launch` come before the command, which is
+    train, skill train or sweep. A sweep's processes train different cells. Started by SLURM's srun
+    or Open MPI's mpirun, it needs no flags and is one process of the training.
     """
 
     processes: PositiveInt | None = None
-    """Number of processes of this host."""
-    devices: Annotated[list[NonNegativeInt], tyro.conf.arg(metavar="INT ...")] = field(
-        default_factory=list
-    )
-    """GPUs of this host, one per process. Default: the first ones."""
+    """Number of processes of this host, on its first GPUs or those in CUDA_VISIBLE_DEVICES."""
     command: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
     """Arguments of the command."""
 
     def run(self) -> None:
-        """Runs the processes of this host; SystemExit with the exit code of the first one that
-        failed.
+        """Runs the processes of this host.
+
+        SystemExit with the exit code of the first one that failed.
         """
         if os.name != "posix":
             raise InputError(f"launch: {sys.platform} is not supported; it needs Linux or macOS")
@@ -98,9 +90,9 @@ class Launch:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        return [
-            {**variables, MEMBER: f"{i}/{self.processes}@{port}"} for i, variables in enumerate(own)
-        ]
+        for index, variables in enumerate(own):
+            variables[MEMBER] = f"{index}/{self.processes}@{port}"
+        return own
 
     def _member_of_job(self) -> dict[str, str]:
         """Returns the variables of a process that srun or mpirun has started."""
@@ -110,12 +102,6 @@ class Launch:
         for name in names:
             if not os.environ.get(name, "0").isdecimal():
                 fail(name, os.environ[name], "a number, which srun or mpirun sets")
-        if self.devices:
-            fail(
-                "devices",
-                ", ".join(map(str, self.devices)),
-                "left out if srun or mpirun starts the processes",
-            )
         if not self._sweeps:
             return {MEMBER: AUTO}
         index = int(os.environ.get(names[1], "0"))
@@ -128,18 +114,14 @@ class Launch:
     def _own_devices(self, count: int) -> list[dict[str, str]]:
         """Returns the variables that give each of `count` processes a device."""
         visible = os.environ.get(_DEVICES)
-        if not self.devices and visible in _NO_DEVICES:
+        if visible in _NO_DEVICES:
             return [{} for _ in range(count)]
         gpus = _gpus()
-        if visible is None and not self.devices and 0 < gpus < count:
+        if visible is None and 0 < gpus < count:
             fail("processes", count, f"at most the number of this host's GPUs, {gpus}")
-        devices = list(map(str, self.devices)) or _split(visible) or list(map(str, range(count)))
-        if len(devices) < count or (self.devices and len(devices) > count):
-            fail("devices", ", ".join(devices), f"as many as processes, {count}")
-        if gpus and not all(0 <= device < gpus for device in self.devices):
-            fail("devices", ", ".join(devices), f"from 0 to {gpus - 1}: this host has {gpus} GPUs")
-        if not self._sweeps and len(set(self.devices)) < len(self.devices):
-            fail("devices", ", ".join(devices), "a GPU of its own for each process of a training")
+        devices = _split(visible) or list(map(str, range(count)))
+        if len(devices) < count:
+            fail("processes", count, f"at most the number of GPUs in {_DEVICES}, {visible}")
         return [{_DEVICES: device} for device in devices[:count]]
 
 
@@ -155,8 +137,9 @@ def _split(visible: str | None) -> list[str]:
 
 
 def join() -> None:
-    """Joins the other processes of a training if `launch` started this one; InputError if they
-    cannot be reached.
+    """Joins the other processes of a training if `launch` started this one.
+
+    InputError if they cannot be reached.
     """
     if MEMBER not in os.environ:
         return
@@ -170,12 +153,14 @@ def join() -> None:
         return
     import jax
 
-    # it would replace the handler of SIGTERM
-    jax.config.update("jax_enable_preemption_service", False)
-    address, count, index = (
-        (f"127.0.0.1:{match[3]}", int(match[2]), int(match[1])) if match else _job()
-    )
-    own = address if match else None  # Otherwise JAX listens on all addresses of the machine.
+    jax.config.update("jax_enable_preemption_service", False)  # replaces the handler of SIGTERM
+    if match:
+        index, count, port = map(int, match.groups())
+        address = f"127.0.0.1:{port}"
+        own = address
+    else:
+        address, count, index = _job()
+        own = None  # JAX listens on all addresses of the machine
     if index == 0:
         _check_free(own or f":{address.rpartition(':')[2]}", address)
     alone = threading.Timer(LIMIT, _end_alone, [address])
@@ -193,8 +178,9 @@ def join() -> None:
 
 
 def _job() -> tuple[str, int, int]:
-    """Returns the address of process 0, the number of processes and this one's index, as SLURM or
-    MPI tells JAX.
+    """Returns the address of process 0, the number of processes and this one's index.
+
+    SLURM or MPI tells them to JAX.
     """
     from jax._src.clusters import ClusterEnv  # without a public name
 
@@ -214,9 +200,7 @@ def _job() -> tuple[str, int, int]:
 
 
 def _check_free(own: str, address: str) -> None:
-    """Raises an InputError if process 0 cannot listen at its address: JAX could end with
-    SIGSEGV.
-    """
+    """Raises an InputError if process 0 cannot listen at its address: JAX might end by SIGSEGV."""
     host, _, port = own.rpartition(":")
     both = not host and socket.has_dualstack_ipv6()
     family = socket.AF_INET6 if both else socket.AF_INET
@@ -229,12 +213,9 @@ def _check_free(own: str, address: str) -> None:
 
 def _end_alone(address: str) -> None:
     """Ends this process, which JAX keeps waiting for others."""
-    print(
+    echo(
         f"mqe: coordinator: the other processes did not come to {address} within {LIMIT:g} s; "
-        "start all of them, "
-        f"and if another program uses the port: {_PORT}",
-        file=sys.stderr,
-        flush=True,
+        f"start all of them, and if another program uses the port: {_PORT}"
     )
     os._exit(2)
 
@@ -247,8 +228,9 @@ def _end_with_parent() -> None:
 
 
 class _Process:
-    """A process of the training; its standard error is shown for the first of its host, without
-    JAX's noise.
+    """A process of the training.
+
+    The standard error of a host's first process is shown, without JAX's noise.
     """
 
     def __init__(
@@ -277,7 +259,8 @@ class _Process:
         for line in self.popen.stderr:
             aborts = line[0] in "EF" and PEER.search(line)  # JAX then writes a trace
             if aborts or PEER_ENDED in line:
-                self.peer = self.muted = True
+                self.peer = True
+                self.muted = True
             if _NOISE.match(line) or self.muted:
                 continue
             self.last = line.strip() or self.last
@@ -295,25 +278,25 @@ class _Process:
         if self.peer:
             return f"mqe: {PEER_ENDED}; {resume}"
         if code < 0:
-            return (
-                f"mqe: a process of the training was killed by {signal.Signals(-code).name}; "
-                f"{resume}"
-            )
+            name = signal.Signals(-code).name
+            return f"mqe: a process of the training was killed by {name}; {resume}"
         return "" if self._shown else self.last
 
 
 def _supervise(
     command: Sequence[str], members: Sequence[Mapping[str, str]], *, together: bool
 ) -> int:
-    """Runs the processes of this host, which end when one fails if they are `together`; returns the
-    exit code.
+    """Runs the processes of this host and returns the exit code.
+
+    If they are `together`, all end when one fails.
     """
     processes: list[_Process] = []
 
     with interrupts.defer() as signalled:
 
         def pause() -> None:
-            if number := signalled():
+            number = signalled()
+            if number:
                 for process in processes:
                     process.muted = True
                     process.popen.send_signal(signal.SIGTERM)
@@ -326,7 +309,9 @@ def _supervise(
             for i, variables in enumerate(members):
                 prefix = "" if together else f"[{i}] "
                 processes.append(_Process(command, variables, prefix, not together or i == 0))
-            return _wait(processes, pause) if together else max(map(_code, _each(processes, pause)))
+            if together:
+                return _wait(processes, pause)
+            return max(map(_code, _each(processes, pause)))
         finally:
             for process in processes:
                 if process.popen.poll() is None:
@@ -335,20 +320,23 @@ def _supervise(
 
 
 def _wait(processes: Sequence[_Process], pause: Callable[[], None]) -> int:
-    """Waits until all processes have ended, or the others `_GRACE` after one that failed; returns
-    the exit code.
+    """Waits until all processes have ended and returns the exit code.
+
+    If one fails, the others get `_GRACE` to end.
     """
     failed = None
     since = 0.0
     while any(process.popen.poll() is None for process in processes):
-        if failed is None and (failed := _cause(processes)):
+        if failed is None:
+            failed = _cause(processes)
             since = time.monotonic()
-            for process in processes:
-                process.muted |= failed.popen.returncode < 0
-        if failed is not None and (
-            failed.popen.returncode < 0 or time.monotonic() - since > _GRACE
-        ):
-            break
+        if failed is not None:
+            if failed.popen.returncode < 0:
+                for process in processes:
+                    process.muted = True
+                break
+            if time.monotonic() - since > _GRACE:
+                break
         pause()
     failed = failed or _cause(processes)
     if failed is None:
@@ -361,8 +349,9 @@ def _wait(processes: Sequence[_Process], pause: Callable[[], None]) -> int:
 
 
 def _cause(processes: Sequence[_Process]) -> _Process | None:
-    """Returns the process that has failed, if any; of several, the one whose end has ended the
-    others.
+    """Returns the process that has failed, if any.
+
+    Of several, it is the one whose end has ended the others.
     """
     ended = [process for process in processes if process.popen.poll()]
     for process in ended:
@@ -376,7 +365,8 @@ def _each(processes: Sequence[_Process], pause: Callable[[], None]) -> Iterator[
     while running:
         for process in [process for process in running if process.popen.poll() is not None]:
             running.remove(process)
-            if message := process.verdict(_REPEAT):
+            message = process.verdict(_REPEAT)
+            if message:
                 echo(message)
             yield process
         pause()

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mqe_jax.core import interrupts
-from mqe_jax.core.errors import InputError, NonFiniteError, one_line, short_repr
+from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.literal import line
 
 
@@ -46,9 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
-    """Runs a command; returns the exit code, and the message for standard error or an empty
-    string.
-    """
+    """Runs a command; returns the exit code and the message for standard error, if any."""
     # Imported after `interrupts.install`.
     import mqe_jax
     from mqe_jax.cli.arguments import FIRST_STEPS, parse
@@ -81,27 +79,7 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         return 2, one_line(error)
     except NonFiniteError as error:
         return 1, one_line(error)
-    except ValueError as error:
-        if variable := _jax_variable(error):
-            return (
-                2,
-                f"{variable}: {short_repr(os.environ[variable])} is not allowed; JAX says: "
-                f"{one_line(error)}",
-            )
-        raise
     return 0, ""
-
-
-def _jax_variable(error: ValueError) -> str:
-    """Returns the environment variable whose value JAX rejects when it is imported; empty for
-    another error.
-    """
-    importing = "jax" not in sys.modules
-    message = str(error).upper()
-    return next(
-        (name for name in os.environ if importing and name.startswith("JAX_") and name in message),
-        "",
-    )
 
 
 def _run(command: Any) -> None:

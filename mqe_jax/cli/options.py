@@ -1,6 +1,4 @@
-"""What commands share: options; the `--json` object and tables on standard output, messages on
-standard error.
-"""
+"""What commands share: options, the `--json` object and tables on standard output, messages."""
 
 import contextlib
 import os
@@ -38,8 +36,7 @@ DumpDiverged = Annotated[
     tyro.conf.arg(
         metavar="FOLDER",
         help="Write the last 64 steps of each environment whose physics diverges into FOLDER (see "
-        "`mqe replay`). "
-        "Keeps the states of two rollouts in memory.",
+        "`mqe replay`). Keeps the states of two rollouts in memory.",
     ),
 ]
 
@@ -66,9 +63,8 @@ class TaskOptions:
         """Returns the task parameters given by --set, --control, --robot and --senses."""
         senses = None if self.senses is None else parse_yaml(self.senses, "senses")
         flags = {"control": self.control, "robot": self.robot, "senses": senses}
-        return parse_overrides(self.set) | {
-            name: value for name, value in flags.items() if value is not None
-        }
+        given = {name: value for name, value in flags.items() if value is not None}
+        return parse_overrides(self.set) | given
 
 
 @settings_class
@@ -121,25 +117,13 @@ def parse_overrides(pairs: Sequence[str]) -> dict[str, Any]:
 
 def print_table(values: Mapping[str, Any]) -> None:
     """Prints one name and value per line."""
-    flat = {}
     for name, value in values.items():
-        flat.update(
-            {f"reward/{n}": v for n, v in value.items()}
-            if isinstance(value, Mapping)
-            else {name: value}
-        )
-    for name, value in flat.items():
-        print(
-            f"{line(name):<28} {value:.4g}"
-            if isinstance(value, float)
-            else f"{line(name):<28} {line(value)}"
-        )
+        text = f"{value:.4g}" if isinstance(value, float) else line(value)
+        print(f"{line(name):<28} {text}")
 
 
 def print_columns(columns: Mapping[str, Sequence[str]], left: int) -> None:
-    """Prints a table from its columns by header, of which the first `left` ones are aligned on the
-    left.
-    """
+    """Prints a table from its columns by header; the first `left` ones are aligned on the left."""
     padded = []
     for number, (name, texts) in enumerate(columns.items()):
         side = "<" if number < left else ">"

@@ -1,6 +1,4 @@
-"""The start of a command, and compiled programs that JAX stores: their folder, and a check that
-each file is whole.
-"""
+"""The start of a command, and compiled programs that JAX stores."""
 
 import contextlib
 import gc
@@ -15,9 +13,7 @@ from mqe_jax.core.errors import InputError
 
 
 def hasten() -> None:
-    """Makes the start of a command faster: fewer searches for garbage, and none for plug-ins of
-    pydantic.
-    """
+    """Makes the start of a command faster: fewer searches for garbage, no plug-ins of pydantic."""
     gc.set_threshold(50_000, 20, 100)
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
@@ -38,24 +34,21 @@ def import_mujoco() -> None:
 
 
 def keep() -> None:
-    """Has JAX store compiled programs in the user's cache folder, by kind of processor, unless its
-    variable is set.
+    """Has JAX store compiled programs in the user's cache folder, by kind of processor.
+
+    `JAX_COMPILATION_CACHE_DIR` names another folder.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     from mqe_jax.core.files import user_cache
 
-    # without a home, or one that cannot be written, nothing is stored
+    # Nothing is stored without a home, or in one that cannot be written.
     with contextlib.suppress(OSError, InputError):
-        lines = (
-            Path("/proc/cpuinfo").read_text().splitlines()
-            if Path("/proc/cpuinfo").is_file()
-            else []
-        )
-        flags = next(
-            (line for line in lines if line.startswith(("flags", "Features"))), platform.machine()
-        )
-        folder = user_cache() / f"programs-{zlib.crc32(flags.encode()):08x}"
+        about = Path("/proc/cpuinfo")
+        lines = about.read_text().splitlines() if about.is_file() else []
+        flags = [line for line in lines if line.startswith(("flags", "Features"))]
+        kind = flags[0] if flags else platform.machine()
+        folder = user_cache() / f"programs-{zlib.crc32(kind.encode()):08x}"
         folder.mkdir(parents=True, exist_ok=True)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
@@ -64,13 +57,12 @@ def keep() -> None:
 def write_whole() -> None:
     """Has JAX write the files of compiled programs atomically.
 
-    JAX itself writes them in place and never replaces one. A file cut off by a kill or a full disk
-    would be read in vain at every later start, with a warning, and its program compiled anew.
-    Imports JAX.
+    JAX itself writes them in place and never replaces one. If a kill or a full disk cuts a file
+    off, every later start would read it in vain, warn, and compile its program again. Imports JAX.
     """
     from mqe_jax.core.files import write_atomically
 
-    # a private class; another JAX writes as it does
+    # The class is private: another JAX may lack it, and then writes as it does.
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src.lru_cache import LRUCache
 
@@ -83,4 +75,5 @@ def write_whole() -> None:
             if not path.exists():
                 write_atomically(path, value)
 
-        LRUCache.put = put if original.__module__ != __name__ else original
+        if original.__module__ != __name__:
+            LRUCache.put = put

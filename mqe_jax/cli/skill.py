@@ -39,10 +39,8 @@ class SkillEval:
         from mqe_jax.walk.evaluation import evaluate_skill
 
         def report(name: str, figures: Mapping[str, float]) -> None:
-            echo(
-                f"{self.skill}: {name}: "
-                + ", ".join(f"{key} {value:.3g}" for key, value in figures.items())
-            )
+            listed = ", ".join(f"{key} {value:.3g}" for key, value in figures.items())
+            echo(f"{self.skill}: {name}: {listed}")
 
         options = {name: getattr(self, name) for name in ("robot", "impl", "episodes", "seed")}
         result = evaluate_skill(
@@ -72,7 +70,6 @@ class SkillConvert:
 
     def run(self) -> None:
         """Converts official checkpoints."""
-
         from mqe_jax import walk_policy
         from mqe_jax.physics import robots
         from mqe_jax.walk.torchscript import convert

@@ -55,18 +55,14 @@ class SkillTrain:
 
 
 def parse_skill_train(arguments: Sequence[str]) -> SkillTrain:
-    """Parses the arguments of `mqe skill train`: the skill, which decides the flags' defaults,
-    comes first.
+    """Parses the arguments of `mqe skill train`: the skill, then flags with its defaults.
 
     InputError for a skill that cannot be trained; SystemExit as of `parse_train`.
     """
     name = next(iter(arguments), "")
     if name not in SETTINGS and not {"-h", "--help"}.intersection(arguments):
-        fail(
-            "skill",
-            name,
-            f"{' or '.join(SETTINGS)}, before all flags: mqe skill train agile --robot go2",
-        )
+        allowed = " or ".join(SETTINGS)
+        fail("skill", name, f"{allowed}, before all flags: mqe skill train agile --robot go2")
     settings, task = SETTINGS.get(name, SETTINGS["walk"])
     default = SkillTrain(skill=tyro.MISSING, settings=settings, task=task)
     return tyro.cli(

@@ -1,6 +1,5 @@
 """The commands `sweep`, `report` and `tournament`."""
 
-import shlex
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,9 +16,7 @@ from mqe_jax.core.settings import settings_class
 
 @settings_class
 class SweepCommand:
-    """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes
-    interrupted runs.
-    """
+    """Train all combinations of tasks, algorithms, variants and seeds, and report; resumes."""
 
     file: tyro.conf.Positional[Path]
     """YAML file: tasks, algorithms, seeds, config, settings, variants (see docs/sweeps.md)."""
@@ -48,20 +45,11 @@ class SweepCommand:
         from mqe_jax.runs.sweeping import sweep
 
         folder = self.folder or Path("runs") / (self.part or self.file.stem)
-        options = {
-            name: getattr(self, name)
-            for name in ("part", "cells", "seeds", "time_limit", "impl", "dry_run")
-        }
+        names = ("part", "cells", "seeds", "time_limit", "impl", "dry_run")
         try:
-            result = sweep(self.file, folder, **options)
+            result = sweep(self.file, folder, **{name: getattr(self, name) for name in names})
         except KeyboardInterrupt:
-            part = [] if self.part is None else ["--part", self.part]
-            chosen = [
-                *(f"--cells={cell}" for cell in self.cells),
-                *(f"--seeds={seed}" for seed in self.seeds),
-            ]
-            words = ["mqe", "sweep", str(self.file), *part, "--folder", str(folder), *chosen]
-            raise interrupts.Interrupted(f"resume with: {shlex.join(words)}") from None
+            raise interrupts.Interrupted("the same command resumes from here") from None
         if self.dry_run and not self.json:
             _print(result["left"])
         return result["left"] if self.dry_run else result
@@ -90,8 +78,9 @@ class Report:
 
 @settings_class
 class Tournament(TaskOptions):
-    """Play policies against each other and rate them, or as mates in a cooperative task: tables,
-    CSV and picture.
+    """Play policies against each other, or as mates in a cooperative task, and rate them.
+
+    Writes tables, CSV and a picture.
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
@@ -131,14 +120,9 @@ class Tournament(TaskOptions):
 
 
 def _print(result: dict[str, Any]) -> None:
-    for row in [
-        *result["jobs"],
-        {"task": "all", "steps_left": result["steps_left"], "seconds": result["seconds"]},
-    ]:
+    total = {"task": "all", "steps_left": result["steps_left"], "seconds": result["seconds"]}
+    for row in [*result["jobs"], total]:
         name = " ".join(str(row[key]) for key in ("task", "algorithm", "variant") if key in row)
-        seeds = " ".join(map(str, row.get("seeds", [])))
+        seeds = f"seeds {' '.join(map(str, row['seeds']))}" if "seeds" in row else ""
         time = "time unknown" if row["seconds"] is None else f"{row['seconds'] / 3600:.2f} h"
-        print(
-            f"{name:<45} {f'seeds {seeds}' if seeds else '':<20} {row['steps_left'] / 1e6:>9.3g} "
-            f"M steps  {time}"
-        )
+        print(f"{name:<45} {seeds:<20} {row['steps_left'] / 1e6:>9.3g} M steps  {time}")

@@ -66,7 +66,7 @@ class Train(TaskOptions):
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """Settings of the training."""
     source: Annotated[Source, tyro.conf.arg(name="")] = Source()
-    """Where they come from."""
+    """Where the settings come from."""
     run_dir: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Run folder. Default: runs/TASK."""
     resume: bool = False
@@ -86,8 +86,12 @@ class Train(TaskOptions):
 
         run_dir = self.run_dir or Path("runs") / self.target
         seed = self.settings.seed
-        options: dict[str, Any] = {"impl": self.impl, "resume": self.resume}
-        options |= {"run_dir": run_dir, "dump_diverged": self.dump_diverged}
+        options: dict[str, Any] = {
+            "impl": self.impl,
+            "resume": self.resume,
+            "run_dir": run_dir,
+            "dump_diverged": self.dump_diverged,
+        }
         if self.num_seeds == 1:
             folders = [run_dir]
             runs = [learn(self.target, self.settings, **options)]
@@ -99,17 +103,17 @@ class Train(TaskOptions):
             raise interrupts.Interrupted(HINT.format(run_dir))
         if jax.process_index() > 0:  # one process writes the files
             return
-        curves.save_figure(
-            curves.plot_curves([run.metrics for run in runs], self.target), run_dir / "curve.png"
-        )
+        figure = curves.plot_curves([run.metrics for run in runs], self.target)
+        curves.save_figure(figure, run_dir / "curve.png")
         for folder in folders:
             echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
         echo(f"mqe: {run_dir / 'curve.png'} has the curve")
 
 
 def parse_train(arguments: Sequence[str]) -> Train:
-    """Parses the arguments of `mqe train`; settings' file, algorithm, network, group and sensors
-    decide the flags' defaults.
+    """Parses the arguments of `mqe train`; some of them decide the defaults of other flags.
+
+    These are the settings' file, algorithm, network, group and sensors.
 
     InputError without a task in front, or for a file, an algorithm or a network that is not
     allowed; SystemExit as of `mqe_jax.cli.arguments.parse`.
@@ -117,12 +121,10 @@ def parse_train(arguments: Sequence[str]) -> Train:
     task = next(iter(arguments), "")
     helps = {"-h", "--help"}.intersection(arguments)
     if not helps and (not task or task.startswith("-")):
-        raise InputError(
-            f"task: is missing; it comes first: mqe train TASK {' '.join(arguments)}".rstrip()
-        )
-    source, others = tyro.cli(
-        Source, args=list(arguments), add_help=False, return_unknown_args=True
-    )
+        command = " ".join(["mqe train TASK", *arguments])
+        raise InputError(f"task: is missing; it comes first: {command}")
+    others = list(arguments)
+    source, others = tyro.cli(Source, args=others, add_help=False, return_unknown_args=True)
     chosen, others = tyro.cli(Choices, args=others, add_help=False, return_unknown_args=True)
     given, others = tyro.cli(TaskOptions, args=others, add_help=False, return_unknown_args=True)
     changes: dict[str, Any] = {"env": given.overrides()}

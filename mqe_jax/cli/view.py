@@ -20,8 +20,9 @@ _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 @settings_class
 class View(PolicyOptions):
-    """Show a task or a trained run in the browser, with teleoperation and live plots; the page can
-    choose others.
+    """Show a task or a trained run in the browser, with teleoperation and live plots.
+
+    The page can choose other tasks and policies.
     """
 
     num_envs: Annotated[int, Ge(1), Le(16)] = 1
@@ -51,9 +52,7 @@ class View(PolicyOptions):
         shown: Any = {"num_envs": self.num_envs, "sensors": self.sensors}
 
         def open_choice(choice: Entry) -> Session:
-            """Creates another session, with the task's default parameters; a run has its own
-            ones.
-            """
+            """Creates another session, with the default parameters of the task or the run."""
             names = [None if name == DEFAULT else name for name in (choice.policy, choice.opponent)]
             target = choice.policy if choice.policy in runs else choice.task
             options = dataclasses.replace(
@@ -77,21 +76,16 @@ class View(PolicyOptions):
 
 
 def _check_address(host: str, port: int) -> None:
-    """Raises an InputError for a host that is not this machine, on which viser would wait without
-    an end.
+    """Raises an InputError for a host that is not this machine, on which viser would wait for ever.
 
     A port in use is no error: viser takes the next one.
     """
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM
-        )[0]
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        family, kind, protocol, _, address = found[0]
         with socket.socket(family, kind, protocol) as server:
             server.bind(address)
     except (OSError, UnicodeError) as error:
         if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
-            fail(
-                "host",
-                host,
-                f"an address of this machine ({getattr(error, 'strerror', None) or error})",
-            )
+            reason = getattr(error, "strerror", None) or error
+            fail("host", host, f"an address of this machine ({reason})")
