@@ -11,7 +11,7 @@ PYTHON ?= $(firstword $(foreach p,python3 python3.12 python3.11 python3.13 pytho
   $(shell $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(p))))
 # Number of parallel test processes.
 TEST_JOBS ?= 2
-SOURCES := $(wildcard mqe_jax tests examples tools lab)
+SOURCES := $(wildcard *.py mqe_jax tests examples tools lab)
 
 .PHONY: help install demo test soak docs audit release check fmt clean system browser npm
 
@@ -73,4 +73,4 @@ fmt: $(STAMP) ## Format and apply automatic fixes
 
 clean: ## Remove .venv, caches and build leftovers (runs/ stays)
 	rm -rf $(VENV) .cache .pytest_cache .ruff_cache build dist *.egg-info
-	find mqe_jax tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find mqe_jax tests lab -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -37,6 +37,7 @@ from mqe_jax.train.config import load_config
 from mqe_jax.train.policy import Actor, TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 from tests.inputs import refuses
+from tools import ship
 
 MATCHES = [
     name
@@ -60,7 +61,7 @@ def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> N
     card = zoo.card(task)
     assert isinstance(policy, TrainedPolicy) and policy.task == task
     assert policy.deterministic == (card.mode == "deterministic")
-    assert zoo.file_of(task).stat().st_size <= 126_000
+    assert zoo.file_of(task).stat().st_size <= ship.BYTES
     assert (
         card.command.startswith((f"mqe train {task} ", "mqe sweep configs/zoo.yaml "))
         and task in card.command
@@ -187,7 +188,7 @@ def test_commands_apply_what_a_shipped_policy_needs(capfd: Any) -> None:
 
 def test_policy_files_hold_their_mode_and_card(tmp_path: Path) -> None:
     policy = load_policy("go1gate")
-    file = zoo.ship(policy, override(zoo.card("go1gate"), {"mode": "deterministic"}), tmp_path)
+    file = ship.ship(policy, override(zoo.card("go1gate"), {"mode": "deterministic"}), tmp_path)
     assert (
         file == tmp_path / "go1gate.safetensors"
         and load_policy(file).metadata["card"]["mode"] == "deterministic"

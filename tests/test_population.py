@@ -17,6 +17,7 @@ from mqe_jax.policies.zoo import population
 from mqe_jax.runs import playing
 from mqe_jax.selfplay.opponents import versus
 from tests.test_opponents import MATCHES, matches, new_policy
+from tools import ship
 
 TASK = "go1revolvingdoor"
 
@@ -27,8 +28,8 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     actions.
     """
     monkeypatch.setattr(population, "FOLDER", tmp_path)
-    population.add("1", TASK, "idle")
-    population.add("1", TASK, "early", new_policy(versus(matches(), ["idle"])))
+    ship.add_member("1", TASK, "idle")
+    ship.add_member("1", TASK, "early", new_policy(versus(matches(), ["idle"])))
     return tmp_path
 
 
@@ -42,7 +43,7 @@ def check(name: str, task: str, *others: str) -> None:
     for member in (*members, *others):
         assert load_policy(member, env).task == task
         file = Path(population.resolve(member, task))
-        assert not file.suffix or file.stat().st_size <= population.BYTES
+        assert not file.suffix or file.stat().st_size <= ship.BYTES
 
 
 @pytest.mark.parametrize("task", MATCHES)
@@ -69,7 +70,7 @@ def test_every_file_belongs_to_a_shipped_population() -> None:
 
 
 def test_the_scripted_member_walks_against_every_policy(fake: Path) -> None:
-    population.add("1", "go1bridge", "scripted")
+    ship.add_member("1", "go1bridge", "scripted")
     assert parameters_for("go1bridge", "go1bridge", "scripted")["skill"] == "agile"
     assert parameters_for("go1bridge", "go1bridge", "population/1/scripted")["skill"] == (
         "walk",
@@ -97,11 +98,11 @@ def test_a_published_version_does_not_change(fake: Path) -> None:
     with pytest.raises(
         InputError, match=r"member: 'early' .* a new one, of at most 5: idle, early"
     ):
-        population.add("1", TASK, "early", policy)
+        ship.add_member("1", TASK, "early", policy)
     for name in ("scripted", "random", "forward"):
-        population.add("1", TASK, name)
+        ship.add_member("1", TASK, name)
     with pytest.raises(InputError, match="member: 'sixth' "):
-        population.add("1", TASK, "sixth", policy)
+        ship.add_member("1", TASK, "sixth", policy)
     (file,) = fake.glob("*.safetensors")
     file.write_bytes(file.read_bytes() + b" ")
     with pytest.raises(
@@ -111,12 +112,12 @@ def test_a_published_version_does_not_change(fake: Path) -> None:
 
 
 def test_a_member_that_is_too_large_is_refused(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(population, "BYTES", 1000)
+    monkeypatch.setattr(ship, "BYTES", 1000)
     before = sorted(fake.iterdir())
     with pytest.raises(
         InputError, match=r"policy: '[0-9]+ bytes' is not allowed; it must be at most 1000"
     ):
-        population.add("1", TASK, "late", new_policy(versus(matches(), ["idle"]), 2))
+        ship.add_member("1", TASK, "late", new_policy(versus(matches(), ["idle"]), 2))
     assert sorted(fake.iterdir()) == before
 
 

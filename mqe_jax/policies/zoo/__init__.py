@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Episodes, Fraction, NonNegative
-from mqe_jax.core.settings import PathText, build, check_arguments, settings_class, to_mapping
-from mqe_jax.core.types import AnyTrained
+from mqe_jax.core.settings import build, check_arguments, settings_class
 from mqe_jax.train.checkpoint import read_metadata
-from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy, save_policy
+from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
 
 FOLDER = Path(__file__).parent
 
@@ -83,14 +81,6 @@ def card(task: str) -> Card:
 def load(task: str) -> TrainedPolicy:
     """Returns a task's shipped policy, which acts as its card declares; errors as `card`."""
     return read_policy(file_of(task)).acting(card(task).mode == "deterministic")
-
-
-@check_arguments(policy=AnyTrained, about=Card, folder=PathText)
-def ship(policy: TrainedPolicy, about: Card, folder: Path = FOLDER) -> Path:
-    """Writes a policy with its card, its parameters as float16; returns the file."""
-    metadata: dict[str, Any] = {**policy.metadata, "card": to_mapping(about)}
-    shipped = dataclasses.replace(policy.acting(about.mode == "deterministic"), metadata=metadata)
-    return save_policy(folder, shipped, file_of(policy.task).name, half=True)
 
 
 NAMED.update({name: functools.partial(load, name) for name in names()})

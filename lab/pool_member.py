@@ -1,6 +1,6 @@
 """Writes an earlier policy of a league's run, a member of its pool, as a policy file.
 
-`python tools/pool_member.py RUN SHARE FILE` writes the member whose steps are nearest to this share
+`python -m lab.pool_member RUN SHARE FILE` writes the member whose steps are nearest to this share
 of the run's steps, and prints its steps. `mqe eval RUN --opponent FILE` then plays against it. The
 pool is that of the newest checkpoint; it lacks the members that the learner beat most.
 """
