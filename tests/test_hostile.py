@@ -272,7 +272,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         (None, {"control": "c"}),
     ),
     ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
-    ("policy: ", lambda x, v: zoo.ship(v, zoo.card("go1tug")), (None, 3, TrainedPolicy)),
     (
         "folder: ",
         lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v),
@@ -428,21 +427,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         (None, 3, np.ones(3), np.ones((2, 2)), np.full((2, 2, 3), NAN)),
     ),
     ("results: ", lambda x, v: games.analyse(v), (None, GAMES)),
-    (
-        "payoff: ",
-        lambda x, v: games.nash(v),
-        (None, 3, np.ones((1, 2)), np.ones((2, 2)), np.full((2, 2), NAN)),
-    ),
-    (
-        "rates: ",
-        lambda x, v: games.mates(v, 1),
-        (None, np.ones((1, 2)), np.full((2, 2), 2.0), np.full((1, 1), NAN)),
-    ),
-    (
-        "rates: ",
-        lambda x, v: games.partners(v, 1),
-        (None, np.ones(2), np.ones((0, 2)), np.full((1, 2), 2.0)),
-    ),
     ("reference: ", lambda x, v: tournament.rate(GAMES, v), (None, -1, 1, "a")),
     ("episodes", lambda x, v: recording.best(v), (None, [], [3])),
     ("episodes", lambda x, v: recording.typical(v), (None, [], [3])),

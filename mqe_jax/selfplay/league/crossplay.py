@@ -1,7 +1,6 @@
 """Cross-play of a cooperative task: teams whose agents follow policies of different trainings."""
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +19,7 @@ from mqe_jax.core.limits import Episodes
 from mqe_jax.core.settings import PathText, check_arguments, fail
 from mqe_jax.core.types import AnyBatch, AnyPolicy, RandomKey, teams_of
 from mqe_jax.envs import VectorEnv
-from mqe_jax.selfplay.league.games import Estimate, mates, partners
+from mqe_jax.selfplay.league.games import Estimate
 from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
 from mqe_jax.selfplay.league.tournament import CSV, PICTURE
 
@@ -81,18 +80,19 @@ class CrossPlay:
     """Success rates of teams whose agent 0 follows the row's policy, the others the column's (N,
     N)."""
 
-    @functools.cached_property
-    def means(self) -> dict[str, Estimate]:
-        """Means of `success` over policies: `same`, `cross` and `gap` of `games.mates`, and with
-        each reference policy.
-
-        With a reference policy, named as it is, the means are of both places.
+    @property
+    def means(self) -> dict[str, float]:
+        """Mean success of policies with themselves, `same`, and of different policies, `cross`, and
+        with each reference policy, named as it is, in both places.
         """
         count = len(self.policies)
-        found = mates(self.success[:count, :count], self.episodes)
+        teams = self.success[:count, :count]
+        found = {"same": float(teams.diagonal().mean())}
+        if count > 1:
+            found["cross"] = float(teams[~np.eye(count, dtype=bool)].mean())
         for i, name in enumerate(self.references, count):
-            teams = np.stack([self.success[:count, i], self.success[i, :count]], axis=-1)
-            found[name] = partners(teams, self.episodes)
+            both = np.concatenate([self.success[:count, i], self.success[i, :count]])
+            found[name] = float(both.mean())
         return found
 
     @property
@@ -116,18 +116,10 @@ class CrossPlay:
         wide = max(
             50 * (rate.high - rate.low) for rate in itertools.starmap(self.rate, self._pairs)
         )
-        shown = {
-            "same": "policies with themselves",
-            "cross": "different policies",
-            "gap": "difference",
-        }
-        shown |= {name: f"policies with {name}" for name in self.references}
-        lines = [f"{self.task}: success in % of {self.episodes} episodes (95% interval)"]
-        lines += [
-            f"{text:<26}{self.means[name].text(form='.1f')}"
-            for name, text in shown.items()
-            if name in self.means
-        ]
+        shown = {"same": "policies with themselves", "cross": "different policies"}
+        lines = [f"{self.task}: success in % of {self.episodes} episodes"]
+        for name, mean in self.means.items():
+            lines.append(f"{shown.get(name, f'policies with {name}'):<26}{100 * mean:.1f}")
         if self.worst is not None:
             first, others = self.worst
             lines.append(
@@ -167,7 +159,7 @@ class CrossPlay:
             "references": [*self.references],
             "episodes": self.episodes,
             "success": Estimate(*np.moveaxis(bounds, -1, 0)).to_dict(),
-            **{name: mean.to_dict() for name, mean in self.means.items()},
+            **self.means,
             "worst": worst,
         }
 

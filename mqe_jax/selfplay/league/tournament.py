@@ -179,7 +179,7 @@ class Standings:
 
     @functools.cached_property
     def analysis(self) -> Analysis:
-        """Mean, worst case, Nash average and cycles, with intervals."""
+        """Mean and worst case, with intervals."""
         return analyse(self.results)
 
     def __repr__(self) -> str:
@@ -188,11 +188,10 @@ class Standings:
         wide = 50 * np.max(found.payoff.high - found.payoff.low)
         names = [shorten(self.policies[i]) for i in order]
         ratings = [self.ratings.at(i).text(1) for i in order]
-        columns = {"mean": found.mean, "worst case": found.worst, "Nash average": found.average}
+        columns = {"mean": found.mean, "worst case": found.worst}
         texts = {
             name: [kind.at(i).text(form="+.0f") for i in order] for name, kind in columns.items()
         }
-        texts["Nash weight"] = [found.weight.at(i).text() for i in order]
         lines = [
             *table({"policy": names, "rating (95% interval)": ratings}),
             "",
@@ -201,8 +200,6 @@ class Standings:
             "",
             f"the same of each pair, row against column; intervals are +-{wide:.0f} at most",
             *grid(100 * found.payoff.value[np.ix_(order, order)], "+.0f", diagonal=False),
-            "",
-            f"cycles: {found.cycles.text()}% of all triples",
         ]
         return "\n".join(lines)
 
@@ -211,13 +208,9 @@ class Standings:
         found = self.analysis
         policies = []
         for i in self._order:
-            each = {name: x.at(i).to_dict() for name, x in found.by_policy().items()}
+            each = {"mean": found.mean.at(i).to_dict(), "worst": found.worst.at(i).to_dict()}
             policies.append({"policy": self.policies[i], **self.ratings.at(i).to_dict(), **each})
-        pairs = {
-            "results": self.results.tolist(),
-            "payoff": found.payoff.to_dict(),
-            "cycles": found.cycles.to_dict(),
-        }
+        pairs = {"results": self.results.tolist(), "payoff": found.payoff.to_dict()}
         return {"task": self.task, "ratings": policies, "policies": [*self.policies], **pairs}
 
     @check_arguments(folder=PathText)
@@ -234,7 +227,8 @@ class Standings:
             pairs.append((self.policies[i], self.policies[j], *self.results[i, j], *rates))
         sides = [f"{name}{end}" for name in RESULTS for end in ("_both_sides", "_low", "_high")]
         write_table(folder / CSV, ("team0", "team1", *RESULTS, *sides), pairs)
-        kinds = {"rating": self.ratings, **self.analysis.by_policy()}
+        found = self.analysis
+        kinds = {"rating": self.ratings, "mean": found.mean, "worst": found.worst}
         header = [f"{name}{end}" for name in kinds for end in ("", "_low", "_high")]
         rows = [
             (self.policies[i], *(f"{x[i]:.6g}" for kind in kinds.values() for x in kind))
