@@ -1,4 +1,4 @@
-"""Reports from made-up runs: same data, same files; figures, tables and reference values.
+"""Reports from made-up runs: same data, same files; figures and tables.
 
 Statistics of few runs.
 
@@ -21,12 +21,8 @@ from mqe_jax.core.literal import to_html, to_markdown
 from mqe_jax.study import statistics
 from mqe_jax.study.estimates import band, group, score_matrices, select_evaluated
 from mqe_jax.study.report import markdown, write_report
-from mqe_jax.study.runs import REWARD, Cell, Reference, Run
+from mqe_jax.study.runs import REWARD, Cell, Run
 from tests.inputs import refuses
-
-REFERENCE = Reference(
-    label="theirs", values={"plain": {"go1gate": {"mappo": 2.75}}}, tasks={"go1sheep-hard": "Hard"}
-)
 
 
 def made_up(cell: Cell, seed: int, *, evaluated: bool = True, scale: float = 1.0) -> Run:
@@ -59,7 +55,7 @@ RUNS = [
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp("report")
-    write_report(RUNS, target, REFERENCE)
+    write_report(group(RUNS), target)
     return target
 
 
@@ -68,21 +64,19 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 
 
 def test_the_same_runs_give_the_same_files(folder: Path, tmp_path: Path) -> None:
-    files = {path.name: path.read_bytes() for path in write_report(RUNS, tmp_path, REFERENCE)}
+    files = {path.name: path.read_bytes() for path in write_report(group(RUNS), tmp_path)}
     assert files == {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert {"curves.png", "evaluations.png", "profiles.png", "final.csv", "report.md"} <= set(files)
+    assert {"curves.png", "evaluations.png", "final.csv", "report.md"} <= set(files)
 
 
-def test_final_values_stand_beside_the_reference(folder: Path) -> None:
+def test_final_values_are_those_of_the_last_updates(folder: Path) -> None:
     rows = rows_of(folder / "final.csv")
-    # the reference names one first
-    assert [row["task"] for row in rows] == ["go1sheep-hard"] * 3 + ["go1gate"] * 3
+    assert [row["task"] for row in rows] == ["go1gate"] * 3 + ["go1sheep-hard"] * 3
     gate = next(row for row in rows if row["task"] == "go1gate" and row["algorithm"] == "mappo")
     ends = [run.curve[REWARD][-8:].mean() for run in RUNS if run.cell == Cell("go1gate", "mappo")]
     assert float(gate["training"]) == pytest.approx(np.mean(ends), rel=1e-4)
     assert float(gate["training_low"]) <= float(gate["training"]) <= float(gate["training_high"])
-    assert float(gate["reference"]) == 2.75 and gate["seeds"] == "3"
-    assert "2.75" in (folder / "report.md").read_text()
+    assert gate["seeds"] == "3"
 
 
 def test_the_better_algorithm_wins_the_aggregate(folder: Path) -> None:
@@ -125,14 +119,10 @@ def test_a_reward_term_that_a_seed_never_gets_is_zero() -> None:
 
 def test_single_seeds_without_evaluation_are_reported(tmp_path: Path) -> None:
     run = made_up(Cell("go1gate", "mappo", "scratch"), 0, evaluated=False)
-    names = {path.name for path in write_report([run], tmp_path, Reference())}
+    names = {path.name for path in write_report(group([run]), tmp_path)}
     assert names == {"curves.png", "curves.csv", "final.csv", "report.md"}
     (row,) = rows_of(tmp_path / "final.csv")
-    assert (
-        row["absolute"] == "nan"
-        and row["training"] == row["training_low"]
-        and "reference" not in row
-    )
+    assert row["absolute"] == "nan" and row["training"] == row["training_low"]
 
 
 def test_evaluations_take_the_place_of_training_rewards() -> None:
@@ -140,7 +130,7 @@ def test_evaluations_take_the_place_of_training_rewards() -> None:
         made_up(Cell("go1gate", "mat", "tuned"), 0),
         made_up(Cell("go1gate", "mat"), 0, evaluated=False),
     ]
-    cells = group(runs, REFERENCE)
+    cells = group(runs)
     ((cell, (run,)),) = select_evaluated(cells).items()
     assert cell.variant == "tuned" and list(run.curve["env_steps"]) == [20_000_000, 40_000_000]
 
@@ -226,8 +216,6 @@ def test_point_estimates_equal_the_package(case: dict[str, Any]) -> None:
     np.testing.assert_allclose(statistics.interquartile_mean(x), case["iqm"], rtol=1e-12)
     improvement = statistics.probability_of_improvement(x, y)
     np.testing.assert_allclose(improvement, case["probability_of_improvement"], rtol=1e-12)
-    profile = statistics.performance_profile(x, PACKAGE["thresholds"])
-    np.testing.assert_allclose(profile, case["profile"], rtol=1e-12)
 
 
 @CASES
@@ -247,12 +235,6 @@ def test_intervals_equal_the_package_on_its_own_draws(case: dict[str, Any]) -> N
         [x, y], statistics.probability_of_improvement, PackageRandom(x.shape, y.shape)
     )
     np.testing.assert_allclose(improvement, case["improvement_interval"], rtol=1e-9, atol=1e-12)
-
-    def profile(scores: np.ndarray) -> np.ndarray:
-        return statistics.performance_profile(scores, PACKAGE["thresholds"])
-
-    profiles = interval([x], profile, PackageRandom(x.shape))
-    np.testing.assert_allclose(profiles, case["profile_interval"], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("scores", [np.zeros(3), np.zeros((0, 2)), np.array([[np.nan]])])

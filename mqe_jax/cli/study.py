@@ -28,8 +28,8 @@ class SweepCommand:
     cells: Annotated[list[str], Repeated, tyro.conf.arg(metavar="CELL")] = field(
         default_factory=list
     )
-    """Train only these cells: TASK/ALGORITHM, in a sweep with variants TASK/ALGORITHM+VARIANT, in a
-    part that measures TASK/VARIANT. May be a pattern such as '*/mat'; may be repeated."""
+    """Train only these cells: TASK/ALGORITHM, in a sweep with variants TASK/ALGORITHM+VARIANT. May
+    be a pattern such as '*/mat'; may be repeated."""
     seeds: Annotated[list[int], Repeated, tyro.conf.arg(metavar="SEED")] = field(
         default_factory=list
     )
@@ -57,21 +57,17 @@ class SweepCommand:
 
 @settings_class
 class Report:
-    """Write figures and tables of a sweep from its finished runs, with reference values."""
+    """Write figures and tables of a sweep from its finished runs."""
 
     folder: tyro.conf.Positional[Path]
     """Folder of the sweep, with its runs in runs/; the report goes into report/."""
-    reference: Path | None = None
-    """YAML file of reference values, such as the paper's in results/paper/reference.yaml."""
     json: Json = False
 
     def run(self) -> dict[str, Any]:
         """Writes the report of a sweep from its finished runs."""
         from mqe_jax.study import report as reports
-        from mqe_jax.study.runs import load_reference
 
-        reference = None if self.reference is None else load_reference(self.reference)
-        files = reports.report(self.folder, reference)
+        files = reports.report(self.folder)
         echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
         return {"report": [str(file) for file in files]}
 

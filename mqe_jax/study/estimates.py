@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mqe_jax.study import statistics
-from mqe_jax.study.runs import REWARD, Cell, Reference, Run
+from mqe_jax.study.runs import REWARD, Cell, Run
 
 Array = NDArray[np.float64]
 Cells = Mapping[Cell, Sequence[Run]]
@@ -21,20 +21,10 @@ LAST = 0.02
 """Fraction of a training run over which its final reward is averaged."""
 
 
-def group(runs: Sequence[Run], reference: Reference) -> dict[Cell, list[Run]]:
-    """Returns the runs of each cell, cells in the reference's order: by variant, task and
-    algorithm.
-    """
-    orders = list(reference.variants), list(reference.tasks), list(reference.algorithms)
-
-    def key(cell: Cell) -> list[tuple[int, str]]:
-        named = cell.variant, cell.task, cell.algorithm
-        return [(o.index(x) if x in o else len(o), x) for x, o in zip(named, orders, strict=True)]
-
-    return {
-        cell: [run for run in runs if run.cell == cell]
-        for cell in sorted({run.cell for run in runs}, key=key)
-    }
+def group(runs: Sequence[Run]) -> dict[Cell, list[Run]]:
+    """Returns the runs of each cell, cells sorted by variant, task and algorithm."""
+    cells = sorted({run.cell for run in runs}, key=lambda x: (x.variant, x.task, x.algorithm))
+    return {cell: [run for run in runs if run.cell == cell] for cell in cells}
 
 
 def names(cells: Cells, field: str) -> list[str]:
@@ -125,7 +115,7 @@ def curve_rows(cells: Cells) -> Rows:
     ]
 
 
-def final_rows(cells: Cells, reference: Reference) -> Rows:
+def final_rows(cells: Cells) -> Rows:
     """Returns the table of final values, a row for each cell; an estimate is NaN if a seed has no
     value.
     """
@@ -148,9 +138,6 @@ def final_rows(cells: Cells, reference: Reference) -> Rows:
                 key: float(x[0])
                 for key, x in zip((name, f"{name}_low", f"{name}_high"), three, strict=True)
             }
-        if reference.values:
-            value = reference.value(cell.variant, cell.task, cell.algorithm)
-            row["reference"] = math.nan if value is None else value
         rows.append(row)
     return rows
 

@@ -1,40 +1,30 @@
-"""Figures of a study as PNG: learning curves, evaluations during training, profiles."""
+"""Figures of a study as PNG: learning curves, evaluations during training."""
 
 import io
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from mqe_jax.core.literal import to_label
-from mqe_jax.study.estimates import (
-    Array,
-    Cells,
-    band,
-    estimate,
-    names,
-    score_matrices,
-    select_evaluated,
-)
-from mqe_jax.study.runs import Cell, Reference, Run
-from mqe_jax.study.statistics import performance_profile
+from mqe_jax.study.estimates import Array, Cells, band, names, select_evaluated
+from mqe_jax.study.runs import Cell, Run
 
-_INK = "#23252b"
+INK = "#23252b"
 _PALE = "#8a8f99"
-_COLORS = {"jrpo": "#4f86e0", "mappo": "#b5316f", "mat": "#3fae49"}
-_OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", _INK)
-_DASHES = (0, (4, 3))
-_COLORS_OF_VARIANTS = (_COLORS["mappo"], _COLORS["jrpo"], _COLORS["mat"], *_OTHER_COLORS)
+COLORS = {"jrpo": "#4f86e0", "mappo": "#b5316f", "mat": "#3fae49"}
+_OTHER_COLORS = ("#d98b1f", "#7a5bd0", "#2a9d9d", "#8a5a3b", INK)
+_COLORS_OF_VARIANTS = (COLORS["mappo"], COLORS["jrpo"], COLORS["mat"], *_OTHER_COLORS)
 
 
-def _figure(width: float, height: float) -> Any:
+def make_figure(width: float, height: float) -> Any:
+    """Returns an empty figure, inches."""
     from matplotlib.figure import Figure
 
     return Figure((width, height), dpi=105, layout="constrained")
 
 
-def _png(figure: Any) -> bytes:
+def to_png(figure: Any) -> bytes:
+    """Returns a figure as PNG."""
     content = io.BytesIO()
     figure.savefig(content, format="png")
     return content.getvalue()
@@ -52,19 +42,28 @@ def _panels(parent: Any, tasks: Sequence[str]) -> Iterator[tuple[Any, str]]:
             yield axes, task
 
 
-def _color(algorithm: str, algorithms: Sequence[str]) -> str:
-    others = [name for name in algorithms if name not in _COLORS]
-    return _COLORS.get(algorithm) or _OTHER_COLORS[others.index(algorithm) % len(_OTHER_COLORS)]
+def color_of(algorithm: str, algorithms: Sequence[str]) -> str:
+    """Returns the colour of one of some algorithms."""
+    others = [name for name in algorithms if name not in COLORS]
+    return COLORS.get(algorithm) or _OTHER_COLORS[others.index(algorithm) % len(_OTHER_COLORS)]
 
 
-def draw_curves(cells: Cells, reference: Reference) -> bytes:
-    """Returns the training curves, a block of tasks for each variant; dashed lines are the
-    reference's values.
+def draw_curves(cells: Cells) -> bytes:
+    """Returns the training curves: a block of tasks for each variant."""
+    figure = plot_curves(cells)
+    add_legend(figure, label_colors(cells))
+    return to_png(figure)
+
+
+def plot_curves(cells: Cells) -> Any:
+    """Returns a figure of the training curves, without a legend.
+
+    Its subfigures are the variants, the axes of each are the tasks; both are in the cells' order.
     """
     variants = names(cells, "variant")
     algorithms = names(cells, "algorithm")
     tasks = names(cells, "task")
-    figure = _figure(
+    figure = make_figure(
         max(5.0, 3.7 * min(2, len(tasks)) * len(variants)), 2.5 * -(-len(tasks) // 2) + 0.9
     )
     blocks = figure.subfigures(1, len(variants), squeeze=False)[0]
@@ -73,27 +72,18 @@ def draw_curves(cells: Cells, reference: Reference) -> bytes:
             for algorithm in algorithms:
                 runs = cells.get(Cell(task, algorithm, variant))
                 if runs is not None:
-                    _draw_band(axes, runs, _color(algorithm, algorithms), algorithm.upper())
+                    _draw_band(axes, runs, color_of(algorithm, algorithms), algorithm.upper())
             if not axes.lines:
                 axes.text(
                     0.5, 0.6, "not trained", color=_PALE, ha="center", transform=axes.transAxes
                 )
                 axes.set_xticks([])
-            values = reference.values.get(variant, {}).get(task, {})
-            _draw_values(axes, {name: x for name, x in values.items() if name in algorithms})
-            _style_axes(axes, reference.tasks.get(task, task))
-        block.suptitle(to_label(reference.variants.get(variant, variant)), color=_INK, fontsize=11)
-    colors = {name.upper(): _color(name, algorithms) for name in algorithms}
-    _key(figure, colors, reference.label if reference.values else None)
-    return _png(figure)
+            style_axes(axes, task)
+        block.suptitle(to_label(variant), color=INK, fontsize=11)
+    return figure
 
 
-def _draw_values(axes: Any, values: Mapping[str, float]) -> None:
-    for name, value in values.items():
-        axes.axhline(value, color=_COLORS.get(name, _INK), lw=1.0, ls=_DASHES, alpha=0.8)
-
-
-def draw_evaluations(cells: Cells, reference: Reference) -> bytes:
+def draw_evaluations(cells: Cells) -> bytes:
     """Returns the evaluations during training, of the unmodified task with sampled actions: a panel
     for each task.
 
@@ -101,25 +91,25 @@ def draw_evaluations(cells: Cells, reference: Reference) -> bytes:
     """
     tasks = names(cells, "task")
     chosen = select_evaluated(cells)
-    figure = _figure(max(5.0, 3.7 * min(2, len(tasks))), 2.7 * -(-len(tasks) // 2) + 0.6)
+    figure = make_figure(max(5.0, 3.7 * min(2, len(tasks))), 2.7 * -(-len(tasks) // 2) + 0.6)
     for axes, task in _panels(figure, tasks):
         drawn = [cell for cell in chosen if cell.task == task]
         for cell, color in zip(drawn, itertools.cycle(_COLORS_OF_VARIANTS)):
             _draw_band(axes, chosen[cell], color, f"{cell.algorithm.upper()}, {cell.variant}")
-        _style_axes(axes, reference.tasks.get(task, task))
+        style_axes(axes, task)
         if drawn:
             bottom, top = axes.get_ylim()
             axes.set_ylim(bottom, top + 0.09 * len(drawn) * (top - bottom))  # room for the legend
             axes.legend(frameon=False, fontsize=6.5, loc="upper left")
-    return _png(figure)
+    return to_png(figure)
 
 
 def _draw_band(axes: Any, runs: Sequence[Run], color: str, label: str) -> None:
     steps, *values = band(runs)
-    _draw_interval(axes, steps / 1e6, values, color, label)
+    draw_interval(axes, steps / 1e6, values, color, label)
 
 
-def _draw_interval(
+def draw_interval(
     axes: Any, x: Array, values: Sequence[Array], color: str, label: str = ""
 ) -> None:
     """Draws a line and its interval: `values` are middle, low and high, each of x's shape."""
@@ -127,8 +117,9 @@ def _draw_interval(
     axes.plot(x, values[0], color=color, lw=1.5, label=to_label(label))
 
 
-def _style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> None:
-    axes.set_title(to_label(title), color=_INK, fontsize=10, style="italic")
+def style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> None:
+    """Gives the axes of a curve their title, labels and grid."""
+    axes.set_title(to_label(title), color=INK, fontsize=10, style="italic")
     axes.set_xlabel("environment steps (millions)", fontsize=8)
     axes.set_ylabel(ylabel, fontsize=8)
     axes.set_xlim(left=0)
@@ -137,15 +128,20 @@ def _style_axes(axes: Any, title: str, ylabel: str = "average step reward") -> N
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
-    """Adds a legend below the figure: colours by label, and the label of dashed lines."""
+def label_colors(cells: Cells) -> dict[str, str]:
+    """Returns the colours of the cells' algorithms by their labels."""
+    algorithms = names(cells, "algorithm")
+    return {name.upper(): color_of(name, algorithms) for name in algorithms}
+
+
+def add_legend(figure: Any, colors: Mapping[str, str], *further: Any) -> None:
+    """Adds a legend below the figure: colours by label, then further handles."""
     from matplotlib.lines import Line2D
 
     handles = [
         Line2D([], [], color=color, label=to_label(label)) for label, color in colors.items()
     ]
-    if dashed is not None:
-        handles.append(Line2D([], [], color=_INK, ls=_DASHES, lw=1.0, label=to_label(dashed)))
+    handles.extend(further)
     figure.legend(
         handles=handles,
         loc="outside lower center",
@@ -153,23 +149,3 @@ def _key(figure: Any, colors: Mapping[str, str], dashed: str | None) -> None:
         frameon=False,
         fontsize=8,
     )
-
-
-def draw_profiles(cells: Cells, reference: Reference) -> bytes:
-    """Returns performance profiles of each variant: the fraction of runs above each score."""
-    variants = [variant for variant in names(cells, "variant") if score_matrices(cells, variant)]
-    algorithms = names(cells, "algorithm")
-    thresholds = np.linspace(0.0, 1.0, 101)
-
-    figure = _figure(max(5.0, 4.2 * len(variants)), 3.4)
-    for axes, variant in zip(
-        figure.subplots(1, len(variants), squeeze=False)[0], variants, strict=True
-    ):
-        for name, scores in score_matrices(cells, variant).items():
-            values = estimate(lambda x: performance_profile(x, thresholds), scores)
-            _draw_interval(axes, thresholds, values, _color(name, algorithms))
-        _style_axes(axes, reference.variants.get(variant, variant), "fraction of runs above")
-        axes.set_xlabel("score, fraction of each task's range", fontsize=8)
-        axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
-    _key(figure, {name.upper(): _color(name, algorithms) for name in algorithms}, None)
-    return _png(figure)

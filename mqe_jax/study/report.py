@@ -1,7 +1,7 @@
 """The report of a sweep, generated from its finished runs: the same files from the same runs."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ from mqe_jax.core.files import check_folder, write_atomically
 from mqe_jax.core.literal import to_markdown
 from mqe_jax.study.estimates import (
     LAST,
+    Cells,
     Rows,
     aggregate_tables,
     curve_rows,
@@ -16,45 +17,39 @@ from mqe_jax.study.estimates import (
     group,
     select_evaluated,
 )
-from mqe_jax.study.figures import draw_curves, draw_evaluations, draw_profiles
-from mqe_jax.study.runs import Reference, Run, read_runs, table
+from mqe_jax.study.figures import draw_curves, draw_evaluations
+from mqe_jax.study.runs import read_runs, table
 from mqe_jax.train.logs import number
 
 
-def report(folder: Path, reference: Reference | None = None) -> list[Path]:
+def report(folder: Path) -> list[Path]:
     """Writes FOLDER/report from the finished runs of a sweep; returns the files.
 
     InputError without a finished run.
     """
     runs = read_runs(folder)
     check_folder(folder / "report", "folder")
-    return write_report(runs, folder / "report", reference or Reference())
+    return write_report(group(runs), folder / "report")
 
 
-def write_report(runs: Sequence[Run], target: Path, reference: Reference) -> list[Path]:
-    """Writes the report of runs into a folder; returns the files."""
-    cells = group(runs, reference)
-    finals = final_rows(cells, reference)
+def write_report(cells: Cells, target: Path) -> list[Path]:
+    """Writes the report of cells, in their order, into a folder; returns the files."""
+    finals = final_rows(cells)
     files: dict[str, bytes] = {
         "curves.csv": table(curve_rows(cells)).encode(),
         "final.csv": table(finals).encode(),
-        "curves.png": draw_curves(cells, reference),
+        "curves.png": draw_curves(cells),
     }
-    label = [f"`reference`: {to_markdown(reference.label)}."] if reference.values else []
-    text = ["# Results", "", _EXPLANATION, *label, ""]
+    text = ["# Results", "", _EXPLANATION, ""]
     text += [markdown(finals), "", "![Training curves](curves.png)", ""]
     if with_evaluations := select_evaluated(cells):
-        files["evaluations.png"] = draw_evaluations(
-            {cell: cells[cell] for cell in with_evaluations}, reference
-        )
+        evaluated = {cell: cells[cell] for cell in with_evaluations}
+        files["evaluations.png"] = draw_evaluations(evaluated)
         text += ["![Evaluations during training](evaluations.png)", ""]
     aggregates = aggregate_tables(cells)
     for name, rows in aggregates.items():
         files[f"{name}.csv"] = table(rows).encode()
         text += [f"## {_HEADINGS[name]}", "", markdown(rows), ""]
-    if aggregates:
-        files["profiles.png"] = draw_profiles(cells, reference)
-        text += ["![Performance profiles](profiles.png)", ""]
     files["report.md"] = "\n".join(text).encode()
     for name, content in files.items():
         write_atomically(target / name, content)

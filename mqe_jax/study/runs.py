@@ -1,6 +1,4 @@
-"""Finished runs of a sweep, from FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV;
-reference values.
-"""
+"""Finished runs of a sweep, from FOLDER/runs/TASK/ALGORITHM[+VARIANT]/seed*; tables as CSV."""
 
 import csv
 import io
@@ -14,7 +12,6 @@ from numpy.typing import NDArray
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.literal import line
-from mqe_jax.core.settings import FrozenMapping, build, load_yaml, settings_class
 from mqe_jax.train.checkpoint import read_metadata
 from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
 from mqe_jax.train.logs import number, read_metrics
@@ -133,35 +130,3 @@ def table(
             {name: line(x) if isinstance(x, str) else number(x, digits) for name, x in row.items()}
         )
     return text.getvalue()
-
-
-@settings_class
-class Reference:
-    """Values that a report compares with, such as a paper's, and the titles and order of its
-    cells.
-    """
-
-    label: str = "reference"
-    """What the values are, in the legend of figures."""
-    values: Mapping[str, Mapping[str, Mapping[str, float]]] = FrozenMapping()
-    """Variant -> task -> algorithm -> average step reward."""
-    variants: Mapping[str, str] = FrozenMapping()
-    """Titles of variants, in their order; others follow."""
-    tasks: Mapping[str, str] = FrozenMapping()
-    """Titles of tasks, in their order; others follow."""
-    algorithms: tuple[str, ...] = ()
-    """Algorithms in their order; others follow."""
-
-    def value(self, variant: str, task: str, algorithm: str) -> float | None:
-        """Returns the reference value of a cell, or None."""
-        return self.values.get(variant, {}).get(task, {}).get(algorithm)
-
-
-def load_reference(path: Path) -> Reference:
-    """Reads a YAML file with the fields of `Reference`; InputError naming the file, for invalid
-    content.
-    """
-    try:
-        return build(Reference, load_yaml(path))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None

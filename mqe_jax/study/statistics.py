@@ -1,5 +1,5 @@
 """Statistics over few runs: interquartile mean, stratified bootstrap intervals, probability of
-improvement, profiles.
+improvement.
 
 Scores are float arrays (runs, tasks); a statistic maps scores with any leading axes (..., runs,
 tasks) to (...). Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al.
@@ -25,12 +25,6 @@ def interquartile_mean(scores: ArrayLike) -> Array:
     flat = _flat(np.asarray(scores, np.float64))
     cut = flat.shape[-1] // 4
     return np.sort(flat, axis=-1)[..., cut : flat.shape[-1] - cut].mean(axis=-1)
-
-
-def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Array:
-    """Returns the fraction of scores above each threshold: (..., runs, tasks), (K,) -> (..., K)."""
-    flat = _flat(np.asarray(scores, np.float64))
-    return np.mean(flat[..., None, :] > np.asarray(thresholds, np.float64)[:, None], axis=-1)
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:

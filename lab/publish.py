@@ -1,12 +1,12 @@
 """Publishes sweeps: curves and evaluations as two compressed tables, and the page with their
 figure.
 
-`python tools/publish.py SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and
+`python -m lab.publish SWEEP ...` adds the finished runs below each SWEEP to curves.csv.gz and
 evaluations.csv.gz in results/paper, thinned. It then regenerates the figure and the table of
 docs/results/paper.md, and the estimates in results/paper, from results/ alone; without a SWEEP only
 this.
 
-`python tools/publish.py --measurement NAME FILE` puts a JSON or CSV file into
+`python -m lab.publish --measurement NAME FILE` puts a JSON or CSV file into
 results/measurements.json under NAME.
 """
 
@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import paper_page
 
+from lab import paper_page
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
 from mqe_jax.study.estimates import absolute

@@ -1,5 +1,5 @@
 """Draws the figure and fills the table of docs/results/paper.md from published runs; called by
-tools/publish.py.
+`python -m lab.publish`.
 
 The text between `<!-- begin NAME -->` and `<!-- end NAME -->` is replaced; NAME is one of those in
 `sections`.
@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from lab.report import Reference, arrange, compared_rows, draw_curves, load_reference
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
-from mqe_jax.study.estimates import Cells, Rows, aggregate_tables, estimate, final_rows, group
-from mqe_jax.study.figures import draw_curves
-from mqe_jax.study.runs import Reference, Run, load_reference, table
+from mqe_jax.study.estimates import Cells, Rows, aggregate_tables, estimate, group
+from mqe_jax.study.runs import Run, table
 from mqe_jax.study.statistics import interquartile_mean
 
 PAPER = "hierarchical"
@@ -34,7 +34,7 @@ def update(runs: Sequence[Run], folder: Path, page: Path) -> None:
     FOLDER/reference.yaml has the paper's values.
     """
     reference = load_reference(folder / "reference.yaml")
-    cells = group(runs, reference)
+    cells = arrange(group(runs), reference)
     drawn = of(cells, reference.values)
     figure = reduced(draw_curves(drawn, reference))
     if not (path := page.parent / "curves.png").is_file() or path.read_bytes() != figure:
@@ -74,10 +74,10 @@ def filled(text: str, contents: Mapping[str, str]) -> str:
 
 
 def estimated(cells: Cells, reference: Reference) -> Rows:
-    """Returns final values of all cells: those of `final_rows`, success with mean actions, and the
-    verdict.
+    """Returns final values of all cells: those of `compared_rows`, success with mean actions, and
+    the verdict.
     """
-    rows = final_rows(cells, reference)
+    rows = compared_rows(cells, reference)
     for row, runs in zip(rows, cells.values(), strict=True):
         values = [
             (run.absolute or {"deterministic": {}})["deterministic"].get("success_rate")
