@@ -46,6 +46,7 @@ PAGES = sorted(
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
         ROOT / "SECURITY.md",
+        ROOT / "lab" / "README.md",
         *(ROOT / "docs").rglob("*.md"),
     ]
 )
@@ -270,6 +271,8 @@ def check_commands(text: str) -> None:
             assert words[1] in targets, words
         elif program == "python" and words[1].endswith(".py"):
             assert (ROOT / words[1]).is_file(), words
+        elif program == "python" and words[2].startswith("lab."):
+            assert (ROOT / words[2].replace(".", "/")).with_suffix(".py").is_file(), words
         else:
             assert program in SHELL, words
 

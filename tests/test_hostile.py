@@ -33,7 +33,6 @@ from mqe_jax.envs.registry import register_scripted
 from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.export.scene import scene_xml
 from mqe_jax.physics import robots
-from mqe_jax.policies import zoo
 from mqe_jax.selfplay.league import games, tournament
 from mqe_jax.selfplay.opponents import Mirror, versus
 from mqe_jax.study.runs import read_curve

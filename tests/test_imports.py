@@ -3,7 +3,10 @@
 import ast
 import graphlib
 import re
+import tomllib
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mqe_jax"
@@ -61,3 +64,13 @@ def test_networks_and_optimisers_are_our_own() -> None:
         assert not re.search(
             r"^\s*(import|from) (flax|optax)\b", path.read_text(encoding="utf-8"), re.MULTILINE
         ), path
+
+
+def test_the_wheel_has_no_experiments_and_the_package_imports_none() -> None:
+    setuptools = pytest.importorskip("setuptools")
+    find = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
+    shipped = setuptools.find_namespace_packages(str(ROOT), **find["packages"]["find"])
+    assert {name.split(".")[0] for name in shipped} == {"mqe_jax"}
+    for path in PACKAGE.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"^\s*(import|from) (lab|tools|tests)\b", text, re.MULTILINE), path

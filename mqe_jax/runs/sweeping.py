@@ -13,15 +13,14 @@ from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.files import write_atomically
 from mqe_jax.core.limits import Positive, Seed
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, check_arguments, fail, to_mapping
+from mqe_jax.core.settings import PathText, check_arguments, to_mapping
 from mqe_jax.envs.registry import task_id
 from mqe_jax.presets import Layers
 from mqe_jax.runs import build
-from mqe_jax.runs.measuring import measure
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import Cell
-from mqe_jax.study.sweep import Job, Measurement, Sweep, load_part
+from mqe_jax.study.sweep import Job, Sweep
 from mqe_jax.train.config import TrainConfig
 
 
@@ -42,7 +41,7 @@ def sweep(
     """Trains all combinations of tasks, algorithms, variants and seeds, and reports, as `mqe
     sweep`.
 
-    A part with `measure` evaluates policies instead. Call it again to resume.
+    Call it again to resume.
 
     Example:
         ```python
@@ -53,11 +52,10 @@ def sweep(
         ```
 
     Args:
-        file: YAML file with the fields of `mqe_jax.study.sweep.Sweep` or `Measurement`.
+        file: YAML file with the fields of `mqe_jax.study.sweep.Sweep`.
         folder: folder of the sweep; runs go into runs/, the report into report/.
         part: name of one sweep in a file that maps names to sweeps.
-        cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT], or to measure,
-            TASK/VARIANT. Default: all.
+        cells: patterns of the cells to train, TASK/ALGORITHM[+VARIANT]. Default: all.
         seeds: seeds to train. Default: all.
         time_limit: time after which the training in progress is saved and the sweep ends, min.
             Default: none.
@@ -73,14 +71,9 @@ def sweep(
             trainings failed.
         NonFiniteError: at the end, if the first training that failed became non-finite.
     """
-    settings = load_part(Path(file), part)
+    settings = sweeps.load_sweep(Path(file), part)
     folder = Path(folder)
     began = time.monotonic()
-    if isinstance(settings, Measurement):
-        for name, value in {"seeds": seeds, "time_limit": time_limit}.items():
-            if value:
-                fail(name, value, "left out: the part measures policies")
-        return measure(settings, folder, impl, cells, dry_run=dry_run)
     for task in settings.tasks:
         task_id(task)
 

@@ -99,32 +99,6 @@ class Sweep:
         return for_task({"settings": self.settings, **variant}, cell.task)
 
 
-@settings_class
-class Measurement:
-    """Settings of a part that measures policies: a call for every combination of tasks and
-    variants.
-    """
-
-    measure: str
-    """What is called: evaluate, tournament or exploitability, as in `mqe_jax`."""
-    tasks: Annotated[tuple[str, ...], MinLen(1)]
-    """Ids of the tasks."""
-    arguments: Mapping[str, Any] = FrozenMapping()
-    """Arguments of the call, in which {task} stands for the task's id, in a list also * for any
-    part of a file name."""
-    by_task: Mapping[str, Any] = FrozenMapping()
-    """Arguments of a task, by its id, that override these, such as go1gate: {episodes: 64}."""
-    variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
-    """Named arguments that override all others, such as slippery: {env: {friction: 0.5}}."""
-
-    def __post_init__(self) -> None:
-        for task, values in self.by_task.items():
-            if task not in self.tasks:
-                fail("by_task", task, f"one of the part's tasks: {', '.join(self.tasks)}")
-            if not isinstance(values, Mapping):
-                fail(f"by_task.{task}", values, "a mapping of arguments")
-
-
 @dataclass(frozen=True)
 class Job:
     """Seeds of one cell that are trained together, with the settings of each."""
@@ -145,31 +119,26 @@ def load_sweep(path: Path, part: str | None = None) -> Sweep:
     """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to parts; InputError
     names the file.
     """
-    loaded = load_part(path, part)
-    if isinstance(loaded, Measurement):
-        raise InputError(
-            f"{path}: measure: {loaded.measure!r} is not allowed; it must be a sweep of trainings"
-        )
-    return loaded
+    values = read_part(path, part)
+    try:
+        return build(Sweep, values)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
-def load_part(path: Path, part: str | None = None) -> Sweep | Measurement:
-    """Reads a YAML file of trainings or measurements, or a part of it; errors as `load_sweep`."""
+def read_part(path: Path, part: str | None = None) -> dict[str, Any]:
+    """Reads the content of a YAML file, or of its part; errors as `load_sweep`."""
     values = load_yaml(path)
     if part is not None:
         if not isinstance(values.get(part), dict):
             raise InputError(
                 f"{path}: has no part {part!r}{nearest(part, values)}; it has: {', '.join(values)}"
             )
-        values = values[part]
-    elif "tasks" not in values and any(
-        isinstance(value, dict) and "tasks" in value for value in values.values()
-    ):
+        return values[part]
+    parts = [value for value in values.values() if isinstance(value, dict)]
+    if "tasks" not in values and any("tasks" in value for value in parts):
         raise InputError(f"part: none is named; {path} has: {', '.join(values)}")
-    try:
-        return build(Measurement if "measure" in values else Sweep, values)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    return values
 
 
 def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:

@@ -1,4 +1,4 @@
-"""Parts of a sweep that measure policies, and the published ones."""
+"""Measurements of policies, and the published ones."""
 
 import csv
 import itertools
@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 import yaml
 
-from mqe_jax import cli
+from lab import measure as measuring
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
-from mqe_jax.runs import exploiting, measuring, playing, sweeping
+from mqe_jax.runs import exploiting, playing, sweeping
 from mqe_jax.study import sweep as sweeps
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+ROOT = Path(__file__).parents[2]
+FILE = ROOT / "lab" / "strength.yaml"
 MEASURES = """
 rates:
   measure: evaluate
@@ -31,9 +32,7 @@ rates:
 """
 
 
-def test_a_part_measures_policies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_measures_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
 
     def evaluate(
@@ -48,69 +47,51 @@ def test_a_part_measures_policies(
         calls.append((task, policy, opponent, env, impl))
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return SimpleNamespace(
-            to_dict=lambda: {
-                "win_rate": 0.5,
-                "episodes": episodes,
-                "intervals": {"win_rate": [0.4, 0.6]},
-            }
-        )
+        found = {"win_rate": 0.5, "episodes": episodes, "intervals": {"win_rate": [0.4, 0.6]}}
+        return SimpleNamespace(to_dict=lambda: found)
 
     monkeypatch.setattr(playing, "evaluate", evaluate)
     file = tmp_path / "strength.yaml"
     folder = tmp_path / "out"
     file.write_text(MEASURES)
-    arguments = ["sweep", str(file), "--part", "rates", "--folder", str(folder), "--impl", "c"]
-    assert cli.main([*arguments, "--dry-run"]) == 0
-    assert capfd.readouterr().out.count("go1tug heavy") == 1 and not folder.exists()
-    cli.main(arguments)  # interrupted
-    assert cli.main(arguments) == 0 == cli.main(arguments)
+
+    def run(*words: str) -> None:
+        words = (str(file), "--part", "rates", "--folder", str(folder), "--impl", "c", *words)
+        monkeypatch.setattr("sys.argv", ["measure", *words])
+        measuring.main()
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    run()
+    run()
     assert calls[0] == ("go1gate", "go1gate", "scripted", None, "c") and len(calls) == 5
     task, policy, _, env, _ = calls[-1]
-    assert (task, policy.task, policy.needs.robot, env["robot"]) == (
-        "go1tug",
-        "go1tug",
-        "go2",
-        "go2",
-    )
+    assert (task, policy.task, env["robot"]) == ("go1tug", "go1tug", "go2")
+    assert policy.needs.robot == "go2"
     (folder / "results" / "go1tug" / "heavy" / "result.json").unlink()
-    assert (
-        cli.main([*arguments, "--cells", "*/scripted", "--dry-run"]) == 0
-        and "go1tug" not in capfd.readouterr().out
-    )
-    assert cli.main([*arguments, "--cells", "go1tug/*"]) == 0 and len(calls) == 6
+    run("--cells", "*/scripted")
+    assert len(calls) == 5
+    run("--cells", "go1tug/*")
+    assert len(calls) == 6
     rows = list(csv.DictReader((folder / "rates.csv").open()))
     assert [(row["task"], row["variant"]) for row in rows] == list(
         itertools.product(("go1gate", "go1tug"), ("scripted", "heavy"))
     )
-    assert [rows[0][name] for name in ("rate", "value", "low", "high")] == [
-        "win_rate",
-        "0.5",
-        "0.4",
-        "0.6",
-    ]
+    shown = [rows[0][name] for name in ("rate", "value", "low", "high")]
+    assert shown == ["win_rate", "0.5", "0.4", "0.6"]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"seeds": [0]},
-            "seeds: [0] is not allowed; it must be left out: the part measures policies",
-        ),
-        ({"time_limit": 5.0}, "time_limit: 5.0 is not allowed"),
-        (
-            {"cells": ["go1tug/heavi"]},
-            "cells: 'go1tug/heavi' matches no cell (did you mean 'go1tug/heavy'?)",
-        ),
-    ],
-)
-def test_options_of_trainings_are_refused(
-    tmp_path: Path, options: dict[str, Any], message: str
-) -> None:
-    (tmp_path / "strength.yaml").write_text(MEASURES)
-    with pytest.raises(InputError, match=re.escape(message)):
-        sweeping.sweep(tmp_path / "strength.yaml", tmp_path, part="rates", dry_run=True, **options)
+def test_unknown_cells_and_parts_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "strength.yaml"
+    file.write_text(MEASURES)
+    part = measuring.load(file, "rates")
+    with pytest.raises(InputError, match=r"'go1tug/heavi' matches no cell \(did you mean"):
+        measuring.measure(part, tmp_path, cells=["go1tug/heavi"])
+    with pytest.raises(InputError, match="has no part 'rate'"):
+        measuring.load(file, "rate")
+    file.write_text("tasks: [go1gate]")
+    with pytest.raises(InputError, match=r"strength\.yaml: measure: "):
+        measuring.load(file)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +125,7 @@ def test_measurements_that_cannot_be_made_are_named(
 ) -> None:
     part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
     with pytest.raises(InputError, match=re.escape(message)):
-        measuring.plan(build(sweeps.Measurement, part), tmp_path)
+        measuring.plan(build(measuring.Measurement, part), tmp_path)
 
 
 def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(
@@ -163,7 +144,7 @@ def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(
         "variants": {"v": {"seed": 4}},
     }
     gate, tug = (
-        item.arguments for item in measuring.plan(build(sweeps.Measurement, part), tmp_path)
+        item.arguments for item in measuring.plan(build(measuring.Measurement, part), tmp_path)
     )
     assert gate == {"impl": "auto", "policies": ["go1gate-seed0", "go1gate-seed1"], "seed": 4}
     assert tug == {
@@ -174,20 +155,17 @@ def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(
     }
 
 
-def published(part: str) -> sweeps.Measurement:
-    """A part of the shipped file."""
-    loaded = sweeps.load_part(CONFIGS / "strength.yaml", part)
-    assert isinstance(loaded, sweeps.Measurement)
-    return loaded
+def published(part: str) -> measuring.Measurement:
+    return measuring.load(FILE, part)
 
 
 def test_published_parts_name_files_and_arguments_that_exist(monkeypatch: Any) -> None:
-    monkeypatch.chdir(CONFIGS.parent)
-    for part, content in yaml.safe_load((CONFIGS / "strength.yaml").read_text("utf-8")).items():
+    monkeypatch.chdir(ROOT)
+    for part, content in yaml.safe_load(FILE.read_text("utf-8")).items():
         if "measure" in content:
             assert measuring.plan(published(part), Path("none"))
         else:
-            assert isinstance(sweeps.load_part(CONFIGS / "strength.yaml", part), sweeps.Sweep)
+            assert sweeps.load_sweep(FILE, part).tasks
 
 
 class Started(Exception):
@@ -205,7 +183,7 @@ def test_published_trainings_can_start(
     part: str, tasks: list[str], monkeypatch: Any, tmp_path: Path
 ) -> None:
     """They are planned and checked with all of their settings, but not begun."""
-    monkeypatch.chdir(CONFIGS.parent)
+    monkeypatch.chdir(ROOT)
     plan = sweeping.sweep
     begun = []
 
@@ -234,7 +212,7 @@ def test_a_measurement_that_trains_has_a_folder(
         exploiting, "exploitability", lambda task, policy, folder, impl: {**found, "folder": folder}
     )
     part = {"measure": "exploitability", "tasks": ["go1tug"], "arguments": {"policy": "{task}"}}
-    measuring.measure(build(sweeps.Measurement, part), tmp_path)
+    measuring.measure(build(measuring.Measurement, part), tmp_path)
     place = tmp_path / "results" / "go1tug" / "plain"
     assert json.loads((place / "result.json").read_text())["result"] == {
         **found,

@@ -1,11 +1,11 @@
 """Fills tables of pages in docs/results and draws their pictures from results/strength.
 
-`python tools/strength_page.py` reads the rates that `mqe sweep configs/strength.yaml --part PART`
-measured, as results/strength/PART.csv, mixed teams in crossplay_TASK.json and pool_TASK.json, best
-responses in exploitability.csv and double oracles in oracle.json. `python tools/strength_page.py
---rates FOLDER` first copies the results of every part that is below FOLDER; best responses, double
-oracles and mixed teams of tasks that it lacks stay. The table of other conditions has a row for
-each task that is measured under all of them.
+`python -m lab.strength_page` reads the rates that `python -m lab.measure lab/strength.yaml --part
+PART` measured, as results/strength/PART.csv, mixed teams in crossplay_TASK.json and best responses
+in exploitability.csv. Version 0.3.0 measured pool_TASK.json (teams trained with pools of mates) and
+oracle.json (mixtures). `python -m lab.strength_page --rates FOLDER` first copies the results of
+every part that is below FOLDER; best responses and mixed teams of tasks that it lacks stay. The
+table of other conditions has a row for each task that is measured under all of them.
 """
 
 import argparse
@@ -16,9 +16,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
-from paper_page import filled, reduced
 
+from lab.games import means
+from lab.paper_page import filled, reduced
 from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
@@ -223,12 +225,11 @@ def published(name: str) -> dict[str, Any]:
 
 
 def mates(task: str) -> dict[str, Rate]:
-    """Returns means over mixed teams by name, the `worst` pair, and `gap`, by which teams of one
-    seed are better.
-    """
+    """Returns means over mixed teams by name, and `gap`, by which teams of one seed are better."""
     data = published(f"crossplay_{task}")
-    names = ("same", "cross", "gap", "worst", *data["references"])
-    return {name: Rate(*(data[name][key] for key in Rate._fields)) for name in names}
+    success = np.array(data["success"]["value"])
+    found = means(success, data["references"], data["episodes"])
+    return {name: Rate(*map(float, mean)) for name, mean in found.items()}
 
 
 def team(task: str, first: str, second: str) -> Rate:
@@ -439,14 +440,10 @@ def copy_rates(folder: Path) -> None:
         others = [row for row in rows("exploitability") if row["task"] not in tasks]
         both = sorted([*others, *leads(responses)], key=lambda row: row["task"])
         contents["exploitability.csv"] = runs.table(both).encode()
-    if oracles := results(folder, "oracle"):
-        content = published("oracle") | {result["task"]: result for result in oracles}
-        contents["oracle.json"] = f"{json.dumps(content)}\n".encode()
-    for part, name in (("crossplay", "crossplay"), ("pools", "pool")):
-        for result in results(folder, part):
-            contents[f"{name}_{result['task']}.json"] = f"{json.dumps(result)}\n".encode()
+    for result in results(folder, "crossplay"):
+        contents[f"crossplay_{result['task']}.json"] = f"{json.dumps(result)}\n".encode()
     if not contents:
-        parts = ", ".join((*PARTS, "exploitability", "oracle", "crossplay", "pools"))
+        parts = ", ".join((*PARTS, "exploitability", "crossplay"))
         raise InputError(f"--rates: {folder} has no results of a part: {parts}")
     for name, content in contents.items():
         write_atomically(DATA / name, content)

@@ -1,30 +1,22 @@
-"""tools/strength_page.py: the tables of docs/results/strength.md, mates.md and skills.md and the
+"""lab/strength_page.py: the tables of docs/results/strength.md, mates.md and skills.md and the
 data behind them.
 """
 
 import csv
-import importlib
 import io
-import itertools
 import json
 import shutil
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import yaml
 from PIL import Image
 
+from lab import strength_page
 from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.policies import zoo
-from mqe_jax.selfplay.league.crossplay import CrossPlay
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-strength_page: Any = importlib.import_module("strength_page")
 
 
 @pytest.fixture
@@ -93,16 +85,10 @@ def test_the_page_on_settings_shows_the_worst_of_three_seeds() -> None:
 def test_mixed_teams_of_a_page_are_those_of_their_rates(task: str) -> None:
     """All act alike, and the published means are those of the published rates."""
     found = json.loads((strength_page.DATA / f"crossplay_{task}.json").read_text("utf-8"))
-    names = {name: tuple(found[name]) for name in ("policies", "references")}
-    play = CrossPlay(
-        task, episodes=found["episodes"], success=np.array(found["success"]["value"]), **names
-    )
-    expected = play.to_dict()
     shipped = [name for name in found["policies"] if name in zoo.names()]
-    for name, key in itertools.product(
-        ("same", "cross", "gap", "worst", *found["references"]), Rate._fields
-    ):
-        assert found[name][key] == pytest.approx(expected[name][key], abs=1e-6), name
+    for name, mean in strength_page.mates(task).items():
+        for key, value in mean._asdict().items():
+            assert found[name][key] == pytest.approx(value, abs=1e-6), name
     assert len(found["policies"]) == 5 and all(zoo.card(name).mode == "sampled" for name in shipped)
 
 
@@ -188,17 +174,15 @@ def save(folder: Path, part: str, task: str, result: Any) -> None:
 def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     """Those of other tasks stay."""
     with pytest.raises(
-        InputError, match=r"--rates: .* has no results of a part: cooperative, matches, .*, pools"
+        InputError,
+        match=r"--rates: .* has no results of a part: cooperative, matches, .*, crossplay",
     ):
         strength_page.copy_rates(tmp_path)
     before = {file.name: file.read_bytes() for file in data.iterdir()}
     responses = strength_page.rows("exploitability")
-    games = strength_page.published("oracle")
     write(tmp_path / "population" / "rates.csv", {("go1tug", "plain", "win_rate"): 0.5})
     mixed = {"same": {"value": 0.5}}
     save(tmp_path, "crossplay", "go1gate", mixed)
-    save(tmp_path, "pools", "go1seesaw", {"start": "before", **mixed})
-    save(tmp_path, "oracle", "go1tug", {"rounds": []})
     chosen = {
         f"runs/go1tug/default+{start}/seed20": {
             actions: {
@@ -225,19 +209,11 @@ def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     assert champion["from"] == "champion" and float(champion["value"]) == 0.75
     assert (champion["actions"], mean["actions"], mean["value"]) == ("sampled", "mean", "1")
     assert float(champion["low"]) < 0.75 < float(champion["high"]) <= 1.0
-    assert strength_page.published("oracle") == games | {"go1tug": {"task": "go1tug", "rounds": []}}
     assert strength_page.published("crossplay_go1gate") == {"task": "go1gate", **mixed}
-    assert strength_page.published("pool_go1seesaw")["start"] == "before"
     assert (data / "population.csv").read_bytes() == (
         tmp_path / "population" / "rates.csv"
     ).read_bytes()
-    names = (
-        "population.csv",
-        "exploitability.csv",
-        "oracle.json",
-        "crossplay_go1gate.json",
-        "pool_go1seesaw.json",
-    )
+    names = ("population.csv", "exploitability.csv", "crossplay_go1gate.json")
     assert {name: before[name] for name in names} == {
         file.name: before[file.name]
         for file in data.iterdir()
@@ -248,10 +224,4 @@ def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("task", strength_page.POOLS)
 def test_a_pool_of_mates_has_neither_the_team_nor_the_new_mate(task: str) -> None:
     pool = strength_page.published(f"pool_{task}")
-    part = yaml.safe_load((strength_page.ROOT / "configs" / "strength.yaml").read_text("utf-8"))[
-        "pools"
-    ]
     assert len(pool["mates"]) == 3 and not {pool["start"], pool["policies"][-1]} & {*pool["mates"]}
-    assert (pool["start"], [pool["policies"][-1]]) == tuple(
-        part["by_task"][task][name] for name in ("start", "others")
-    )

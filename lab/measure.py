@@ -1,24 +1,30 @@
-"""Parts of a sweep that measure policies: evaluations, tournaments and other calls that return a
-result.
+"""Measures policies by evaluations, tournaments and other calls, for every task and variant.
+
+`python -m lab.measure lab/strength.yaml --part matches --impl c` makes the measurements of a part
+that have no results yet, and tabulates their rates in runs/PART/rates.csv. Parts without `measure`
+are trainings, those of `mqe sweep`.
 """
 
+import argparse
 import dataclasses
 import glob
 import inspect
 import json
 import pkgutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
+from annotated_types import MinLen
 
 from mqe_jax.core.errors import InputError, InUseError
 from mqe_jax.core.files import lock, write_atomically
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import fail
+from mqe_jax.core.settings import FrozenMapping, build, fail, settings_class
 from mqe_jax.envs.registry import task_id
 from mqe_jax.policies import load_policy
-from mqe_jax.study.runs import table
-from mqe_jax.study.sweep import Measurement, for_task, match_names
+from mqe_jax.study.runs import PLAIN, table
+from mqe_jax.study.sweep import for_task, match_names, read_part
 from mqe_jax.train.policy import TrainedPolicy
 
 MEASURES = {
@@ -30,6 +36,41 @@ MEASURES = {
 folder."""
 RESULT = "result.json"
 RATES = "rates.csv"
+
+
+@settings_class
+class Measurement:
+    """Settings of a part that measures policies: a call for every combination of tasks and
+    variants.
+    """
+
+    measure: str
+    """What is called: evaluate, tournament or exploitability, as in `mqe_jax`."""
+    tasks: Annotated[tuple[str, ...], MinLen(1)]
+    """Ids of the tasks."""
+    arguments: Mapping[str, Any] = FrozenMapping()
+    """Arguments of the call, in which {task} stands for the task's id, in a list also * for any
+    part of a file name."""
+    by_task: Mapping[str, Any] = FrozenMapping()
+    """Arguments of a task, by its id, that override these, such as go1gate: {episodes: 64}."""
+    variants: Annotated[Mapping[str, Any], MinLen(1)] = FrozenMapping({PLAIN: {}})
+    """Named arguments that override all others, such as slippery: {env: {friction: 0.5}}."""
+
+    def __post_init__(self) -> None:
+        for task, values in self.by_task.items():
+            if task not in self.tasks:
+                fail("by_task", task, f"one of the part's tasks: {', '.join(self.tasks)}")
+            if not isinstance(values, Mapping):
+                fail(f"by_task.{task}", values, "a mapping of arguments")
+
+
+def load(path: Path, part: str | None = None) -> Measurement:
+    """Reads a YAML file of measurements, or a part of it; InputError names the file."""
+    values = read_part(path, part)
+    try:
+        return build(Measurement, values)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 class Item(NamedTuple):
@@ -83,15 +124,10 @@ def _with_files(name: str, value: Any) -> Any:
 
 
 def measure(
-    part: Measurement,
-    folder: Path,
-    impl: str = "auto",
-    cells: Sequence[str] = (),
-    *,
-    dry_run: bool = False,
-) -> dict[str, Any]:
-    """Makes the measurements of a part that have no results yet, and tabulates the rates; see
-    `sweep`.
+    part: Measurement, folder: Path, impl: str = "auto", cells: Sequence[str] = ()
+) -> list[Item]:
+    """Makes the measurements of a part that have no results yet, and tabulates the rates; returns
+    those that other processes make.
 
     With `cells`, it makes only those whose names, TASK/VARIANT, match a pattern.
     """
@@ -99,7 +135,7 @@ def measure(
     names = {f"{item.task}/{item.variant}": item for item in items}
     chosen = [names[name] for name in match_names(names, cells, "*/plain")]
     for item in chosen:
-        if dry_run or item.file.is_file():
+        if item.file.is_file():
             continue
         try:
             with lock(item.file.parent):
@@ -110,19 +146,13 @@ def measure(
                 content = {"measure": part.measure, "arguments": item.arguments, "result": plain}
                 write_atomically(item.file, json.dumps(content, indent=1).encode())
         except InUseError:
-            echo(f"mqe: skipped, in use by another process: {item.task}/{item.variant}")
+            echo(f"lab: skipped, in use by another process: {item.task}/{item.variant}")
             continue
-        echo(f"mqe: wrote {item.file}")
-    rows = [] if dry_run else [row for item in items if item.file.is_file() for row in _rates(item)]
+        echo(f"lab: wrote {item.file}")
+    rows = [row for item in items if item.file.is_file() for row in _rates(item)]
     if rows:
         write_atomically(folder / RATES, table(rows).encode())
-    left = [
-        {"task": x.task, "variant": x.variant, "steps_left": 0, "seconds": None}
-        for x in chosen
-        if not x.file.is_file()
-    ]
-    total = {"steps_left": 0, "seconds": None}
-    return {"left": {"jobs": left, **total}, "report": [str(folder / RATES)] if rows else []}
+    return [item for item in chosen if not item.file.is_file()]
 
 
 def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -161,3 +191,25 @@ def _rates(item: Item) -> list[dict[str, Any]]:
         }
         for name, (low, high) in result.get("intervals", {}).items()
     ]
+
+
+def main() -> None:
+    """Makes the measurements that the command line names."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("file", type=Path, help="YAML file of measurements")
+    parser.add_argument("--part", help="name of one part in a file that maps names to parts")
+    parser.add_argument("--folder", type=Path, help="default: runs/PART, or runs/NAME of the file")
+    parser.add_argument("--cells", action="append", default=[], help="TASK/VARIANT, or a pattern")
+    parser.add_argument("--impl", default="auto", help="physics engine")
+    given = parser.parse_args()
+    folder = given.folder or Path("runs") / (given.part or given.file.stem)
+    measure(load(given.file, given.part), folder, given.impl, given.cells)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None
