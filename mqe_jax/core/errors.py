@@ -1,7 +1,11 @@
 """Errors that the command line prints as one line, and suggestions of the nearest allowed name."""
 
+import os
 import reprlib
+import sys
+import warnings
 from collections.abc import Collection, Iterable
+from pathlib import Path
 
 from mqe_jax.core.limits import SHOWN
 from mqe_jax.core.literal import line
@@ -34,6 +38,17 @@ class NonFiniteError(ArithmeticError):
 
     The command line prints it as one line, exit code 1.
     """
+
+
+def warn(message: str) -> None:
+    """Warns at the line outside of the package that led to the call."""
+    package = f"{Path(__file__).parents[1]}{os.sep}"
+    frame = sys._getframe()
+    level = 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
+        frame = frame.f_back
+        level += 1
+    warnings.warn(message, stacklevel=level)
 
 
 def one_line(error: BaseException) -> str:

@@ -5,11 +5,10 @@ parameters.
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from typing import Any
 
 from mqe_jax import skills
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, warn
 from mqe_jax.envs.task import Task
 from mqe_jax.physics.scene import Scene
 from mqe_jax.skills.control import Controller
@@ -66,10 +65,9 @@ def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Co
     uses_skill = task.control == "command" or npcs
     if uses_skill:
         skill.check_period(scene.timestep, num_substeps)
-    beyond = ", ".join(skill.untrained_commands(params.command_ranges))
-    if uses_skill and beyond:
-        text = f"command_ranges: the skill {params.skill!r} was not trained for {beyond}"
-        warnings.warn(text, stacklevel=2)
+        beyond = ", ".join(skill.untrained_commands(params.command_ranges))
+        if beyond:
+            warn(f"command_ranges: the skill {params.skill!r} was not trained for {beyond}")
     return Controller(
         mode=task.control,
         robot=task.robot,
