@@ -23,8 +23,9 @@ ActuatorParams = dict[str, dict[str, jax.Array]]
 
 
 def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
-    """Reads an actuator network (6-32-32-1, softsign) from safetensors: `0.weight` (32, 6),
-    `0.bias`, `2...`, `4...`.
+    """Returns an actuator network (6-32-32-1, softsign) from a safetensors file.
+
+    Its arrays are `0.weight` (32, 6), `0.bias` and those of layers `2` and `4`.
 
     InputError if the file is missing, damaged, or holds other names or shapes.
     """
@@ -32,26 +33,26 @@ def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
     if not file.is_file():
         raise InputError(f"actuator_network: no file {file}")
     flat = read_tensors(file, "actuator_network")
-    layers = linear_layers(
-        f"actuator_network {file}", flat, {"0": (6, 32), "2": (32, 32), "4": (32, 1)}
-    )
+    sizes = {"0": (6, 32), "2": (32, 32), "4": (32, 1)}
+    layers = linear_layers(f"actuator_network {file}", flat, sizes)
     return jax.tree.map(jnp.asarray, layers)
 
 
 def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Returns joint torques (...), N m, from joint position minus target, rad, and joint velocity,
-    rad/s (3, ...).
+    """Returns joint torques (...), N m.
 
-    The three are of this physics step and the two before.
+    `error`, joint position minus target, rad, and `velocity`, rad/s, are (3, ...): of this physics
+    step and the two before.
     """
+
+    def linear(layer: str, x: jax.Array) -> jax.Array:
+        weight = params[layer]["weight"]
+        return jnp.matmul(x, weight.T, precision="highest") + params[layer]["bias"]
+
     x = jnp.moveaxis(jnp.concatenate([error, velocity]), 0, -1)
     for layer in ("0", "2"):
-        x = jax.nn.soft_sign(
-            jnp.matmul(x, params[layer]["weight"].T, precision="highest") + params[layer]["bias"]
-        )
-    return (jnp.matmul(x, params["4"]["weight"].T, precision="highest") + params["4"]["bias"])[
-        ..., 0
-    ]
+        x = jax.nn.soft_sign(linear(layer, x))
+    return linear("4", x)[..., 0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,14 +81,17 @@ class NetworkActuators:
         fields: Mapping[str, jax.Array],
         xfrc_applied: jax.Array | None,
     ) -> "tuple[mjx.Data, Any, jax.Array]":
-        """Advances the physics by one environment step under joint targets (R, 12), rad; returns as
-        `Engine.step`.
+        """Advances the physics by one environment step under joint targets (R, 12), rad.
+
+        Returns as `Engine.step`, with the next recurrent state.
         """
 
         def substep(carry: Any, _: None) -> Any:
             data, (errors, velocities) = carry
-            errors = jnp.concatenate([(data.qpos[self.index.joint_qpos] - target)[None], errors])
-            velocities = jnp.concatenate([data.qvel[self.index.joint_qvel][None], velocities])
+            error = data.qpos[self.index.joint_qpos] - target
+            velocity = data.qvel[self.index.joint_qvel]
+            errors = jnp.concatenate([error[None], errors])
+            velocities = jnp.concatenate([velocity[None], velocities])
             limit = self.robot.torque_limit
             torque = jnp.clip(actuator_torque(self.params, errors, velocities), -limit, limit)
             ctrl = scatter(np.zeros(self.physics.model.nu), self.index.actuator, torque)

@@ -1,5 +1,6 @@
-"""Collision bits: two geoms collide where the contype of one shares a bit with the other's
-conaffinity.
+"""Collision bits of geoms.
+
+Two geoms collide if the contype of one shares a bit with the conaffinity of the other.
 """
 
 from mqe_jax.core.limits import Robots, bounds

@@ -28,8 +28,9 @@ class Poses(NamedTuple):
 
 
 def poses(model: mujoco.MjModel, data: "mjx.Data", bodies: Sequence[int] | np.ndarray) -> Poses:
-    """Returns the poses of bodies, given by their ids; quaternions in `data.qpos` are taken to be
-    normalised.
+    """Returns the poses of bodies, given by their ids.
+
+    Quaternions in `data.qpos` must be normalised.
     """
     found: dict[int, tuple[Any, Any]] = {0: (jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]))}
 
@@ -46,11 +47,13 @@ def _place(
     model: mujoco.MjModel, data: "mjx.Data", body: int, position: Any, quaternion: Any
 ) -> tuple[Any, Any]:
     """Returns the pose of a body in the pose of its parent."""
-    if (number := int(model.body_mocapid[body])) >= 0:
+    number = int(model.body_mocapid[body])
+    if number >= 0:
         return data.mocap_pos[number], data.mocap_quat[number]
     position = position + rotate(quaternion, _single(model.body_pos[body]))
     quaternion = compose(quaternion, _single(model.body_quat[body]))
-    for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+    first = model.body_jntadr[body]
+    for joint in range(first, first + model.body_jntnum[body]):
         address = int(model.jnt_qposadr[joint])
         kind = int(model.jnt_type[joint])
         if kind == _JOINT.mjJNT_FREE:
@@ -61,10 +64,11 @@ def _place(
         if kind == _JOINT.mjJNT_SLIDE:
             position = position + rotate(quaternion, axis) * moved
             continue
-        ball = kind == _JOINT.mjJNT_BALL
-        turned = compose(
-            quaternion, data.qpos[address : address + 4] if ball else rotation(axis, moved)
-        )
+        if kind == _JOINT.mjJNT_BALL:
+            turn = data.qpos[address : address + 4]
+        else:
+            turn = rotation(axis, moved)
+        turned = compose(quaternion, turn)
         if anchor.any():
             position = position + rotate(quaternion, anchor) - rotate(turned, anchor)
         quaternion = turned

@@ -56,8 +56,9 @@ class Object:
         return None
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        """Adds the body `name` to a scene, with its purely visual geoms if `visual`; no actuator,
-        no mocap body.
+        """Adds the body `name` to a scene, with its visual geoms if `visual`.
+
+        It may add neither an actuator nor a mocap body.
         """
         raise NotImplementedError(f"object {type(self).__name__}: add() is not defined")
 
@@ -65,8 +66,9 @@ class Object:
 def add_body(
     spec: mujoco.MjSpec, name: str, position: Sequence[float], mass: float, inertia: Any
 ) -> Any:
-    """Adds a body at a position (3,), m, of a mass, kg, and principal moments of inertia (3,), kg
-    m^2.
+    """Adds a body with an explicit inertia, and returns it.
+
+    `position` is (3,), m, `mass` in kg, and `inertia` the principal moments (3,), kg m^2.
     """
     body = spec.worldbody.add_body(name=name, pos=position)
     body.explicitinertial = True
@@ -122,9 +124,8 @@ class Box(Object):
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         x, y, z = np.square(self.size)
-        body = add_body(
-            spec, name, (0, 0, 0), self.mass, np.array([y + z, x + z, x + y]) * self.mass / 12
-        )
+        inertia = np.array([y + z, x + z, x + y]) * self.mass / 12
+        body = add_body(spec, name, (0, 0, 0), self.mass, inertia)
         _add_joint(body, "free", _JOINT.mjJNT_FREE)
         half = np.array(self.size) / 2
         add_solid(body, _GEOM.mjGEOM_BOX, WOOD, self.friction, size=half, **_FREE)
@@ -150,14 +151,13 @@ class Ball(Object):
         return Circle(self.radius)
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        # A thin shell on three slides and a ball joint: a free joint has a single damping
-        # coefficient.
-        body = add_body(spec, name, (0, 0, 0), self.mass, (2 / 3 * self.mass * self.radius**2,) * 3)
+        # A thin shell on three slides and a ball joint, as a free joint has only one damping.
+        inertia = 2 / 3 * self.mass * self.radius**2
+        body = add_body(spec, name, (0, 0, 0), self.mass, (inertia,) * 3)
         add_slides(body, "xyz", self.damping)
         _add_joint(body, "turn", _JOINT.mjJNT_BALL, self.angular_damping)
-        add_solid(
-            body, _GEOM.mjGEOM_SPHERE, (0.95, 0.95, 0.95, 1.0), size=(self.radius, 0, 0), **_FREE
-        )
+        white = (0.95, 0.95, 0.95, 1.0)
+        add_solid(body, _GEOM.mjGEOM_SPHERE, white, size=(self.radius, 0, 0), **_FREE)
         if visual:
             bodies.football(body, self.radius)
 
@@ -220,9 +220,8 @@ class Door(Object):
         return Rectangle(*self.size[:2])
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        body = add_body(
-            spec, name, (*self.position, self.size[2] / 2), self.mass, (1.0, 0.5, self.inertia)
-        )
+        place = (*self.position, self.size[2] / 2)
+        body = add_body(spec, name, place, self.mass, (1.0, 0.5, self.inertia))
         _add_joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
         half = np.array(self.size) / 2
         group = HIDDEN_GROUP if visual else 1
@@ -318,8 +317,9 @@ class Ring(Object):
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         body = spec.worldbody.add_body(name=name, pos=self.center)
-        for part in circle((0.0, 0.0), self.radius, width=self.width) if visual else ():
-            part.add(body)
+        if visual:
+            for part in circle((0.0, 0.0), self.radius, width=self.width):
+                part.add(body)
 
 
 @settings_class
@@ -341,13 +341,12 @@ class Sheep(Object):
         return Circle(self.radius)
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
-        # The lower end of the capsule is below the ground, so that it is cylindrical at ground
-        # level.
+        # The capsule's lower end is below the ground, so it is cylindrical at ground level.
         body = add_body(spec, name, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
         add_slides(body, "xy")
-        shape = {"size": (self.radius, 0, 0), "fromto": (0, 0, 0, 0, 0, self.height - self.radius)}
-        add_solid(
-            body, _GEOM.mjGEOM_CAPSULE, STONE, group=HIDDEN_GROUP if visual else 1, **shape, **_HELD
-        )
+        top = self.height - self.radius
+        shape = {"size": (self.radius, 0, 0), "fromto": (0, 0, 0, 0, 0, top)}
+        group = HIDDEN_GROUP if visual else 1
+        add_solid(body, _GEOM.mjGEOM_CAPSULE, STONE, group=group, **shape, **_HELD)
         if visual:
             bodies.sheep(body, self.radius, self.height)

@@ -6,8 +6,9 @@ from jax.typing import ArrayLike
 
 
 def quaternion_to_euler(quaternion: jax.Array) -> jax.Array:
-    """Converts wxyz quaternions (..., 4) to roll, pitch, yaw (..., 3), rad, applied in the order z,
-    y, x.
+    """Converts wxyz quaternions (..., 4) to roll, pitch, yaw (..., 3), rad.
+
+    These rotations are applied in the order z, y, x.
     """
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -18,8 +19,8 @@ def quaternion_to_euler(quaternion: jax.Array) -> jax.Array:
 
 def euler_to_quaternion(euler: jax.Array) -> jax.Array:
     """Converts roll, pitch, yaw (..., 3), rad, to wxyz quaternions (..., 4)."""
-    (cr, cp, cy) = jnp.moveaxis(jnp.cos(euler / 2), -1, 0)
-    (sr, sp, sy) = jnp.moveaxis(jnp.sin(euler / 2), -1, 0)
+    cr, cp, cy = jnp.moveaxis(jnp.cos(euler / 2), -1, 0)
+    sr, sp, sy = jnp.moveaxis(jnp.sin(euler / 2), -1, 0)
     return jnp.stack(
         [
             cr * cp * cy + sr * sp * sy,
@@ -48,15 +49,15 @@ def rotate_inverse(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
 def compose(first: jax.Array, second: ArrayLike) -> jax.Array:
     """Returns the products of wxyz quaternions (..., 4): rotations by `second`, then by `first`."""
     other = jnp.asarray(second)
-    (w, real) = (first[..., :1], other[..., :1])
-    (u, v) = (first[..., 1:], other[..., 1:])
+    w = first[..., :1]
+    u = first[..., 1:]
+    real = other[..., :1]
+    v = other[..., 1:]
     scalar = w * real - jnp.sum(u * v, axis=-1, keepdims=True)
     return jnp.concatenate([scalar, w * v + real * u + jnp.cross(u, v)], axis=-1)
 
 
 def rotation(axis: ArrayLike, angle: jax.Array) -> jax.Array:
-    """Returns the wxyz quaternions (..., 4) of rotations about unit axes (..., 3) by angles (...),
-    rad.
-    """
+    """Returns quaternions (..., 4) of rotations about unit axes (..., 3) by angles (...), rad."""
     half = angle[..., None] / 2
     return jnp.concatenate([jnp.cos(half), jnp.sin(half) * jnp.asarray(axis)], axis=-1)

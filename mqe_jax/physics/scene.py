@@ -1,6 +1,4 @@
-"""A scene: a track, N robots and movable objects, compiled to a MuJoCo model with its index
-tables.
-"""
+"""Scenes of a track, N robots and objects, compiled to a MuJoCo model with its index tables."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
@@ -109,18 +107,17 @@ class CompiledScene:
     def sample_anchors(self, key: jax.Array) -> jax.Array:
         """Samples the anchors' positions (G, 2), m."""
         anchors = self.layout.anchors
-        mean, spread = (
-            np.array([(a.position, a.spread) for a in anchors]).reshape(-1, 2, 2).swapaxes(0, 1)
-        )
-        return jnp.asarray(mean, jnp.float32) + spread * jax.random.uniform(
-            key, mean.shape, minval=-1.0
-        )
+        mean = np.array([anchor.position for anchor in anchors]).reshape(-1, 2)
+        spread = np.array([anchor.spread for anchor in anchors]).reshape(-1, 2)
+        offset = spread * jax.random.uniform(key, mean.shape, minval=-1.0)
+        return jnp.asarray(mean, jnp.float32) + offset
 
     def wall_positions(self, anchors: jax.Array) -> jax.Array:
         """Places the moving walls (W, 3) around anchors (G, 2), m: values for `mocap_pos`."""
         if not len(self.mocap_anchor):
             return jnp.zeros((0, 3))
-        return jnp.pad(anchors, ((0, 0), (0, 1)))[self.mocap_anchor] + self.mocap_offset
+        on_ground = jnp.pad(anchors, ((0, 0), (0, 1)))
+        return on_ground[self.mocap_anchor] + self.mocap_offset
 
 
 def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
@@ -141,8 +138,7 @@ def build_spec(scene: Scene, *, visual: bool) -> tuple[mujoco.MjSpec, Layout]:
     spec.option.ls_iterations = 8
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    # Without islands the C engine's solver iterates over the whole scene, as MJX does, and the
-    # engines agree.
+    # Without islands the C engine's solver iterates over the whole scene, as MJX does.
     spec.option.disableflags |= (
         mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_ISLAND
     )
@@ -177,15 +173,15 @@ def _robots_of(scene: Scene) -> tuple[Robot, ...]:
 
 
 def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> None:
-    """Adds an object, which may bring bodies, geoms, joints, sensors, tendons and equality
-    constraints.
+    """Adds an object, and checks that it changes no more than it may.
+
+    It may bring bodies, geoms, joints, sensors, tendons and equality constraints.
     """
 
     def counts() -> dict[str, float]:
-        mocap = sum(body.mocap for body in spec.bodies)
         return {
             "actuators": len(spec.actuators),
-            "mocap bodies": mocap,
+            "mocap bodies": sum(body.mocap for body in spec.bodies),
             "timestep": spec.option.timestep,
         }
 
@@ -239,21 +235,22 @@ def compile_scene(scene: Scene) -> CompiledScene:
 
 
 def _index_objects(model: mujoco.MjModel, names: Iterable[str]) -> Mapping[str, ObjectIndex]:
-    found = {}
-    for name in names:
-        body = model.body(f"object/{name}")
-        joints = range(body.jntadr[0], body.jntadr[0] + body.jntnum[0]) if body.jntnum[0] else ()
-        widths = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
-        qpos = []
-        qvel = []
-        for joint in joints:
-            coordinates, speeds = widths.get(mujoco.mjtJoint(model.jnt_type[joint]), (1, 1))
-            qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
-            qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
+    return {name: _index_object(model, f"object/{name}") for name in names}
 
-        def as_int(rows):
-            return np.asarray(rows, np.int32)
 
-        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"object/{name}")
-        found[name] = ObjectIndex(as_int(qpos), as_int(qvel), int(body.id), geom)
-    return found
+def _index_object(model: mujoco.MjModel, name: str) -> ObjectIndex:
+    widths = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+    body = model.body(name)
+    qpos = []
+    qvel = []
+    for number in range(body.jntnum[0]):
+        joint = body.jntadr[0] + number
+        coordinates, speeds = widths.get(mujoco.mjtJoint(model.jnt_type[joint]), (1, 1))
+        qpos.extend(model.jnt_qposadr[joint] + np.arange(coordinates))
+        qvel.extend(model.jnt_dofadr[joint] + np.arange(speeds))
+    return ObjectIndex(
+        qpos=np.asarray(qpos, np.int32),
+        qvel=np.asarray(qvel, np.int32),
+        body=int(body.id),
+        geom=mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name),
+    )

@@ -1,5 +1,6 @@
-"""What scenes look like: colours, and geoms without mass or contacts that only rendering models
-have; metres.
+"""What scenes look like: colours, and geoms without mass or contacts.
+
+Only rendering models have these geoms. Lengths are in metres.
 """
 
 import colorsys
@@ -13,8 +14,7 @@ Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
 
 
 def _perceived(colors: np.ndarray) -> np.ndarray:
-    """Returns sRGB colours (N, 3) in Oklab (N, 3), where distances are about as large as people see
-    them.
+    """Returns sRGB colours (N, 3) in Oklab (N, 3), whose distances are about those that people see.
 
     Lightness counts half, for it changes with the light on a robot. Source:
     bottosson.github.io/posts/oklab.
@@ -30,16 +30,16 @@ def _perceived(colors: np.ndarray) -> np.ndarray:
 
 
 def _palette(first: tuple[Color, ...], count: int) -> tuple[Color, ...]:
-    """Returns `count` colours: the first ones, then always the vivid one that differs most from all
-    before it.
+    """Returns `count` colours: the first ones, then vivid ones.
+
+    Each further one is the vivid colour that differs most from all before it.
     """
     levels = itertools.product(np.arange(30) / 30, ((0.85, 0.95), (0.9, 0.6), (0.45, 1.0)))
     vivid = np.array([colorsys.hsv_to_rgb(hue, *level) for hue, level in levels])
     candidates = _perceived(vivid)
     colors = list(first)
-    apart = np.linalg.norm(candidates[:, None] - _perceived(np.array(first)[:, :3]), axis=-1).min(
-        axis=1
-    )
+    differences = candidates[:, None] - _perceived(np.array(first)[:, :3])
+    apart = np.linalg.norm(differences, axis=-1).min(axis=1)
     while len(colors) < count:
         best = int(apart.argmax())
         red, green, blue = vivid[best].round(3).tolist()
@@ -64,8 +64,9 @@ UNNUMBERED = 4  # robots of a scene, at most, that differ by colour and bear no 
 
 
 def team_colors(size: int) -> tuple[int, ...]:
-    """Returns the colours of two teams, as indices of `ROBOT_COLORS`; of larger teams, one colour
-    each.
+    """Returns the colours of two teams, as indices of `ROBOT_COLORS`.
+
+    Each robot of a team of one or two has its own colour, larger teams have one colour each.
     """
     return {1: (0, 2), 2: (0, 1, 2, 3)}.get(size, (0,) * size + (2,) * size)
 
@@ -87,8 +88,8 @@ VISUAL_GROUP = 2  # of visual geoms
 GROUND_GROUP = 0  # of the floor and of what is painted on it
 HIDDEN_GROUP = 3  # of collision shapes that are not shown
 SITE_GROUP = 5  # of sites, which are not shown
-# first part of the names of sites that a camera keeps in view: gates, goals, finish lines
 GOAL_SITE = "goal"
+"""First part of the names of sites that a camera keeps in view: gates, goals, finish lines."""
 
 
 def mix(first: Color, second: Color, part: float) -> Color:

@@ -9,9 +9,8 @@ from mqe_jax.physics.appearance import DARK_WOOD, GLASS, INK, STEEL, WHITE, WOOD
 from mqe_jax.physics.appearance.shapes import Kind, add_box, add_rod, add_visual
 
 _PROUD = 0.004  # distance by which details stand out from the collision shape, m
-# Inked segments of each digit: three across from the top, the left upper and lower, the right upper
-# and lower.
 _DIGITS = "1011111 0000011 1110110 1110011 0101011 1111001 1111101 1000011 1111111 1111011".split()
+"""Inked segments of a digit: three across from the top, two on the left, two on the right."""
 
 
 def crate(body: Any, half: np.ndarray) -> None:
@@ -24,10 +23,8 @@ def crate(body: Any, half: np.ndarray) -> None:
                 size = np.full(3, thick)
                 place = np.zeros(3)
                 size[axis] = half[axis] + _PROUD
-                place[[other, third]] = (
-                    a * (half[other] - thick + _PROUD),
-                    b * (half[third] - thick + _PROUD),
-                )
+                place[other] = a * (half[other] - thick + _PROUD)
+                place[third] = b * (half[third] - thick + _PROUD)
                 add_box(body, DARK_WOOD, size, place)
     for axis, sign in ((0, 1), (1, -1)):  # diagonal braces
         size = np.full(3, 0.8 * thick)
@@ -54,10 +51,9 @@ def drum(body: Any, radius: float, height: float) -> None:
     """Adds an upright cylinder like a barrel: staves, two hoops and a lid."""
     half = height / 2
     add_visual(body, Kind.mjGEOM_CYLINDER, WOOD, size=(radius, half, 0), pos=(0, 0, half))
+    hoop = (radius + 0.006, 0.035, 0)
     for z in (0.16 * height, 0.84 * height):
-        add_visual(
-            body, Kind.mjGEOM_CYLINDER, STEEL, size=(radius + 0.006, 0.035, 0), pos=(0, 0, z)
-        )
+        add_visual(body, Kind.mjGEOM_CYLINDER, STEEL, size=hoop, pos=(0, 0, z))
     lid = mix(WOOD, WHITE, 0.35)
     add_visual(body, Kind.mjGEOM_CYLINDER, lid, size=(0.93 * radius, 0.003, 0), pos=(0, 0, height))
 
@@ -72,17 +68,14 @@ def door(body: Any, half: np.ndarray) -> None:
         add_box(body, YELLOW, (x, bar, z), (0, side * (y - bar), 0))
         add_box(body, INK, (1.03 * x, bar, 0.12 * z), (0, side * (y - bar), 0.45 * z))
         for height in (-1, 1):
-            add_box(
-                body,
-                STEEL,
-                (0.8 * x, y / 2, bar / 1.5),
-                (0, side * y / 2, height * (z - bar / 1.5)),
-            )
+            place = (0, side * y / 2, height * (z - bar / 1.5))
+            add_box(body, STEEL, (0.8 * x, y / 2, bar / 1.5), place)
 
 
 def plank(body: Any, half: np.ndarray, center: float) -> None:
-    """Adds the slats and the edges of a wooden plank of half extents (3,) whose centre is at x
-    `center`, m.
+    """Adds the slats and the edges of a wooden plank of half extents (3,), m.
+
+    Its centre is at x `center`, m.
     """
     x, y, z = half
     edges = np.linspace(-x, x, 15)
@@ -99,19 +92,15 @@ def trestle(world: Any, hinge: tuple[float, float, float], half_width: float) ->
     end = half_width + 0.09
     add_rod(world, STEEL, 0.04, (x, y - end, z), (x, y + end, z))
     for side in (-1, 1):
+        post = y + side * (end - 0.03)
         for lean in (-0.3, 0.3):
-            add_rod(
-                world,
-                DARK_WOOD,
-                0.035,
-                (x + lean, y + side * (end - 0.03), 0),
-                (x, y + side * (end - 0.03), z),
-            )
+            add_rod(world, DARK_WOOD, 0.035, (x + lean, post, 0), (x, post, z))
 
 
 def column(world: Any, radius: float, top: tuple[float, float, float]) -> None:
-    """Adds a column with a foot and a head from the ground up to the middle of its `top` (3,), m,
-    to the world.
+    """Adds a column with a foot and a head to the world.
+
+    It stands on the ground below the middle of its `top` (3,), m.
     """
     x, y, z = top
     add_rod(world, STEEL, radius, (x, y, 0), (x, y, z))
@@ -124,43 +113,22 @@ def sheep(body: Any, radius: float, height: float) -> None:
     wool: Color = (0.97, 0.95, 0.89, 1.0)
     face: Color = (0.22, 0.19, 0.18, 1.0)
     middle = 0.62 * height
-    add_visual(
-        body,
-        Kind.mjGEOM_ELLIPSOID,
-        wool,
-        size=(radius, 0.72 * radius, 0.30 * height),
-        pos=(0, 0, middle),
-    )
+
+    def curl(size: float, place: tuple[float, float, float]) -> None:
+        add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(size * radius, 0, 0), pos=place)
+
+    trunk = (radius, 0.72 * radius, 0.30 * height)
+    add_visual(body, Kind.mjGEOM_ELLIPSOID, wool, size=trunk, pos=(0, 0, middle))
     for x, count, wide in ((-0.75, 5, 0.52), (-0.25, 7, 0.72), (0.3, 7, 0.70), (0.75, 5, 0.50)):
         for angle in np.linspace(-0.35, np.pi + 0.35, count):
-            place = (
-                x * radius,
-                wide * radius * np.cos(angle),
-                middle + 0.25 * height * np.sin(angle),
-            )
-            add_visual(body, Kind.mjGEOM_SPHERE, wool, size=(0.31 * radius, 0, 0), pos=place)
-    head = (1.25 * radius, 0, 0.80 * height)
-    add_visual(
-        body,
-        Kind.mjGEOM_ELLIPSOID,
-        face,
-        size=(0.40 * radius, 0.26 * radius, 0.30 * radius),
-        pos=head,
-    )
-    add_visual(
-        body,
-        Kind.mjGEOM_SPHERE,
-        wool,
-        size=(0.27 * radius, 0, 0),
-        pos=(1.08 * radius, 0, 0.92 * height),
-    )
-    add_visual(
-        body,
-        Kind.mjGEOM_SPHERE,
-        wool,
-        size=(0.2 * radius, 0, 0),
-        pos=(-1.2 * radius, 0, 0.7 * height),
-    )
+            y = wide * radius * np.cos(angle)
+            z = middle + 0.25 * height * np.sin(angle)
+            curl(0.31, (x * radius, y, z))
+    head = np.array([0.40, 0.26, 0.30]) * radius
+    place = (1.25 * radius, 0, 0.80 * height)
+    add_visual(body, Kind.mjGEOM_ELLIPSOID, face, size=head, pos=place)
+    curl(0.27, (1.08 * radius, 0, 0.92 * height))
+    curl(0.2, (-1.2 * radius, 0, 0.7 * height))
     for side in (-1, 1):
         place = (1.08 * radius, side * 0.34 * radius, 0.84 * height)
         ear = np.array([0.1, 0.22, 0.08]) * radius
@@ -171,15 +139,13 @@ def sheep(body: Any, radius: float, height: float) -> None:
 
 
 def back_number(trunk: Any, number: int, top: float) -> None:
-    """Adds a robot's number to its trunk, on a white cloth whose height above the trunk's origin is
-    `top`, m.
+    """Adds a robot's number to its trunk, on a white cloth `top` m above the trunk's origin.
 
     It reads from behind the robot.
     """
-    # of a digit, along x and y; of a segment
     digits = str(number)
-    half = (0.09, 0.042)
-    thick = 0.014
+    half = (0.09, 0.042)  # of a digit, along x and y
+    thick = 0.014  # of a segment
     pitch = 2 * half[1] + 3 * thick
     add_box(trunk, WHITE, (0.13, 0.02 + pitch * len(digits) / 2, 0.003), (0, 0, top))
     lower = -half[0] / 2
@@ -188,8 +154,9 @@ def back_number(trunk: Any, number: int, top: float) -> None:
         middle = ((len(digits) - 1) / 2 - place) * pitch
         across = [(x, 0.0, (thick, half[1] + thick)) for x in (half[0], 0.0, -half[0])]
         along = [
-            (x, side * half[1], (upper + thick, thick)) for side in (1, -1) for x in (upper, lower)
+            (x, y, (upper + thick, thick)) for y in (half[1], -half[1]) for x in (upper, lower)
         ]
-        for inked, (x, y, (length, width)) in zip(_DIGITS[int(digit)], across + along, strict=True):
+        segments = zip(_DIGITS[int(digit)], across + along, strict=True)
+        for inked, (x, y, (length, width)) in segments:
             if inked == "1":
                 add_box(trunk, INK, (length, width, 0.003), (x, middle + y, top + 0.002))

@@ -57,18 +57,13 @@ def pads(poses: Sequence[Sequence[float]], colors: Sequence[int]) -> tuple[Shape
 def finish(x: float, y: Point, squares: int = 14, z: float = 0.0) -> tuple[Shape, ...]:
     """Returns a chequered line across the track at x, between two y, m."""
     side = (y[1] - y[0]) / squares
-    dark = [
-        rectangle(
-            (x + row * side, x + (row + 1) * side),
-            (y[0] + i * side, y[0] + (i + 1) * side),
-            INK,
-            4,
-            z,
-        )
-        for row in range(2)
-        for i in range(row, squares, 2)
-    ]
-    return rectangle((x, x + 2 * side), y, WHITE, 3, z), *dark
+    shapes = [rectangle((x, x + 2 * side), y, WHITE, 3, z)]
+    for row in range(2):
+        along = (x + row * side, x + (row + 1) * side)
+        for i in range(row, squares, 2):
+            across = (y[0] + i * side, y[0] + (i + 1) * side)
+            shapes.append(rectangle(along, across, INK, 4, z))
+    return tuple(shapes)
 
 
 def track(
@@ -86,9 +81,7 @@ def hall(x: Point, y: Point, color: Color, shapes: Sequence[Shape] = ()) -> Grou
 
 
 def halves(x: Point, y: Point) -> Ground:
-    """Returns a floor whose halves are those of the first and of the second team, with a line
-    between them.
-    """
+    """Returns a floor with a line between the halves of the first and of the second team."""
     blue = mix(ROBOT_COLORS[0], STONE, 0.74)
     red = mix(ROBOT_COLORS[2], STONE, 0.74)
     middle = line((x[0], 0.0), (x[1], 0.0))
@@ -96,8 +89,9 @@ def halves(x: Point, y: Point) -> Ground:
 
 
 def warehouse(x: Point, width: float, goal_x: float) -> Ground:
-    """Returns a concrete floor between two x, m, with yellow lines, and a painted zone beyond the
-    gate at `goal_x`.
+    """Returns a concrete floor between two x, m, with yellow lines.
+
+    The zone beyond the gate at `goal_x` is painted.
     """
     half = width / 2 - 0.25
     zone = rectangle((goal_x, x[1]), (-width / 2, width / 2), (0.55, 0.72, 0.58, 1.0), 2)
@@ -106,8 +100,9 @@ def warehouse(x: Point, width: float, goal_x: float) -> Ground:
 
 
 def meadow(x_range: Point, width: float, goal_x: float) -> Ground:
-    """Returns grass between two x, m, with tufts and flowers, and a pen beyond the gate at
-    `goal_x`.
+    """Returns grass between two x, m, with tufts and flowers.
+
+    A pen is beyond the gate at `goal_x`.
     """
     begin, end = x_range
     random = np.random.default_rng(4)
@@ -122,28 +117,28 @@ def meadow(x_range: Point, width: float, goal_x: float) -> Ground:
         radius = random.uniform(0.1, 0.35)
         x = random.uniform(begin + 0.4, goal_x - 0.5)
         y = random.uniform(-0.44, 0.44) * width
-        if all(
-            np.hypot(x - other_x, y - other_y) > radius + other
-            for other_x, other_y, other in patches
-        ):
+        apart = [np.hypot(x - a, y - b) > radius + other for a, b, other in patches]
+        if all(apart):
             patches.append((x, y, radius))
             shapes.append(mark((x, y, 0.0), (radius,), tones[number % 2], 2))
     for number in range(round(3.0 * (end - begin))):
         x = random.uniform(begin + 0.2, end - 0.2)
         y = random.choice([-1, 1]) * random.uniform(0.52, 0.85) * width
-        flower = number % 3 == 0
-        half = (0.045, 0.045, 0.04) if flower else (0.16, 0.12, 0.10)
-        color = ((0.98, 0.93, 0.55, 1.0), WHITE)[number % 2] if flower else tones[0]
-        shapes.append(tuft((x, y, 0.06 if flower else 0.0), half, color))
+        if number % 3 == 0:  # a flower
+            color = ((0.98, 0.93, 0.55, 1.0), WHITE)[number % 2]
+            shapes.append(tuft((x, y, 0.06), (0.045, 0.045, 0.04), color))
+        else:
+            shapes.append(tuft((x, y, 0.0), (0.16, 0.12, 0.10), tones[0]))
     return Ground(shapes=tuple(shapes))
 
 
 def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
-    """Returns a football pitch between two goal lines x; `goal` is the width, height and depth of
-    both goals, m.
+    """Returns a football pitch between two goal lines x, m.
+
+    `goal` is the width, height and depth of both goals, m.
     """
     half = width / 2
-    (mouth, height, depth) = goal
+    mouth, height, depth = goal
     middle = sum(x) / 2
     stripes = itertools.pairwise(np.linspace(x[0] - depth, x[1] + depth, 13).tolist())
     tones = ((0.33, 0.57, 0.29, 1.0), (0.38, 0.63, 0.33, 1.0))
@@ -191,25 +186,29 @@ def _goal(x: float, depth: float, half: float, height: float, color: Color) -> l
 def climb(
     length: float, width: float, top: tuple[float, float, float], size: tuple[float, float, float]
 ) -> Ground:
-    """Returns a running track with a finish line on a platform with this centre of its top and
-    these extents, m.
+    """Returns a running track with a finish line on a platform.
+
+    `top` is the centre of the platform's top, `size` its extents, m.
     """
-    (x, y, z) = top
-    half = size[1] / 2
-    base = rectangle((x - size[0] / 2, x + size[0] / 2), (y - half, y + half), WHITE, 1, z)
-    line_ = finish(x - size[0] / 2, (y - half, y + half), 10, z)
-    points = tuple((x + sign * size[0] / 2, y, z) for sign in (-1, 1))
-    return dataclasses.replace(track((0.0, length), width, 4, (base, *line_)), goals=points)
+    x, y, z = top
+    near = x - size[0] / 2
+    far = x + size[0] / 2
+    across = (y - size[1] / 2, y + size[1] / 2)
+    base = rectangle((near, far), across, WHITE, 1, z)
+    shapes = (base, *finish(near, across, 10, z))
+    points = ((near, y, z), (far, y, z))
+    return dataclasses.replace(track((0.0, length), width, 4, shapes), goals=points)
 
 
 def dohyo(
     top: tuple[float, float, float], size: tuple[float, float, float], radius: float
 ) -> Ground:
-    """Returns a sumo stage on a platform, given by its top's centre and its extents, with a ring of
-    a radius, m.
+    """Returns a sumo stage on a platform, with a ring of a radius, m.
+
+    `top` is the centre of the platform's top, `size` its extents, m.
     """
-    (x, y, z) = top
-    (length, width, _) = size
+    x, y, z = top
+    length, width, _ = size
     sand = (0.90, 0.77, 0.55, 1.0)
     edge = (0.72, 0.55, 0.36, 1.0)
     shapes: list[Shape] = [
@@ -230,8 +229,7 @@ def dohyo(
 
 
 def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top: float) -> Ground:
-    """Returns a river, with planks on a bridge and stones with the teams' flags on its two
-    platforms.
+    """Returns a river with a bridge of planks between two platforms of stone with the teams' flags.
 
     `platforms` are their centres' x, `ends` those of the bridge, `widths` the platforms' extents
     along x and y and the bridge's width, `top` their height, m.
@@ -243,9 +241,8 @@ def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top
     for _ in range(70):
         x = random.uniform(ends[0] - 0.8, ends[1] + 0.8)
         y = random.uniform(-6.0, 6.0)
-        shapes.append(
-            mark((x, y, 0.0), (random.uniform(0.04, 0.06), random.uniform(0.3, 0.8)), foam, 2)
-        )
+        wave = (random.uniform(0.04, 0.06), random.uniform(0.3, 0.8))
+        shapes.append(mark((x, y, 0.0), wave, foam, 2))
     length, width, bridge = widths
     planks = np.linspace(*ends, 24).tolist()
     for i, (a, b) in enumerate(itertools.pairwise(planks)):
@@ -256,16 +253,17 @@ def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top
         x_range = (x - length / 2, x + length / 2)
         y_range = (-width / 2, width / 2)
         shapes.append(rectangle(x_range, y_range, mix(ROBOT_COLORS[color], STONE, 0.55), 1, top))
-        shapes += outline(
-            (x_range[0] + 0.06, x_range[1] - 0.06), (y_range[0] + 0.06, y_range[1] - 0.06), z=top
-        )
+        inner_x = (x_range[0] + 0.06, x_range[1] - 0.06)
+        inner_y = (y_range[0] + 0.06, y_range[1] - 0.06)
+        shapes += outline(inner_x, inner_y, z=top)
         points += [(x, y, top) for y in y_range]
     return Ground(shapes=tuple(shapes), goals=tuple(points))
 
 
 def add_light(spec: mujoco.MjSpec, middle: tuple[float, float, float]) -> None:
-    """Adds a light that casts shadows, a sky, and the material of the ground, which renderers give
-    its geoms.
+    """Adds a light that casts shadows, a sky, and the material of the ground.
+
+    Renderers give this material to the ground's geoms.
     """
     spec.worldbody.add_light(
         pos=middle,

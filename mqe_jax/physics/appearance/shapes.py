@@ -71,8 +71,9 @@ class Shape(NamedTuple):
 def mark(
     center: Place, size: tuple[float, ...], color: Color = WHITE, level: int = 1, yaw: float = 0.0
 ) -> Shape:
-    """Returns a flat box of extents `size` (2,), or a disc of radius `size` (1,), m, turned by
-    `yaw` about z.
+    """Returns a flat box of extents `size` (2,), or a disc of radius `size` (1,), m.
+
+    `yaw` turns it about z.
 
     `center` is that of its top, with the height of what it is painted on; higher levels cover lower
     ones.
@@ -87,12 +88,8 @@ def mark(
 
 def rod(start: Place, end: Place, radius: float, color: Color) -> Shape:
     """Returns a cylinder between two points, m, such as a goal post."""
-    return Shape(
-        Kind.mjGEOM_CYLINDER,
-        color,
-        VISUAL_GROUP,
-        {"size": (radius, 0, 0), "fromto": (*start, *end)},
-    )
+    options = {"size": (radius, 0, 0), "fromto": (*start, *end)}
+    return Shape(Kind.mjGEOM_CYLINDER, color, VISUAL_GROUP, options)
 
 
 def tuft(center: Place, half: Place, color: Color) -> Shape:
@@ -102,12 +99,8 @@ def tuft(center: Place, half: Place, color: Color) -> Shape:
 
 def slab(center: Place, size: Place, color: Color) -> Shape:
     """Returns an upright box of extents (3,), m, such as the side of a stage."""
-    return Shape(
-        Kind.mjGEOM_BOX,
-        color,
-        VISUAL_GROUP,
-        {"size": [extent / 2 for extent in size], "pos": center},
-    )
+    options = {"size": [extent / 2 for extent in size], "pos": center}
+    return Shape(Kind.mjGEOM_BOX, color, VISUAL_GROUP, options)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,16 +133,12 @@ def line(
     z: float = 0.0,
 ) -> Shape:
     """Returns a straight line between two points (2,), m."""
-    (x0, y0) = start
-    (x1, y1) = end
+    x0, y0 = start
+    x1, y1 = end
+    middle = ((x0 + x1) / 2, (y0 + y1) / 2, z)
+    length = float(np.hypot(x1 - x0, y1 - y0))
     yaw = float(np.arctan2(y1 - y0, x1 - x0))
-    return mark(
-        ((x0 + x1) / 2, (y0 + y1) / 2, z),
-        (float(np.hypot(x1 - x0, y1 - y0)), width),
-        color,
-        level,
-        yaw,
-    )
+    return mark(middle, (length, width), color, level, yaw)
 
 
 def outline(
@@ -157,10 +146,8 @@ def outline(
 ) -> tuple[Shape, ...]:
     """Returns the four edges of a rectangle."""
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
-    return tuple(
-        line(a, b, color, width, z=z)
-        for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
-    )
+    edges = zip(corners, corners[1:] + corners[:1], strict=True)
+    return tuple(line(a, b, color, width, z=z) for a, b in edges)
 
 
 def circle(center: Point, radius: float, width: float) -> tuple[Shape, ...]:
@@ -187,8 +174,9 @@ _RAIL = 0.045  # half height of a fence's rails, m
 def side_wall(
     world: Any, style: Style, center: np.ndarray, half: tuple[float, float, float], yaw: float
 ) -> None:
-    """Adds the look of a fixed wall of half extents (thickness, length, height) at its `center`
-    (3,), m.
+    """Adds the look of a fixed wall at its `center` (3,), m.
+
+    Its half extents are thickness, length and height, m.
     """
     x, y, z = half
     quat = about_z(yaw)
@@ -198,22 +186,26 @@ def side_wall(
         place = (center[0] + turned[0], center[1] + turned[1], height)
         add_box(world, color, size, place, quat=quat, group=WALL_GROUP)
 
-    wood = style == "fence"
-    rail, post = (WOOD, DARK_WOOD) if wood else (STEEL, STEEL)
-    for part in (0.35, 0.85) if wood else (1.0,):
-        box(rail, (0.6 * x, y, _RAIL if wood else 0.015), 0.0, 2 * part * z)
     count = max(2, round(2 * y / 1.25) + 1)
-    for along in np.linspace(0.03 - y, y - 0.03, count):
-        box(post, (x, 0.035 if wood else 0.02, z), float(along), z)
-    if not wood:
+    posts = np.linspace(0.03 - y, y - 0.03, count).tolist()
+    if style == "fence":
+        for part in (0.35, 0.85):
+            box(WOOD, (0.6 * x, y, _RAIL), 0.0, 2 * part * z)
+        for along in posts:
+            box(DARK_WOOD, (x, 0.035, z), along, z)
+    else:
+        box(STEEL, (0.6 * x, y, 0.015), 0.0, 2 * z)
+        for along in posts:
+            box(STEEL, (x, 0.02, z), along, z)
         board = _BOARD * 2 * z
         box(NAVY, (x, y, board / 2), 0.0, board / 2)
         box(WHITE, (1.05 * x, y, 0.012), 0.0, board)
 
 
 def gate_wall(body: Any, style: Style, half: np.ndarray, inner: float) -> None:
-    """Adds the look of a wall of half extents (3,), m, to its body; `inner` is the sign of y
-    towards the gap.
+    """Adds the look of a wall of half extents (3,), m, to its body.
+
+    `inner` is the sign of y towards the gap.
     """
     x, y, z = half
     if style == "fence":

@@ -27,18 +27,22 @@ that is preferred on this machine."""
 
 
 def resolve(impl: str = "auto") -> str:
-    """Returns the name of an engine that can run here; `auto` is warp on an NVIDIA GPU, c on a CPU,
-    else jax.
+    """Returns the name of an engine that can run here.
+
+    `auto` is warp on an NVIDIA GPU, c on a CPU, and jax elsewhere. InputError for an unknown engine
+    or one that cannot run here.
     """
     if known_name("impl: unknown engine", impl, ("auto", *ENGINES)) == "auto":
         return next(name for name in ENGINES if pkgutil.resolve_name(ENGINES[name]).is_preferred())
-    if (obstacle := pkgutil.resolve_name(ENGINES[impl]).obstacle()) is not None:
+    obstacle = pkgutil.resolve_name(ENGINES[impl]).obstacle()
+    if obstacle is not None:
         raise InputError(f"impl {impl!r} {obstacle}")
     return impl
 
 
 def make(model: mujoco.MjModel, *, impl: str = "auto", **options: Any) -> Engine:
-    """Creates an engine by name for a compiled model; the options are those of `Engine`; InputError
-    as `resolve`.
+    """Creates an engine by name for a compiled model.
+
+    The options are those of `Engine`. InputError as `resolve`.
     """
     return pkgutil.resolve_name(ENGINES[resolve(impl)])(model, **options)

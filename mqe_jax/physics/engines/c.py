@@ -34,8 +34,7 @@ class CEngine(Engine):
     def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
         super().__init__(model, **options)
         own = model.__copy__()
-        # No silent reset: a diverged environment keeps its non-finite state, so that the task can
-        # terminate it.
+        # No silent reset: the task terminates environments whose state is not finite.
         own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         content = np.zeros(mujoco.mj_sizeModel(own), np.uint8)
         mujoco.mj_saveModel(own, None, content)
@@ -64,9 +63,8 @@ class CEngine(Engine):
 
     def blank(self) -> "mjx.Data":
         device = jax.local_devices(backend="cpu")[0]
-        return private.without_pointers(
-            private.load_mjx().make_data(self.model, device, impl="cpp")
-        )
+        data = private.load_mjx().make_data(self.model, device, impl="cpp")
+        return private.without_pointers(data)
 
     def advance(
         self, data: "mjx.Data", fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
@@ -91,19 +89,19 @@ class CEngine(Engine):
         return data, jnp.zeros((), bool)
 
     def _number(self, *options: Any) -> int:
-        """Returns a number that names the physics with these options: of its content, not of this
-        process.
+        """Returns a number that names the physics with these options.
+
+        It depends on their content, not on this process.
         """
         motors = () if self.motors is None else dataclasses.astuple(self.motors)
+        numbers = [np.asarray(value).tolist() for value in motors]
         content = hashlib.sha256(self._content)
-        content.update(repr((*options, [np.asarray(value).tolist() for value in motors])).encode())
+        content.update(repr((*options, numbers)).encode())
         return int.from_bytes(content.digest()[:8], "little", signed=True)
 
 
 class _Stepper:
-    """Steps environments of one model in batches, which it keeps for the next call until its engine
-    is gone.
-    """
+    """Steps environments of one model in batches, which it keeps until its engine is gone."""
 
     def __init__(self, model: mujoco.MjModel, motors: Motors | None) -> None:
         self._model = model
@@ -126,8 +124,9 @@ class _Stepper:
     def call(
         self, names: tuple[str, ...], forced: bool, substeps: int, *arrays: np.ndarray
     ) -> np.ndarray:
-        """Returns positions, velocities, accelerations and sensors after some physics steps (N, sum
-        of the sizes).
+        """Returns positions, velocities, accelerations and sensors after `substeps` physics steps.
+
+        They are rows (N, sum of the sizes).
         """
         qpos, *rest = arrays
         lead = qpos.shape[:-1]
@@ -136,9 +135,11 @@ class _Stepper:
         key = count, names, forced
         with self._lock:
             idle = self._idle.setdefault(key, [])
-            batch, rows = (
-                idle.pop() if idle else (Batch(self._model, nsim=count), self._repeat(count))
-            )
+            if idle:
+                batch, rows = idle.pop()
+            else:
+                batch = Batch(self._model, nsim=count)
+                rows = self._repeat(count)
         try:
             row = self._step_batch(batch, rows, names, forced, substeps, flat)
         finally:
@@ -155,8 +156,9 @@ class _Stepper:
         substeps: int,
         flat: Iterator[np.ndarray],
     ) -> np.ndarray:
-        """Returns the results of a batch (N, sum of the sizes), from the arguments of the call (N,
-        ...).
+        """Returns the results of a batch (N, sum of the sizes).
+
+        `flat` are the arguments of the call (N, ...).
         """
         start = {name: next(flat) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
         for name, values in start.items():
@@ -178,9 +180,7 @@ class _Stepper:
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
     def _repeat(self, count: int) -> _Rows | None:
-        """Returns motors, gain (count, J) and bias (count, J, 3) of the model, repeated for each
-        environment.
-        """
+        """Returns motors, gain (count, J) and bias (count, J, 3), a row for each environment."""
         if self._motors is None:
             return None
         gain = self._model.actuator_gainprm[:, 0]
@@ -244,8 +244,9 @@ def _drive(
 def _step_limited(
     batch: Batch, motors: Motors, substeps: int, ids: np.ndarray, gain: np.ndarray, bias: np.ndarray
 ) -> None:
-    """Steps the environments `ids` with the limits evaluated in every physics step; `motors` has a
-    row for each.
+    """Steps the environments `ids`, with the motors' limits in every physics step.
+
+    `motors`, `gain` and `bias` have a row for each of them.
     """
     rows = slice(None) if len(ids) == batch.nsim else ids[:, None]  # numpy is faster with a slice
     qpos = batch.bind("qpos")
@@ -258,8 +259,9 @@ def _step_limited(
     base = armature[rows, speeds]
     try:
         for _ in range(substeps):
-            joints = qpos[rows, angles].astype(np.float32), qvel[rows, speeds].astype(np.float32)
-            ctrl[ids], added = motors.limit(np, asked, *joints, gain, bias)
+            position = qpos[rows, angles].astype(np.float32)
+            velocity = qvel[rows, speeds].astype(np.float32)
+            ctrl[ids], added = motors.limit(np, asked, position, velocity, gain, bias)
             armature[rows, speeds] = base + added if added.any() else base
             batch.step(ids=ids)
             _clamp(batch, motors, rows)
@@ -268,8 +270,9 @@ def _step_limited(
 
 
 def _clamp(batch: Batch, motors: Motors, rows: Any) -> None:
-    """Clamps the joint speeds of environments after a physics step; `rows` is their column of ids,
-    or a slice.
+    """Clamps the joint speeds of environments after a physics step.
+
+    `rows` is the column of their ids, or a slice.
     """
     qpos = batch.bind("qpos")
     qvel = batch.bind("qvel")
@@ -282,4 +285,5 @@ def _clamp(batch: Batch, motors: Motors, rows: Any) -> None:
 
 def _columns(bias: np.ndarray) -> np.ndarray:
     """Returns coefficients (..., J, 3) in single precision, each column contiguous."""
-    return np.moveaxis(np.ascontiguousarray(np.moveaxis(bias, -1, 0), np.float32), 0, -1)
+    columns = np.ascontiguousarray(np.moveaxis(bias, -1, 0), np.float32)
+    return np.moveaxis(columns, 0, -1)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mqe_jax.core import threefry  # noqa: F401  (for programs on a CPU
+from mqe_jax.core import threefry  # noqa: F401  (for programs on a CPU)
 from mqe_jax.physics.robots.motors import Motors
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ class Engine(abc.ABC):
     impl: ClassVar[str]  # name of the engine in the registry
     model: mujoco.MjModel  # compiled model
     _: dataclasses.KW_ONLY
-    # motors that drive its actuators; without them the actuators have no speed limit
     motors: Motors | None = None
+    """Motors that drive the actuators; without them the actuators have no speed limit."""
     num_substeps: int = 4  # physics steps per call of `step`
     num_envs: int = 4096  # environments for which buffers are sized that environments share
     contacts_per_env: int = 32
@@ -54,15 +54,17 @@ class Engine(abc.ABC):
 
     @classmethod
     def is_preferred(cls) -> bool:
-        """Returns whether `auto` chooses this engine on this machine, unless one before it in the
-        registry is.
+        """Returns whether `auto` chooses this engine here, unless it chooses an earlier one.
+
+        Engines are asked in the order of the registry.
         """
         return False
 
     @classmethod
     def obstacle(cls) -> str | None:
-        """Returns why this machine cannot run the engine, as the end of "impl 'NAME' ..."; None if
-        it can.
+        """Returns why this machine cannot run the engine, or None.
+
+        The text ends a line that begins with "impl 'NAME'".
         """
         return None
 
@@ -78,8 +80,7 @@ class Engine(abc.ABC):
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances one environment by `num_substeps` physics steps under the control `data.ctrl`,
-        which stays.
+        """Advances one environment by physics steps under the control `data.ctrl`, which stays.
 
         `fields` are as of `step`, whose overflow flag it also returns; `forced` says whether
         `data.xfrc_applied` may differ from zero.
@@ -88,8 +89,9 @@ class Engine(abc.ABC):
     def init(
         self, qpos: jax.Array, qvel: jax.Array, mocap_pos: jax.Array, ctrl: jax.Array
     ) -> mjx.Data:
-        """Returns the initial state of one environment, without a forward pass; `mocap_pos` are
-        (nmocap, 3), m.
+        """Returns the initial state of one environment, without a forward pass.
+
+        `mocap_pos` is (nmocap, 3), m.
         """
 
         def as_float(x):
@@ -116,8 +118,9 @@ class Engine(abc.ABC):
         xfrc_applied: jax.Array | None = None,
         num_substeps: int | None = None,
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances one environment by steps under a constant control (nu,), joint targets (rad) or
-        torques (N m).
+        """Advances one environment by physics steps under a constant control (nu,).
+
+        The control is joint targets, rad, or torques, N m.
 
         `fields` are the model fields that this environment overrides, by their `mjModel` names,
         `xfrc_applied` external forces and torques on the bodies (nbody, 6), N and N m, world frame.
@@ -132,9 +135,7 @@ class Engine(abc.ABC):
             return self.advance(data, dict(fields or {}), xfrc_applied is not None, substeps)
 
     def merge(self, choose: jax.Array, first: mjx.Data, second: mjx.Data) -> mjx.Data:
-        """Returns `first` where `choose` () is true, else `second`; copies only the state
-        fields.
-        """
+        """Returns `first` where `choose` () is true, else `second`; copies only state fields."""
         merged = {
             name: jnp.where(choose, getattr(first, name), getattr(second, name))
             for name in STATE_FIELDS
@@ -143,8 +144,9 @@ class Engine(abc.ABC):
 
     @functools.cached_property
     def _template(self) -> mjx.Data:
-        """Template of `init`, created on first use: importing MJX takes a second, which `mqe tasks`
-        avoids.
+        """Template of `init`.
+
+        It is created on first use: importing MJX takes a second, which `mqe tasks` avoids.
         """
         with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
             return self.blank()

@@ -1,5 +1,6 @@
-"""Host functions called from compiled programs by name and number, so that JAX's compilation cache
-can store them.
+"""Host functions that compiled programs call by number.
+
+JAX's compilation cache can store these programs.
 
 JAX does not store programs that contain its own callbacks, since those hold addresses of this
 process. Here a program holds a number that a function has in every process; XLA calls one handler,
@@ -53,15 +54,15 @@ _Buffer = _structure(
     "_Buffer", ("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64))
 )
 _Items = ("size", c_int64), ("types", c_void_p)
-# XLA_FFI_Args and XLA_FFI_Rets
 _List = _structure("_List", *_Items, ("items", POINTER(POINTER(_Buffer))))
+"""XLA_FFI_Args and XLA_FFI_Rets."""
 _Attributes = _structure(
     "_Attributes", *_Items, ("names", c_void_p), ("items", POINTER(POINTER(_Scalar)))
 )
 _Error = _structure("_Error", ("message", c_char_p), ("code", c_int))
 _Create = ctypes.CFUNCTYPE(c_void_p, POINTER(_Error))
-# its beginning
 _Api = _structure("_Api", ("version", _Version), ("internal", c_void_p), ("create_error", _Create))
+"""The beginning of XLA_FFI_Api."""
 _Frame = _structure(
     "_Frame",
     ("api", POINTER(_Api)),
@@ -96,8 +97,9 @@ def host_call(
     result: jax.ShapeDtypeStruct,
     arguments: Sequence[jax.Array],
 ) -> jax.Array:
-    """Returns the result of a host function in a compiled program; batched with all its arguments
-    by `vmap`.
+    """Returns the result of a host function in a compiled program.
+
+    `vmap` batches it with all its arguments.
 
     Functions of one number (64 bits), the same in every process, do the same; those whose owners
     live are preferred, which they must not reference. `result` has the shape and dtype without
@@ -108,14 +110,13 @@ def host_call(
     _latest[number] = function
     while len(_latest) > _KEPT:
         _latest.pop(next(iter(_latest)), None)
+    batching: Any = {"vmap_method": "broadcast_all"}
     if FITS:
-        out = jax.ffi.ffi_call(TARGET, result, vmap_method="broadcast_all")(
-            *arguments, number=np.int64(number)
-        )
+        call = jax.ffi.ffi_call(TARGET, result, **batching)
+        out = call(*arguments, number=np.int64(number))
     else:
-        out = jax.pure_callback(
-            functools.partial(_call, number), result, *arguments, vmap_method="broadcast_all"
-        )
+        call = functools.partial(_call, number)
+        out = jax.pure_callback(call, result, *arguments, **batching)
     assert isinstance(out, jax.Array)
     return out
 
@@ -162,15 +163,14 @@ def _handler(pointer: Any) -> int | None:
 
 
 def _fits() -> bool:
-    """Returns whether JAX's C interface has this version, or a later one of the same major
-    version.
-    """
+    """Returns whether JAX's C interface has this major version, and at least this minor one."""
     header = Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h"
     text = header.read_text("utf-8", "replace") if header.is_file() else ""
-    major, minor = (
-        re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")
-    )
-    return bool(major and minor and int(major[1]) == _VERSION[0] and int(minor[1]) >= _VERSION[1])
+    major = re.search(r"define XLA_FFI_API_MAJOR (\d+)", text)
+    minor = re.search(r"define XLA_FFI_API_MINOR (\d+)", text)
+    if not major or not minor:
+        return False
+    return int(major[1]) == _VERSION[0] and int(minor[1]) >= _VERSION[1]
 
 
 FITS = _fits()
@@ -181,8 +181,9 @@ if FITS:
 
 @atexit.register
 def _finish() -> None:
-    """Waits for programs whose results exist: their threads cannot call Python while the
-    interpreter ends.
+    """Waits for programs whose results exist.
+
+    Their threads cannot call Python while the interpreter ends.
     """
     for array in jax.live_arrays():
         with contextlib.suppress(Exception):  # deleted, or the result of a program that failed

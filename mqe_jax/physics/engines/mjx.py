@@ -25,30 +25,37 @@ _BIT = mujoco.mjtDisableBit
 _JACOBIAN = mujoco.mjtJacobian
 _FRICTION: int = int(_BIT.mjDSBL_FRICTIONLOSS)
 _PASSIVE: int = int(_BIT.mjDSBL_SPRING) | int(_BIT.mjDSBL_DAMPER)
-# degrees of freedom up to which Warp's line search needs no extra kernels for dense Jacobians
 _MAX_DENSE = 50
-# Degrees of freedom above which Warp's solver skips zeros by default. On an H200 this gains nothing
-# with four robots (78, the most of the paper) and a third with eight (150): sizes/warp in
-# results/measurements.json.
+"""Degrees of freedom up to which Warp's line search needs no extra kernels for dense Jacobians."""
 _MAX_FULL = 80
+"""Degrees of freedom above which Warp's solver skips zeros by default.
 
-# The model fields of each term of the dynamics; where all are zero, so is the term. Without springs
-# and dampers Warp and MuJoCo compute no passive force at all, so theirs include gravity
-# compensation and adhesion.
+On an H200 this gains nothing with four robots (78, the most of the paper) and a third with eight
+(150): sizes/warp in results/measurements.json.
+"""
 _TERMS: dict[int, tuple[str, ...]] = {
     _FRICTION: ("dof_frictionloss", "tendon_frictionloss"),
     _PASSIVE: (
-        *("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"),
-        *("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
-        *(
-            "actuator_damping",
-            "actuator_dampingpoly",
-            "body_gravcomp",
-            "geom_adhesion",
-            "pair_adhesion",
-        ),
+        "jnt_stiffness",
+        "jnt_stiffnesspoly",
+        "tendon_stiffness",
+        "tendon_stiffnesspoly",
+        "dof_damping",
+        "dof_dampingpoly",
+        "tendon_damping",
+        "tendon_dampingpoly",
+        "actuator_damping",
+        "actuator_dampingpoly",
+        "body_gravcomp",
+        "geom_adhesion",
+        "pair_adhesion",
     ),
 }
+"""The model fields of each term of the dynamics: if all are zero, so is the term.
+
+Without springs and dampers Warp and MuJoCo compute no passive force at all, so the fields of
+`_PASSIVE` include gravity compensation and adhesion.
+"""
 
 
 class MjxEngine(Engine):
@@ -58,19 +65,17 @@ class MjxEngine(Engine):
     unroll = 1
     """Physics steps in one iteration of the loop over them; more compile longer."""
     last_apart = False
-    """Whether the last physics step is not in the loop, and the others compute no sensors, which
-    nothing reads."""
+    """Whether only the last physics step, outside of the loop, computes sensors."""
 
     @abc.abstractmethod
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """Advances by one physics step of `mjx_model`, possibly with other field values; returns
-        the overflow flag.
+        """Advances by one physics step and returns the overflow flag.
+
+        `model` is `mjx_model`, possibly with other field values.
         """
 
     def unused_terms(self, fields: Collection[str]) -> int:
-        """Returns the disable flags of terms that need no computation where environments override
-        some fields.
-        """
+        """Returns the disable flags of terms that are zero where environments override `fields`."""
         return 0
 
     def advance(
@@ -98,15 +103,17 @@ class MjxEngine(Engine):
     def _drive(
         self, model: mjx.Model, data: mjx.Data, ctrl: jax.Array
     ) -> tuple[mjx.Model, mjx.Data]:
-        """Returns model and data for one physics step: the motors' armature and control, and the
-        clamped joints.
+        """Returns model and data for one physics step, with the motors in them.
+
+        The model has their armature, the data their control and clamped joints.
         """
         motors = self.motors
         if motors is None:
             return model, data
         gain = model.actuator_gainprm[:, 0]
         bias = model.actuator_biasprm[:, :3]
-        ctrl, added = motors.limit(jnp, ctrl, *self._joints(data, motors), gain, bias)
+        position, velocity = self._joints(data, motors)
+        ctrl, added = motors.limit(jnp, ctrl, position, velocity, gain, bias)
         armature = model.dof_armature + scatter(np.zeros(self.model.nv), motors.joint_qvel, added)
         return model.replace(dof_armature=armature), self._clamp(data).replace(ctrl=ctrl)
 
@@ -146,8 +153,9 @@ class JaxEngine(MjxEngine):
         return private.load_mjx().make_data(self.model, jax.local_devices()[0], impl="jax")
 
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """Advances by one physics step; contacts may have been dropped if the capped contact list
-        is full.
+        """Advances by one physics step.
+
+        Contacts may have been dropped if the capped contact list is full.
         """
         data = self._step(model, data)
         contact = private.contact(data)
@@ -172,16 +180,13 @@ class WarpEngine(MjxEngine):
         self._mjx = private.load_mjx()
         private.keep_streams()
         self._model = _with_jacobian(model)
-        device = jax.local_devices()[0]
-        self.mjx_model = private.without_warnings(
-            self._mjx.put_model(self._model, device, impl="warp")
-        )
+        put = self._mjx.put_model(self._model, jax.local_devices()[0], impl="warp")
+        self.mjx_model = private.without_warnings(put)
         needs = private.sparse_newton_needs(self.mjx_model)
         if needs and self.sparse_solver:
             fail("sparse_solver", True, f"None or False: it needs {needs}")
-        if not needs and (
-            model.nv > _MAX_FULL if self.sparse_solver is None else self.sparse_solver
-        ):
+        sparse = model.nv > _MAX_FULL if self.sparse_solver is None else self.sparse_solver
+        if sparse and not needs:
             self.mjx_model = private.with_sparse_newton(self.mjx_model)
 
     @classmethod
@@ -207,9 +212,7 @@ class WarpEngine(MjxEngine):
         return self._mjx.make_data(self._model, jax.local_devices()[0], impl="warp", **sizes)
 
     def unused_terms(self, fields: Collection[str]) -> int:
-        """Returns the disable flags of terms that are zero for the model, and that no field of
-        environments changes.
-        """
+        """Returns the disable flags of terms that are zero, also with any values of `fields`."""
         model = self.model
         flags = 0
         for flag, names in _TERMS.items():
@@ -217,16 +220,18 @@ class WarpEngine(MjxEngine):
                 flags |= flag
         # Flexes and fluids add passive forces; without dampers, implicit integrators ignore the
         # actuators' derivatives.
-        fluid = (model.opt.density, model.opt.viscosity, *model.opt.wind)
-        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER or model.nflex or any(fluid):
+        fluid = any((model.opt.density, model.opt.viscosity, *model.opt.wind))
+        implicit = model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER
+        if implicit or model.nflex or fluid:
             flags &= ~_PASSIVE
         return flags
 
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
     ) -> tuple[mjx.Data, jax.Array]:
-        """Advances by physics steps; the overflow flag is Warp's own, which it sets but never
-        clears.
+        """Advances by physics steps.
+
+        The overflow flag is Warp's own, which it sets but never clears.
         """
         data, _ = super().advance(private.without_overflow(data), fields, forced, num_substeps)
         return data, private.overflow(data)
@@ -236,8 +241,9 @@ class WarpEngine(MjxEngine):
 
 
 def _with_jacobian(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns the model, or a copy with dense Jacobians where it leaves the choice and they take
-    fewer kernels.
+    """Returns the model, or a copy with dense Jacobians.
+
+    These take fewer kernels in small models that leave the choice.
     """
     if model.opt.jacobian != _JACOBIAN.mjJAC_AUTO or model.nv > _MAX_DENSE:
         return model

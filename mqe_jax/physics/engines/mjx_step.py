@@ -27,8 +27,8 @@ _BEFORE_COLLISION = (
     mjx.tendon_armature,
     mjx.factor_m,
 )
-# one of each opposite pair
 _CORNERS = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)], np.float32)
+"""One of each opposite pair of a box's corners, in half extents."""
 _ROUND = (int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE))
 
 
@@ -41,17 +41,18 @@ class MarginStep:
         without_margins.geom_margin[:] = 0.0
         without_margins.geom_rbound[:] += inflation
         self.model = mjx.put_model(without_margins, jax.local_devices()[0], impl="jax")
-        capped = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "max_contact_points") >= 0
-        # of each dimension
-        self.max_contacts = int(model.numeric("max_contact_points").data[0]) if capped else -1
+        self.max_contacts = -1  # of each dimension; -1: any number
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "max_contact_points") >= 0:
+            self.max_contacts = int(model.numeric("max_contact_points").data[0])
         self._inflation = inflation.astype(np.float32)
         self._size = model.geom_size.astype(np.float32)
         self._size[:, 0] += self._inflation
         self._margin = model.geom_margin.astype(np.float32) - self._inflation
 
     def __call__(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        """Advances one environment by one physics step; `model` is `self.model`, possibly with
-        other field values.
+        """Advances one environment by one physics step.
+
+        `model` is `self.model`, possibly with other field values.
         """
         data = self._forward_position(model, data)
         data = mjx.sensor_pos(model, data)
@@ -106,15 +107,16 @@ def _contacts(model: mjx.Model, data: mjx.Data, cap: int) -> mjx.Contact:
             if pairs.types == (mjx.GeomType.CAPSULE, mjx.GeomType.BOX) and len(rows):
                 both = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
                 nearest = _capsule_box(model, data, geom[rows])
-                corrected = _correct(dist[both], pos[both], frame[both], *nearest)
-                dist, pos, frame = (
-                    x.at[both].set(y) for x, y in zip((dist, pos, frame), corrected, strict=True)
+                own_dist, own_pos, own_frame = _correct(
+                    dist[both], pos[both], frame[both], *nearest
                 )
+                dist = dist.at[both].set(own_dist)
+                pos = pos.at[both].set(own_pos)
+                frame = frame.at[both].set(own_frame)
         count = len(dist) // len(geom)
         contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), pairs.contact)
-        by_dimension.setdefault(pairs.condim, []).append(
-            contact.replace(dist=dist, pos=pos, frame=frame)
-        )
+        contact = contact.replace(dist=dist, pos=pos, frame=frame)
+        by_dimension.setdefault(pairs.condim, []).append(contact)
     kept = []
     for _, parts in sorted(by_dimension.items()):
         contact = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
@@ -128,31 +130,28 @@ def _contacts(model: mjx.Model, data: mjx.Data, cap: int) -> mjx.Contact:
 def _plane_box(
     model: mjx.Model, data: mjx.Data, geom: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns distances (4 N,), positions (4 N, 3) and frames (4 N, 3, 3) of the lower corners of N
-    boxes on planes.
+    """Returns the contacts of the four lower corners of N boxes with planes.
+
+    They are distances (4 N,), m, positions (4 N, 3), m, and frames (4 N, 3, 3).
     """
     plane, box = geom.T
     normal = data.geom_xmat[plane][:, None, :, 2]
-    corners = jnp.sum(
-        (_CORNERS * model.geom_size[box][:, None])[..., None, :] * data.geom_xmat[box][:, None],
-        axis=-1,
-    )
+    own = _CORNERS * model.geom_size[box][:, None]  # in the box's frame
+    corners = jnp.sum(own[..., None, :] * data.geom_xmat[box][:, None], axis=-1)
     corners = jnp.where(jnp.sum(corners * normal, axis=-1, keepdims=True) > 0.0, -corners, corners)
     corners = corners + data.geom_xpos[box][:, None]
     dist = jnp.sum((corners - data.geom_xpos[plane][:, None]) * normal, axis=-1, keepdims=True)
+    pos = corners - 0.5 * dist * normal
     frame = private.make_frames(normal[:, 0])
-    return (
-        dist.ravel(),
-        (corners - 0.5 * dist * normal).reshape(-1, 3),
-        jnp.repeat(frame, 4, axis=0),
-    )
+    return dist.ravel(), pos.reshape(-1, 3), jnp.repeat(frame, 4, axis=0)
 
 
 def _capsule_box(
     model: mjx.Model, data: mjx.Data, geom: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns distances (N,), positions (N, 3) and normals (N, 3) where N capsules are nearest to
-    boxes.
+    """Returns the contacts of N capsules with boxes, where they are nearest.
+
+    They are distances (N,), m, positions (N, 3), m, and normals (N, 3).
 
     The squared distance to the box is a convex, piecewise quadratic function of the position t in
     [-1, 1] on the capsule's axis. Its minimum is between the two breakpoints of its derivative at
@@ -163,7 +162,7 @@ def _capsule_box(
     half = model.geom_size[box]
     radius = model.geom_size[capsule][:, :1]
     length = model.geom_size[capsule][:, 1:2]
-    # box frame
+    # middle and half of the capsule's axis, in the box's frame
     center = jnp.sum(turn * (data.geom_xpos[capsule] - data.geom_xpos[box])[..., None], axis=1)
     axis = jnp.sum(turn * data.geom_xmat[capsule][:, :, 2][..., None], axis=1) * length
 
@@ -182,9 +181,8 @@ def _capsule_box(
     slope_low = jnp.sum(outside(low) * axis[:, None], axis=-1)
     slope_high = jnp.sum(outside(high) * axis[:, None], axis=-1)
     rise = slope_high - slope_low
-    way = jnp.where(
-        rise > 0.0, jnp.clip(-slope_low / jnp.where(rise > 0.0, rise, 1.0), 0.0, 1.0), 0.0
-    )
+    part = jnp.clip(-slope_low / jnp.where(rise > 0.0, rise, 1.0), 0.0, 1.0)
+    way = jnp.where(rise > 0.0, part, 0.0)
     t = low + way * (high - low)
     gap = outside(t)[:, 0]
     size = jnp.linalg.norm(gap, axis=-1, keepdims=True)
@@ -194,11 +192,8 @@ def _capsule_box(
     def to_world(x):
         return jnp.sum(turn * x[:, None], axis=-1)
 
-    return (
-        jnp.where(size > 1e-6, size - radius, -jnp.inf)[:, 0],
-        data.geom_xpos[box] + to_world(point),
-        to_world(normal),
-    )
+    dist = jnp.where(size > 1e-6, size - radius, -jnp.inf)[:, 0]
+    return dist, data.geom_xpos[box] + to_world(point), to_world(normal)
 
 
 def _correct(
@@ -209,18 +204,17 @@ def _correct(
     true_pos: jax.Array,
     normal: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Replaces the two contacts of MJX-JAX for each capsule and box, where the deeper one is not at
-    the true distance.
+    """Returns MJX-JAX's contacts of capsules with boxes, corrected.
+
+    Both of a pair are replaced if the deeper one is not at the true distance.
 
     They are kept where the capsule's axis enters the box (`true_dist` -inf).
     """
     count = len(true_dist)
     found = jnp.min(dist.reshape(count, 2), axis=1)
-    wrong = (
-        (jnp.abs(found - true_dist) > 1e-5)
-        & (jnp.minimum(found, true_dist) < 0.0)
-        & jnp.isfinite(true_dist)
-    )
+    wrong = jnp.abs(found - true_dist) > 1e-5
+    wrong &= jnp.minimum(found, true_dist) < 0.0
+    wrong &= jnp.isfinite(true_dist)
     none = jnp.ones(count)
     dist = jnp.where(wrong[:, None], jnp.stack([true_dist, none], axis=1), dist.reshape(count, 2))
     pos = jnp.where(wrong[:, None, None], true_pos[:, None], pos.reshape(count, 2, 3))

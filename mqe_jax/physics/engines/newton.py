@@ -23,8 +23,9 @@ def _tops_of_inertia(
     size: int,
     tops: wp.array2d[int],
 ):
-    """Sets the first block of each block column that M can fill: that of the first degree of
-    freedom of its robot.
+    """Sets the first block of each block column that M can fill.
+
+    It is that of the first degree of freedom of the column's robot.
     """
     env, block = wp.tid()
     top = block
@@ -42,8 +43,9 @@ def _tops_of_constraints(
     row_column: wp.array3d[int],
     tops: wp.array2d[int],
 ):
-    """Lowers the first block of each block column to that of any constraint in it, active or
-    not.
+    """Lowers the first block of each block column to that of any constraint in it.
+
+    Constraints count whether they are active or not.
     """
     env, thread = wp.tid()
     for group in range(thread, groups[env], THREADS):
@@ -94,8 +96,9 @@ def _factor(
 
 @functools.cache
 def _step_kernel(padded: int, size: int) -> Any:
-    """Returns the kernel for H (padded, padded), whose first `size` rows and columns are degrees of
-    freedom.
+    """Returns the kernel for H (padded, padded).
+
+    Its first `size` rows and columns are degrees of freedom.
     """
 
     @wp.kernel(

@@ -20,17 +20,16 @@ import numpy as np
 if TYPE_CHECKING:
     from mujoco import mjx
 
-# Warp's flags for a solver at its iteration limit: expected with few iterations, and not an
-# overflow.
 _ITERATIONS = 1 << 9 | 1 << 10
-# Version of mujoco-mjx whose Newton step `newton.py` replaces: with another one, compare both
-# before it is raised.
+"""Warp's flags for a solver at its iteration limit, which is expected, and no overflow."""
 _NEWTON_OF = "3.17.0"
+"""Version of mujoco-mjx whose Newton step `newton.py` replaces; compare both before raising it."""
 
 
 class _Late(ModuleType):
-    """A module that is imported when it is used, once `ready`; until then, all its attributes are
-    `object`.
+    """A module that is imported when it is used.
+
+    Until it is `ready`, all its attributes are `object`.
     """
 
     ready = False
@@ -41,8 +40,9 @@ class _Late(ModuleType):
 
 @functools.cache
 def load_mjx() -> ModuleType:
-    """Imports MJX, without the lines that it prints where Warp, which only an NVIDIA GPU needs, is
-    not installed.
+    """Imports MJX, without the lines that it prints if Warp is not installed.
+
+    Only an NVIDIA GPU needs Warp.
 
     The packages with which it computes convex hulls of meshes take 80% of this time; they are
     imported when it does.
@@ -64,8 +64,9 @@ def load_mjx() -> ModuleType:
 
 
 def without_pointers(data: mjx.Data) -> mjx.Data:
-    """Zeroes MJX's memory addresses in data made with impl `cpp`: they are invalid in another
-    process.
+    """Zeroes MJX's memory addresses in data made with impl `cpp`.
+
+    They are invalid in another process.
     """
     zeros = {
         name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")
@@ -101,9 +102,8 @@ def without_warnings(model: mjx.Model) -> mjx.Model:
 
 def without_overflow(data: mjx.Data) -> mjx.Data:
     """Clears Warp's overflow flags."""
-    return data.replace(
-        _impl=dataclasses.replace(data._impl, overflow=jnp.zeros_like(data._impl.overflow))
-    )
+    none = jnp.zeros_like(data._impl.overflow)
+    return data.replace(_impl=dataclasses.replace(data._impl, overflow=none))
 
 
 def overflow(data: mjx.Data) -> jax.Array:
@@ -112,10 +112,12 @@ def overflow(data: mjx.Data) -> jax.Array:
 
 
 def sparse_newton_needs(model: mjx.Model) -> str | None:
-    """Returns what a model on Warp lacks for `with_sparse_newton`, as the end of "needs ..."; None
-    if nothing.
+    """Returns what a model on Warp lacks for `with_sparse_newton`, or None.
+
+    The text ends a line that begins with "needs".
     """
-    if (found := importlib.metadata.version("mujoco-mjx")) != _NEWTON_OF:
+    found = importlib.metadata.version("mujoco-mjx")
+    if found != _NEWTON_OF:
         return f"mujoco-mjx {_NEWTON_OF}, not {found}"
     if not model._impl.is_sparse:
         return f"sparse Jacobians, but those of {model.nv} degrees of freedom are dense"
@@ -125,8 +127,9 @@ def sparse_newton_needs(model: mjx.Model) -> str | None:
 
 
 def with_sparse_newton(model: mjx.Model) -> mjx.Model:
-    """Returns a model whose Newton steps on Warp are those of `newton.py`; other models of the
-    process keep theirs.
+    """Returns a model whose Newton steps on Warp are those of `newton.py`.
+
+    Other models of the process keep theirs.
     """
     marked = _sparse_block_dim()(**vars(model._impl.block_dim))
     return model.replace(_impl=model._impl.replace(block_dim=marked))
@@ -134,8 +137,9 @@ def with_sparse_newton(model: mjx.Model) -> mjx.Model:
 
 @functools.cache
 def _sparse_block_dim() -> type:
-    """Returns a type of Warp's block sizes that marks models, whose Newton steps Warp then takes
-    from `newton.py`.
+    """Returns a type of Warp's block sizes that marks models.
+
+    Warp takes the Newton steps of marked models from `newton.py`.
 
     Of all that MJX hands to Warp, this class is the only one that keeps its type, also in the keys
     of caches.
@@ -152,9 +156,10 @@ def _sparse_block_dim() -> type:
     dense: Any = solver._cholesky_factorize_solve
 
     def step(model: Any, *arguments: Any, **options: Any) -> None:
-        # dense copies solve scenes with sleep
+        # Scenes with sleep are solved as dense copies.
         sparse = isinstance(model.block_dim, SparseBlockDim) and model.is_sparse
-        (newton.step if sparse else dense)(model, *arguments, **options)
+        solve = newton.step if sparse else dense
+        solve(model, *arguments, **options)
 
     solver._cholesky_factorize_solve = step
     return SparseBlockDim

@@ -1,6 +1,4 @@
-"""Robots: the `Robot` type, robot data, body tree, index tables and kinematics; the registry of
-robots by name.
-"""
+"""Robots: their type, data, body tree, index tables and kinematics, and their registry by name."""
 
 from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.settings import check_arguments

@@ -19,9 +19,9 @@ _GEOM_TYPES = {
 
 
 # Contact settings of the robots' collision geoms, which take precedence over those of the other
-# geom. The time constant (s), which joint limits share, is the shortest that is stable at a physics
-# step of 0.005 s; the second number is the damping ratio. Contacts begin MARGIN before the surfaces
-# meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics step.
+# geom. SOLREF is a time constant, s, which joint limits share, and a damping ratio. The time
+# constant is the shortest that is stable at a physics step of 0.005 s. Contacts begin MARGIN before
+# the surfaces meet: a foot that lands at 1.5 m/s moves 7.5 mm in a physics step.
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 MARGIN = 0.003  # m
@@ -35,23 +35,24 @@ def _add_inertial(body: Any, link: Link) -> None:
 
 
 def _add_geom(body: Any, primitive: Primitive, left: int, **properties: Any) -> None:
-    """Adds a primitive to the body of a link, with y negated where `left` is -1."""
+    """Adds a primitive to the body of a link, with y negated if `left` is -1."""
     x, y, z = primitive.position
     place: dict[str, Any] = {"pos": (x, left * y, z)}
     if primitive.end is not None:
-        place = {
-            "fromto": (x, left * y, z, primitive.end[0], left * primitive.end[1], primitive.end[2])
-        }
+        end_x, end_y, end_z = primitive.end
+        place = {"fromto": (x, left * y, z, end_x, left * end_y, end_z)}
     size = (*np.atleast_1d(primitive.size), 0.0, 0.0)[:3]
     body.add_geom(type=_GEOM_TYPES[primitive.kind], size=size, mass=0.0, **place, **properties)
 
 
 def _back(robot: Robot) -> float:
     """Returns the height of the highest visual shape of the trunk above the trunk's origin, m."""
-    shapes = [shape.primitive for shape in robot.visuals if shape.link == "trunk"]
-    return max(
-        max(x.position[2], (x.end or x.position)[2]) + np.atleast_1d(x.size)[-1] for x in shapes
-    )
+
+    def top(shape: Primitive) -> float:
+        end = shape.end or shape.position
+        return max(shape.position[2], end[2]) + np.atleast_1d(shape.size)[-1]
+
+    return max(top(shape.primitive) for shape in robot.visuals if shape.link == "trunk")
 
 
 def build_robot(
@@ -99,10 +100,17 @@ def build_robot(
                 )
         for visual_shape in robot.visuals if visual else ():
             if visual_shape.link == link:
-                rgba = visual_shape.mix_color(agent_color)
-                for side in (left, -left) if visual_shape.both else (left,):
-                    shown = {"rgba": rgba, "group": VISUAL_GROUP}
-                    _add_geom(body, visual_shape.primitive, side, contype=0, conaffinity=0, **shown)
+                sides = (left, -left) if visual_shape.both else (left,)
+                for side in sides:
+                    _add_geom(
+                        body,
+                        visual_shape.primitive,
+                        side,
+                        contype=0,
+                        conaffinity=0,
+                        rgba=visual_shape.mix_color(agent_color),
+                        group=VISUAL_GROUP,
+                    )
 
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, robot.stand_height))
     trunk.add_freejoint(name="base")
@@ -113,37 +121,36 @@ def build_robot(
     for leg in LEGS:
         front = 1 if leg[0] == "F" else -1
         left = 1 if leg[1] == "L" else -1
-        hip = trunk.add_body(
-            name=f"{leg}_hip", pos=(front * robot.leg_root[0], left * robot.leg_root[1], 0.0)
-        )
+        root = (front * robot.leg_root[0], left * robot.leg_root[1], 0.0)
+        hip = trunk.add_body(name=f"{leg}_hip", pos=root)
         _add_inertial(hip, robot.hip.reflect(front, left))
         thigh = hip.add_body(name=f"{leg}_thigh", pos=(0.0, left * robot.hip_length, 0.0))
         _add_inertial(thigh, robot.thigh.reflect(1, left))
         calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -robot.thigh_length))
         _add_inertial(calf, robot.calf.reflect(1, left))
-        for body, joint, axis in zip(
-            (hip, thigh, calf), JOINTS, ((1, 0, 0), (0, 1, 0), (0, 1, 0)), strict=True
-        ):
+        links = (hip, thigh, calf)
+        axes = ((1, 0, 0), (0, 1, 0), (0, 1, 0))
+        for body, joint, axis in zip(links, JOINTS, axes, strict=True):
             index = JOINT_NAMES.index(f"{leg}_{joint}")
-            limits = (robot.joint_lower[index], robot.joint_upper[index])
             hinge = body.add_joint(
                 name=f"{leg}_{joint}",
                 type=mujoco.mjtJoint.mjJNT_HINGE,
                 axis=axis,
                 limited=True,
-                range=limits,
+                range=(robot.joint_lower[index], robot.joint_upper[index]),
                 margin=robot.joint_margin,
                 solref_limit=SOLREF,
             )
             if joint_mechanics:
                 hinge.armature = robot.rotor_inertia[index]
-                # the others are of the speed's square and cube
-                hinge.damping[0] = robot.joint_damping[index]
+                hinge.damping[0] = robot.joint_damping[index]  # of the speed, not its powers
                 hinge.frictionloss = robot.friction_loss[index]
             add_shapes(body, joint, f"{leg}_", left)
-    gain, bias = (
-        (1.0, (0.0, 0.0, 0.0)) if torque_control else (robot.kp, (0.0, -robot.kp, -robot.kd))
-    )
+    gain = robot.kp
+    bias = (0.0, -robot.kp, -robot.kd)
+    if torque_control:
+        gain = 1.0
+        bias = (0.0, 0.0, 0.0)
     for name, limit in zip(JOINT_NAMES, robot.torque_limit, strict=True):
         actuator = spec.add_actuator(
             name=name,

@@ -1,6 +1,4 @@
-"""Index tables of the robots of a compiled scene, their state after a step, and closed-form
-kinematics of the legs.
-"""
+"""Index tables of a scene's robots, their state after a step, and kinematics of the legs."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -41,17 +39,15 @@ class RobotIndex:
 
 
 def scatter(base: Any, addresses: np.ndarray, values: jax.Array) -> jax.Array:
-    """Returns the array `base` (n,) with values at addresses, which are host integers of the same
-    shape.
+    """Returns the array `base` (n,) with `values` at `addresses`, host integers of the same shape.
 
     A GPU computes this together with what precedes and follows it; a scatter takes kernels of its
     own.
     """
     source = np.full(len(base), -1)
     source[addresses] = np.arange(addresses.size).reshape(addresses.shape)
-    return jnp.where(
-        source < 0, jnp.asarray(base, values.dtype), jnp.ravel(values)[np.maximum(source, 0)]
-    )
+    placed = jnp.ravel(values)[np.maximum(source, 0)]
+    return jnp.where(source < 0, jnp.asarray(base, values.dtype), placed)
 
 
 def prefix(number: int) -> str:
@@ -75,13 +71,16 @@ def _geom_names(robot: Robot, part: str) -> list[str]:
 
 
 def add_sensors(spec: mujoco.MjSpec, robots: Sequence[Robot], *, feet: bool = False) -> None:
-    """Adds sensors of the strongest contact force on the trunks (and feet), which all engines
-    support.
+    """Adds sensors of the strongest contact force on the trunks, and on the `feet`.
+
+    All engines support them.
     """
     force_bits = 1 << 1
     strongest = 2
     for number, robot in enumerate(robots):
-        names = _geom_names(robot, "trunk") + (_geom_names(robot, "foot") if feet else [])
+        names = _geom_names(robot, "trunk")
+        if feet:
+            names += _geom_names(robot, "foot")
         for name in names:
             spec.add_sensor(
                 name=f"{prefix(number)}{name}_force",
@@ -142,8 +141,7 @@ class RobotState:
 
     position_w: jax.Array  # trunk origin in the environment frame (R, 3), m
     quaternion: jax.Array  # trunk orientation, wxyz (R, 4)
-    # velocity of the trunk origin in the environment frame (R, 3), m/s
-    linear_velocity_w: jax.Array
+    linear_velocity_w: jax.Array  # of the trunk origin in the environment frame (R, 3), m/s
     angular_velocity_b: jax.Array  # angular velocity of the trunk in its own frame (R, 3), rad/s
     joint_position: jax.Array  # joint angles (R, 12), rad
     joint_velocity: jax.Array  # joint velocities (R, 12), rad/s
@@ -162,9 +160,7 @@ class RobotState:
 
     @property
     def base_info(self) -> jax.Array:
-        """Position and roll, pitch, yaw (R, 6): the base information of the paper's
-        observations.
-        """
+        """Position, m, and roll, pitch, yaw, rad (R, 6), the base information of the paper."""
         return jnp.concatenate([self.position_w, self.euler], axis=-1)
 
     @property
@@ -185,12 +181,16 @@ def read_robots(
     sensordata: jax.Array,
     active: jax.Array | None = None,
 ) -> RobotState:
-    """Reads all robots from state vectors; `active` (A,) says which of the first take part, default
-    all.
+    """Reads all robots from state vectors.
+
+    `active` (A,) says which of the first robots take part, by default all.
     """
-    every = jnp.ones(index.num_robots, bool)
+    takes_part = jnp.ones(index.num_robots, bool)
+    if active is not None:
+        takes_part = jnp.concatenate([active, takes_part[len(active) :]])
     base = qpos[index.base_qpos]
     base_velocity = qvel[index.base_qvel]
+    trunk_forces = jnp.linalg.norm(sensordata[index.trunk_force], axis=-1)
     return RobotState(
         position_w=base[:, :3],
         quaternion=base[:, 3:],
@@ -198,21 +198,23 @@ def read_robots(
         angular_velocity_b=base_velocity[:, 3:],
         joint_position=qpos[index.joint_qpos],
         joint_velocity=qvel[index.joint_qvel],
-        trunk_force=jnp.max(jnp.linalg.norm(sensordata[index.trunk_force], axis=-1), axis=-1),
-        active=every if active is None else jnp.concatenate([active, every[len(active) :]]),
+        trunk_force=jnp.max(trunk_forces, axis=-1),
+        active=takes_part,
     )
 
 
 def foot_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
-    """Computes the feet's centres in the trunk frame (..., 4, 3), m, from joint angles (..., 12),
-    rad.
+    """Computes the feet's centres (..., 4, 3), m, in the trunk frame.
+
+    The joint angles are (..., 12), rad.
     """
     return _leg_points(robot, joint_position, robot.foot_position)
 
 
 def knee_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
-    """Computes the knees (calf joints) in the trunk frame (..., 4, 3), m, from joint angles (...,
-    12), rad.
+    """Computes the knees (calf joints) (..., 4, 3), m, in the trunk frame.
+
+    The joint angles are (..., 12), rad.
     """
     return _leg_points(robot, joint_position, (0.0, 0.0))
 
@@ -223,17 +225,14 @@ def _leg_points(robot: Robot, joint_position: jax.Array, point: tuple[float, flo
     hip, thigh, calf = jnp.moveaxis(angles, -1, 0)
     front = jnp.array([1.0, 1.0, -1.0, -1.0])
     left = jnp.array([1.0, -1.0, 1.0, -1.0])
-    x = -robot.thigh_length * jnp.sin(thigh) + point[1] * jnp.sin(thigh + calf)
-    z = -robot.thigh_length * jnp.cos(thigh) + point[1] * jnp.cos(thigh + calf)
-    if point[0]:
-        x += point[0] * jnp.cos(thigh + calf)
-        z -= point[0] * jnp.sin(thigh + calf)
+    ahead, up = point
+    x = -robot.thigh_length * jnp.sin(thigh) + up * jnp.sin(thigh + calf)
+    z = -robot.thigh_length * jnp.cos(thigh) + up * jnp.cos(thigh + calf)
+    if ahead:
+        x += ahead * jnp.cos(thigh + calf)
+        z -= ahead * jnp.sin(thigh + calf)
     y = left * robot.hip_length
-    return jnp.stack(
-        [
-            front * robot.leg_root[0] + x,
-            left * robot.leg_root[1] + y * jnp.cos(hip) - z * jnp.sin(hip),
-            y * jnp.sin(hip) + z * jnp.cos(hip),
-        ],
-        axis=-1,
-    )
+    x_trunk = front * robot.leg_root[0] + x
+    y_trunk = left * robot.leg_root[1] + y * jnp.cos(hip) - z * jnp.sin(hip)
+    z_trunk = y * jnp.sin(hip) + z * jnp.cos(hip)
+    return jnp.stack([x_trunk, y_trunk, z_trunk], axis=-1)

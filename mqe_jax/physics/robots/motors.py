@@ -27,24 +27,22 @@ from mqe_jax.physics.robots.index import RobotIndex
 from mqe_jax.physics.robots.robot import Robot
 
 BAND = 0.15  # share of the speed limit above it at which the motor brakes with its full torque
-# shares of a leg's lowest speed limit at which its armature begins and is complete
-SLOW = 0.85
-FAST = 1.0
-# share of its speed limit that a joint's torques may carry it to within a physics step without
-# armature
+SLOW = 0.85  # share of a leg's lowest speed limit at which its armature begins
+FAST = 1.0  # share at which it is complete
 REACH = 1.25
+"""Share of its speed limit to which a joint's torques may carry it in a step without armature."""
 GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
-# timestep x slope of the torque line / inertia, above which explicit integration of the line is
-# unstable
 STEEP = 2.0
+"""Timestep x slope of the torque line / inertia above which explicit integration is unstable."""
 CLAMP = 1.09  # greatest share of the speed limit after a physics step
 ROUNDING = 1e-5  # relative margin that covers the rounding of single precision
 
 
 @functools.cache
 def leg_response(robot: Robot) -> np.ndarray:
-    """Returns how strongly torques accelerate a leg's joints in the default pose (3, 3), 1/(kg
-    m^2), as magnitudes.
+    """Returns the accelerations of a leg's joints per torque (3, 3), 1/(kg m^2).
+
+    They are magnitudes, in the default pose.
     """
     model = build_robot(robot, 0, visual=False).compile()
     data = mujoco.MjData(model)
@@ -69,8 +67,9 @@ class Motors:
 
     @classmethod
     def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> "Motors":
-        """Returns the motors of all robots of a scene, whose actuators are in the order of the
-        robots' joints.
+        """Returns the motors of all robots of a scene.
+
+        Its actuators must be in the order of the robots' joints.
         """
         assert np.array_equal(index.actuator.ravel(), np.arange(index.actuator.size))
 
@@ -90,11 +89,9 @@ class Motors:
     def limit(
         self, xp: Any, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any
     ) -> tuple[Any, Any]:
-        """Returns the control of one physics step under which the actuators' forces are the motors'
-        torques (..., J).
+        """Returns control and armature (..., J) of one physics step, with the motors' torques.
 
-        It is `ctrl` if the motors can give its torque. The second result is the armature (..., J),
-        kg m^2.
+        The control is `ctrl` if the motors can give its torque. The armature is in kg m^2.
 
         Args:
             xp: numpy or jax.numpy.
@@ -106,9 +103,8 @@ class Motors:
         """
         pace = xp.abs(velocity)
         below = self.speed - pace
-        # in the direction of v
-        most = xp.minimum(xp.minimum(self._line * below, self._brake * below), self.torque)
-        most = xp.maximum(most, -self.torque)
+        steepest = xp.minimum(self._line * below, self._brake * below)
+        most = xp.maximum(xp.minimum(steepest, self.torque), -self.torque)  # in the direction of v
         sign = xp.where(velocity < 0, np.float32(-1.0), np.float32(1.0))
         force = _force(ctrl, position, velocity, gain, bias)
         given = sign * xp.minimum(xp.maximum(sign * force, -self.torque), most)
@@ -116,10 +112,11 @@ class Motors:
         return ctrl, self._armature(xp, pace, xp.abs(given), given * sign < 0)
 
     def idle(self, ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> np.ndarray:
-        """Returns where `limit`, for the same numpy arrays, surely returns `ctrl` itself and no
-        armature (...,) bool.
+        """Returns where `limit` surely returns `ctrl` itself and no armature (...,) bool.
 
-        It takes less time. The torques' magnitudes must be at most L and S (1 - |v| / V), and
+        The arrays are those of `limit`, of numpy.
+
+        This takes less time. The torques' magnitudes must be at most L and S (1 - |v| / V), and
         speeds below those at which armature begins, by a margin for rounding. Some braking and
         numbers that are not finite fail too.
         """
@@ -132,8 +129,9 @@ class Motors:
         return idle.all(axis=-1)
 
     def _kick(self, xp: Any, effort: Any) -> Any:
-        """Returns the speeds (..., J), rad/s, that torques of magnitude `effort` can add in a
-        physics step.
+        """Returns the speeds (..., J), rad/s, that torques can add in a physics step.
+
+        `effort` are the torques' magnitudes (..., J), N m.
         """
         size = len(self.response)
         legs = effort.reshape(-1, size)
@@ -148,8 +146,9 @@ class Motors:
         return total.reshape(effort.shape)
 
     def _armature(self, xp: Any, pace: Any, effort: Any, against: Any) -> Any:
-        """Returns the armature (..., J), kg m^2, from magnitudes of speeds and torques, and which
-        are opposed.
+        """Returns the armature (..., J), kg m^2.
+
+        `pace` and `effort` are magnitudes of speeds and torques, `against` says which are opposed.
         """
         size = len(self.response)
         fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
@@ -157,15 +156,15 @@ class Motors:
         reach = (pace + self._kick(xp, effort)) / self.speed
         if xp is np and near.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
             return np.zeros_like(pace)
-        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * (reach > REACH).astype(
-            np.float32
-        )
+        beyond = (reach > REACH).astype(np.float32)
+        needed = xp.minimum(self._needed * (reach - 1.0), self._full) * beyond
         if self._steep.any():
             line = self._line * (self.speed + xp.where(against, pace, -pace))
             share = xp.minimum(effort / xp.maximum(line, ROUNDING), 1.0)  # of the line's torque
             implicit = share * (self._inertia + self.timestep * self._line) - self._inertia
             needed = xp.where(self._steep, xp.maximum(implicit, 0.0), needed)
-        return xp.maximum(xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1) * self._full, needed)
+        of_legs = xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1)
+        return xp.maximum(of_legs * self._full, needed)
 
     @functools.cached_property
     def fastest(self) -> np.ndarray:
@@ -189,13 +188,13 @@ class Motors:
 
     @functools.cached_property
     def _light(self) -> np.ndarray:
-        """Slope of the torques without armature (..., J), N m s; less than `_line` where that is
-        steep.
+        """Slope of the torques without armature (..., J), N m s.
+
+        It is less than `_line` where that is steep.
         """
         share = self._inertia / (self._inertia + self.timestep * self._line)
-        return (
-            np.where(self._steep, np.float32(1.0 - ROUNDING) * share, np.float32(1.0)) * self._line
-        )
+        share = np.where(self._steep, np.float32(1.0 - ROUNDING) * share, np.float32(1.0))
+        return share * self._line
 
     @functools.cached_property
     def _brake(self) -> np.ndarray:
@@ -220,38 +219,39 @@ class Motors:
     @functools.cached_property
     def _slow(self) -> np.ndarray:
         """Speeds (..., J), rad/s, below which a leg has no armature for its speed."""
-        return np.float32((1.0 - ROUNDING) * SLOW) * np.repeat(
-            self._leg_speed, len(self.response), axis=-1
-        )
+        of_legs = np.repeat(self._leg_speed, len(self.response), axis=-1)
+        return np.float32((1.0 - ROUNDING) * SLOW) * of_legs
 
     @functools.cached_property
     def _near(self) -> np.ndarray:
-        """Speeds (..., J), rad/s, below which a joint has no armature if its torques cannot carry
-        it further.
+        """Speeds (..., J), rad/s, below which a joint has no armature for its speed and torque.
+
+        Its torque cannot carry it beyond them.
         """
-        return np.float32((1.0 - ROUNDING) * REACH) * np.where(
-            self._steep, np.float32(np.inf), self.speed
-        )
+        speed = np.where(self._steep, np.float32(np.inf), self.speed)
+        return np.float32((1.0 - ROUNDING) * REACH) * speed
 
     def repeat(self, count: int) -> "Motors":
-        """Returns the motors with arrays (count, J), for which numpy is faster than with broadcast
-        ones.
+        """Returns the motors with arrays (count, J).
+
+        Numpy is faster with them than with broadcast ones.
         """
-        rows = {
-            name: np.tile(getattr(self, name), (count, 1)) for name in ("speed", "torque", "stall")
-        }
-        return dataclasses.replace(self, **rows)
+        return dataclasses.replace(
+            self,
+            speed=np.tile(self.speed, (count, 1)),
+            torque=np.tile(self.torque, (count, 1)),
+            stall=np.tile(self.stall, (count, 1)),
+        )
 
     def clamp(self, position: Any, velocity: Any) -> tuple[Any, Any]:
-        """Returns joint angles and velocities (..., J) after a physics step, with speeds of at most
-        `fastest`.
+        """Returns joint angles and velocities (..., J) after a physics step.
+
+        Their speeds are at most `fastest`.
         """
         clamped = velocity.clip(-self.fastest, self.fastest)
         return position - self.timestep * (velocity - clamped), clamped
 
 
 def _force(ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> Any:
-    """Returns the forces (..., J), N m, that actuators give without limits; the arguments are those
-    of `limit`.
-    """
+    """Returns the forces (..., J), N m, of actuators without limits; arguments as of `limit`."""
     return gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity

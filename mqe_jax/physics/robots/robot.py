@@ -69,8 +69,9 @@ class Link:
     def from_principal(
         cls, mass: float, com: Vector, moments: Vector, quaternion: Sequence[float]
     ) -> "Link":
-        """Returns a link from principal `moments` of inertia (kg m^2) and the orientation of their
-        axes, wxyz.
+        """Returns a link from its principal moments of inertia, kg m^2.
+
+        `quaternion`, wxyz, is the orientation of their axes.
         """
         w, x, y, z = np.asarray(quaternion) / np.linalg.norm(quaternion)
         axes = np.array(
@@ -287,17 +288,14 @@ class Robot:
                 )
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-        if not np.all(
-            (self.joint_lower < self.default_joints) & (self.default_joints < self.joint_upper)
-        ):
+        above = self.joint_lower < self.default_joints
+        below = self.default_joints < self.joint_upper
+        if not np.all(above & below):
             raise InputError(
                 f"Robot.default_joints: {self.default_joints} must lie between the joint limits"
             )
-        repeated = [
-            name
-            for name, count in Counter(shape.name for shape in self.collision).items()
-            if count > 1
-        ]
+        counts = Counter(shape.name for shape in self.collision)
+        repeated = [name for name, count in counts.items() if count > 1]
         if repeated:
             raise InputError(f"Robot.collision: duplicate names {', '.join(repeated)}")
         parts = [shape.part for shape in self.collision]
@@ -320,15 +318,14 @@ class Robot:
         return MIRROR
 
     def joint_targets(self, action: jax.Array, scale: float = 1.0) -> jax.Array:
-        """Returns joint targets (..., 12), rad: default + `scale` x the robot's scale x action
-        (..., 12).
+        """Returns joint targets (..., 12), rad, of actions (..., 12).
+
+        They are default + `scale` x the robot's scale x action.
         """
         return jnp.asarray(self.default_joints) + scale * self.action_scale * action
 
     def shapes(self, contacts: str = "full") -> tuple[CollisionShape, ...]:
-        """Returns the collision shapes of a set, one of `CONTACTS`; InputError for an unknown
-        set.
-        """
+        """Returns the collision shapes of a set, one of `CONTACTS`; InputError for another name."""
         if contacts not in CONTACTS:
             raise InputError(f"contacts: unknown set {contacts!r}; allowed: {', '.join(CONTACTS)}")
         return tuple(shape for shape in self.collision if shape.part in CONTACTS[contacts])
