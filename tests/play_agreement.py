@@ -50,7 +50,7 @@ def record(
 
     @jax.jit
     def step(state: Any, memory: Any, key: jax.Array) -> tuple[Any, Any, jax.Array, jax.Array]:
-        action, memory = both.act(Observations(state.obs[None]), memory, key, still)
+        action, memory = both.act(Observations.at(state.obs[None]), memory, key, still)
         noise = jax.random.normal(jax.random.fold_in(key, 1), (size,))
         with normal_numbers(noise):
             return env.step(state, action[0]), memory, action[0], noise

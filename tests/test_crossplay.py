@@ -43,7 +43,7 @@ def test_each_agent_does_what_its_own_policy_does_for_it() -> None:
         changed,
         load_policy(OTHER, env, deterministic=True),
     )
-    seen = Observations(jax.random.normal(KEY, (3, 2, 16)))
+    seen = Observations.at(jax.random.normal(KEY, (3, 2, 16)))
     memories = [policy.initial_memory(3) for policy in policies]
     actors = exchangeable(policies)
     pairs = [*itertools.product(range(4), repeat=2)]

@@ -22,6 +22,7 @@ from mqe_jax.core.types import Batch, Observations
 from mqe_jax.policies import load_as, parameters_for, zoo
 from mqe_jax.runs import build
 from mqe_jax.runs.build import prepare
+from mqe_jax.train.learner import make_learner
 from mqe_jax.train.needs import Needs, needs_of
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, read_policy
@@ -117,7 +118,7 @@ def test_policies_without_sensors_send_no_messages() -> None:
     """The shipped policy is a teacher and an opponent of one that sends messages."""
     senses = {"senses": ["proprioception", {"name": "messages", "numbers": 2}]}
     _, cast = prepare("go1gate", TINY, senses, impl="c")
-    obs = Observations(jnp.ones((3, 2, 16)))
+    obs = Observations.at(jnp.ones((3, 2, 16)))
 
     def act(policy):
         return policy.act(obs, policy.initial_memory(3), jax.random.PRNGKey(0))[0]
@@ -150,9 +151,7 @@ def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
     for _ in range(2):
         here = jnp.asarray(random.normal(size=(3, 2, layout.size)), jnp.float32)
         key = jax.random.PRNGKey(0)
-        action, memory = met.act(
-            Observations(jnp.zeros((3, 2, 16)), None, {"onboard": here}), memory, key
-        )
+        action, memory = met.act(Observations({"onboard": here}), memory, key)
         seen = jnp.concatenate([*(layout.split(here) | {"action": last}).values()], axis=-1)
         last, own = policy.act(seen, own)
         assert action.shape == (3, 2, 4) and np.abs(last).max() > 0.01
@@ -269,6 +268,15 @@ def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
     assert losses[-1] < losses[0] - 0.1 and losses[-1] < 0.1  # of its deviation alone -0.08
     blind = Probe(probes.show_hidden, probes.pay_one, num_envs=32)
     refuses("group: 'signs' is missing in the state", updated, blind, config, 0, teacher=Counter())
+
+
+def test_a_critic_needs_the_final_observations_of_its_group() -> None:
+    """The group `policy` has them, the group `signs` has not."""
+    env: Any = Seeing(probes.show_hidden, probes.pay_one, num_envs=4)
+    env.group_sizes = {"signs": 1}
+    said = r"env: final_obs \(group 'signs'\) of probe is missing; expected \(4, 2, 1\)"
+    blind = settings(FAST, num_envs=4, group="signs", network__critic_input="own")
+    refuses(said, make_learner, env, blind)
 
 
 class Pacer:

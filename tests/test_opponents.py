@@ -125,7 +125,7 @@ policies = pytest.fixture(scope="module")(
 def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv) -> None:
     assert all(load_policy(name, door.env).agents == 1 for name in ("random", "idle", "forward"))
     seats = Seats.of_teams(door, *(load_policy(name, door.env) for name in ("forward", "idle")))
-    seen = Observations(jnp.zeros((3, 2, 12)))
+    seen = Observations.at(jnp.zeros((3, 2, 12)))
     action, _ = seats.act(seen, seats.initial_memory(3), KEY, jnp.ones((3, 2, 12)))
     np.testing.assert_allclose(action[:, :, 0], jnp.tile(jnp.array([0.25, 0.0]), (3, 1)))
 

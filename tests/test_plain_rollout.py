@@ -456,7 +456,7 @@ def test_policies_without_files_act_as_named() -> None:
     assert np.abs(columns.mean(0)).max() < 0.08 and np.abs(columns.std(0) - 3**-0.5).max() < 0.03
     assert np.abs(np.corrcoef(columns.T) - np.eye(24)).max() < 0.13
     both = Seats.of_teams(env, random, random)
-    seen = Observations(jnp.zeros((2000, 4, env.observation_size)))
+    seen = Observations.at(jnp.zeros((2000, 4, env.observation_size)))
     teams = both.act(seen, ((), ()), KEY, jnp.zeros((2000, 4, env.action_size)))[0]
     assert np.abs(np.corrcoef(np.asarray(teams).reshape(2000, -1).T) - np.eye(48)).max() < 0.13
     assert not np.asarray(idle.act(obs, (), KEY)[0]).any()

@@ -80,7 +80,7 @@ def test_a_team_of_processes_acts_as_the_policy(
         memory = expected.initial_memory(3)
         for _ in range(3):
             obs = jnp.asarray(rng.normal(size=(3, 2, policy.dims.observation)), jnp.float32)
-            seen = Observations(jnp.zeros((3, 2, 1)), groups={"onboard": obs})
+            seen = Observations({"onboard": obs})
             noise = np.stack(
                 [each.standard_normal((3, policy.dims.action), np.float32) for each in own], axis=1
             )
@@ -127,7 +127,7 @@ def test_a_process_that_ends_is_reported_in_a_line(files: Any) -> None:
         with open_team(files["mean"]) as team:
             team._processes[1]._process.kill()
             size = team.needs.dims.observation
-            seen = Observations(jnp.zeros((2, 2, 1)), groups={"onboard": jnp.zeros((2, 2, size))})
+            seen = Observations({"onboard": jnp.zeros((2, 2, size))})
             jax.block_until_ready(team.act(seen, team.initial_memory(2), jax.random.PRNGKey(0)))
 
 

@@ -100,7 +100,7 @@ def test_policies_act_in_single_precision(task: str, name: str) -> None:
         def act(obs):
             still = jnp.zeros((2, env.num_agents, env.action_size), jnp.float32)
             memory = seats.initial_memory(2)
-            return seats.act(Observations(obs), memory, jax.random.PRNGKey(0), still)
+            return seats.act(Observations.at(obs), memory, jax.random.PRNGKey(0), still)
 
         assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(act, obs))} == {
             jnp.dtype(jnp.float32)

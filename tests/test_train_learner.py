@@ -182,7 +182,7 @@ def test_a_wrong_observation_size_is_named() -> None:
         probes.show_hidden, probes.pay_one, num_envs=4
     )
     refuses(
-        r"env: obs of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)",
+        r"env: obs \(group 'policy'\) of probe has shape \(4, 2, 3\); expected \(4, 2, 7\)",
         make_learner,
         env,
         small(num_envs=4),

@@ -289,12 +289,15 @@ class Outcome:
 class Observations:
     """What agents see: the input of a policy. Leading axis N, or none for a single environment."""
 
-    obs: jax.Array
-    """Observations of the group `policy` (N, A, O)."""
+    groups: dict[str, jax.Array]
+    """Observations by group (N, A, O_g)."""
     active: jax.Array | None = None
     """Which agents take part (N, A) bool; None: all."""
-    groups: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
-    """Observations of further groups by name (N, A, O_g)."""
+
+    @property
+    def obs(self) -> jax.Array:
+        """Observations of the group `policy` (N, A, O)."""
+        return self.group("policy")
 
     def of(self, agents: slice) -> "Observations":
         """Returns what some of the agents see."""
@@ -303,17 +306,16 @@ class Observations:
             return x[..., agents, :]
 
         active = None if self.active is None else self.active[..., agents]
-        return Observations(cut(self.obs), active, jax.tree.map(cut, self.groups))
+        return Observations(jax.tree.map(cut, self.groups), active)
 
     def group(self, name: str) -> jax.Array:
         """Returns the observations of a group (N, A, O_g); InputError if they are missing."""
-        if name != "policy" and name not in self.groups:
-            allowed = ", ".join(["policy", *self.groups])
+        if name not in self.groups:
             raise InputError(
                 f"group: {name!r} is missing in the state; `VectorEnv.with_groups` adds it to "
-                f"{allowed}"
+                f"{', '.join(self.groups)}"
             )
-        return self.obs if name == "policy" else self.groups[name]
+        return self.groups[name]
 
     def to(self, policy: Any) -> Any:
         """Returns the argument of a policy's `act`: these, or an array for a policy that declares
@@ -322,14 +324,28 @@ class Observations:
         return self if hasattr(policy, "groups") else self.obs
 
     @classmethod
-    def at(cls, seen: Any) -> "Observations":
-        """Returns the observations of a state; an array is that of the group `policy`."""
-        return seen if isinstance(seen, Observations) else cls(seen)
+    def at(cls, seen: Any, group: str = "policy") -> "Observations":
+        """Returns observations as they are, or an array as that of a group."""
+        return seen if isinstance(seen, Observations) else cls({group: seen})
 
 
 def observations(state: Any) -> Observations:
     """Returns what all agents see in an environment's state."""
-    return Observations(state.obs, getattr(state, "active", None), getattr(state, "groups", {}))
+    groups = {"policy": state.obs, **getattr(state, "groups", {})}
+    return Observations(groups, getattr(state, "active", None))
+
+
+def final_observations(state: Any) -> dict[str, jax.Array]:
+    """Returns what a state has of the observations by group at the end of the last step."""
+    groups = dict(getattr(state, "final_groups", None) or {})
+    if state.final_obs is not None:
+        groups["policy"] = state.final_obs
+    return groups
+
+
+def group_sizes(env: Any) -> dict[str, int]:
+    """Returns the lengths of an agent's observations in an environment by group."""
+    return {"policy": env.observation_size, **getattr(env, "group_sizes", {})}
 
 
 def active_of(state: Any) -> jax.Array:

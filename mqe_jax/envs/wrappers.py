@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mqe_jax.core import devices
 from mqe_jax.core.precision import single
+from mqe_jax.core.types import group_sizes
 from mqe_jax.envs.autoreset import EnvBatch
 from mqe_jax.envs.state import EnvironmentState
 
@@ -34,7 +35,7 @@ class Outer(EnvBatch):
         self.teams = inner.teams
         self.action_size = inner.action_size
         self.observation_size = inner.observation_size
-        self.group_sizes = getattr(inner, "group_sizes", {})
+        self.group_sizes = group_sizes(inner)
         self.privileged_observation_size = inner.privileged_observation_size
         self.max_episode_steps = inner.max_episode_steps
 

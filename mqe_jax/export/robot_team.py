@@ -81,8 +81,7 @@ class RobotTeam:
 
         The processes draw their own random numbers.
         """
-        seen = Observations.at(obs)
-        readings = seen.group(self.needs.group) if isinstance(obs, Observations) else seen.obs
+        readings = Observations.at(obs, self.needs.group).group(self.needs.group)
         readings = check_obs(readings, self.agents, self.needs.dims.observation)
         kind = jax.ShapeDtypeStruct((*readings.shape[:-1], self.needs.dims.action), jnp.float32)
         action = jax.pure_callback(

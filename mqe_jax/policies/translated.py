@@ -49,10 +49,10 @@ class Translated(Composed):
         if self.sensed is None:
             action, memory = self.policy.act(obs, memory, key)
             return self.here.translate(action, self.own), memory
-        seen = Observations.at(obs)
-        (memory, last) = memory
         group = self.policy.needs.group
-        here = seen.group(group) if isinstance(obs, Observations) else obs
+        seen = Observations.at(obs, group)
+        memory, last = memory
+        here = seen.group(group)
         own = jnp.concatenate(
             [here[..., : self.sensed.start], last, here[..., self.sensed.stop :]], axis=-1
         )

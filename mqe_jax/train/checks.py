@@ -8,13 +8,15 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.memory import check_memory
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import fail
-from mqe_jax.core.types import VectorEnv, teams_of
+from mqe_jax.core.types import VectorEnv, final_observations, observations, teams_of
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.networks import Network
+from mqe_jax.train.networks import EnvDims, Network
 
 
 @single
-def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -> None:
+def check_environment(
+    env: VectorEnv, config: TrainConfig, dims: EnvDims, processes: int = 1
+) -> None:
     """Checks the shapes of the environment's state, and the fields that the settings require."""
     if len(teams_of(env)) > 1:
         raise InputError(
@@ -29,40 +31,29 @@ def check_environment(env: VectorEnv, config: TrainConfig, processes: int = 1) -
         )
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     count = env.num_envs
-    agents = env.num_agents
-    privileged = env.privileged_observation_size
-    expected = {
-        "obs": (count, agents, env.observation_size),
-        "final_obs": (count, agents, env.observation_size),
-        "privileged_obs": (count, privileged),
-        "final_privileged_obs": (count, privileged),
-        "reward": (count, agents),
-        "terminated": (count,),
-        "truncated": (count,),
-    }
+    agents = (count, dims.agents)
+    obs = (*agents, dims.observation)
+    privileged = (count, dims.privileged)
+    group = config.group
+    own = f"obs (group {group!r})"
     reads = config.network.critic_reads
-    other = config.group != "policy"
-    if (
-        other
-        and "obs" in reads
-        and config.group not in (getattr(state, "final_groups", None) or {})
-    ):
-        raise InputError(
-            f"env: final_groups of {env.name} lacks {config.group!r}, which the critic reads"
-        )
-    left_out = {
-        f"final_{name}"
-        for name in ("obs", "privileged_obs")
-        if name not in reads or (name == "obs" and other)
-    }
-    for name, shape in expected.items():
-        value = getattr(state, name)
-        if value is None and name in left_out:
+    final_privileged = state.final_privileged_obs
+    expected = [
+        (own, observations(state).groups.get(group), obs, True),
+        (f"final_{own}", final_observations(state).get(group), obs, "obs" in reads),
+        ("privileged_obs", state.privileged_obs, privileged, True),
+        ("final_privileged_obs", final_privileged, privileged, "privileged_obs" in reads),
+        ("reward", state.reward, agents, True),
+        ("terminated", state.terminated, (count,), True),
+        ("truncated", state.truncated, (count,), True),
+    ]
+    for name, value, shape, required in expected:
+        if value is None and not required:
             continue
         if value is None or value.shape != shape:
             found = "is missing" if value is None else f"has shape {value.shape}"
             raise InputError(f"env: {name} of {env.name} {found}; expected {shape}")
-    numbers = env.num_agents * (env.observation_size + env.action_size + 4) + privileged
+    numbers = dims.agents * (dims.observation + dims.action + 4) + dims.privileged
     check_memory(
         "rollout_steps", config.rollout_steps, 4.0 * numbers * config.steps_per_update / processes
     )

@@ -234,7 +234,7 @@ class TrainConfig:
     """Policy to start from: a run folder, a policy file, or a task for its shipped policy. The run
     takes over its parameters and observation statistics. None: from scratch."""
     group: str = "policy"
-    """Group of observations that the policy sees (`env.groups`), and its critic if that reads
+    """Group of observations that the policy sees (`env.layouts`), and its critic if that reads
     observations."""
     seed: Seed = 0
     """Random seed."""

@@ -95,9 +95,9 @@ def make_learner(
     Of several `processes`, `env` is the share of one, and `devices.Processes` compiles the
     functions. `teacher` is the policy that `imitation` imitates.
     """
-    check_environment(env, config, processes)
-    check_teacher(config, teacher)
     dims = needs_of(env, config).dims
+    check_environment(env, config, dims, processes)
+    check_teacher(config, teacher)
     network = config.network.build(dims)
     features = config.network.features(dims)
     check_divisible(config, network, processes)

@@ -17,7 +17,7 @@ from mqe_jax.core.settings import (
     leaves,
     settings_class,
 )
-from mqe_jax.core.types import AnyEnvironment, teams_of
+from mqe_jax.core.types import AnyEnvironment, group_sizes, teams_of
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 
@@ -115,7 +115,7 @@ def needs_of(env: Any, config: TrainConfig) -> Needs:
 
     InputError if the environment lacks the policy's group of observations.
     """
-    sizes = {"policy": env.observation_size, **getattr(env, "group_sizes", {})}
+    sizes = group_sizes(env)
     if config.group not in sizes:
         fail("group", config.group, f"one of {env.name}: {', '.join(sizes)}")
     task = getattr(env, "env", env)
@@ -136,7 +136,7 @@ def unmet(needs: Needs, env: Any, config: TrainConfig) -> dict[str, tuple[Any, A
     """Returns what an environment lacks of the needs of a policy with these settings: the values of
     both by name.
     """
-    groups = {"policy", *getattr(env, "group_sizes", {})}
+    groups = group_sizes(env)
     if needs.group not in groups:
         return {"group": (needs.group, ", ".join(sorted(groups)))}
     return needs.mismatches(needs_of(env, config))

@@ -23,6 +23,7 @@ from mqe_jax.core.types import (
     Params,
     RandomKey,
     VectorEnv,
+    group_sizes,
     shapes_of,
 )
 from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
@@ -213,9 +214,7 @@ class TrainedPolicy:
         """Returns the policy for the numbers of agents and entities in an environment; itself if it
         has its own.
         """
-        if not self.config.network.any_size or self.needs.group not in getattr(
-            env, "group_sizes", {}
-        ):
+        if not self.config.network.any_size or self.needs.group not in group_sizes(env):
             return self
         needs = self.needs.at_size(needs_of(env, self.config))
         return self if needs == self.needs else dataclasses.replace(self, needs=needs)
@@ -243,16 +242,14 @@ class TrainedPolicy:
         Raises:
             InputError: for an observation of another shape.
         """
-        seen = Observations.at(obs)
         group = self.needs.group
-        given = seen.group(group) if isinstance(obs, Observations) else obs
-        given = check_obs(given, self.dims.agents, self.dims.observation)
+        seen = Observations.at(obs, group)
+        given = check_obs(seen.group(group), self.dims.agents, self.dims.observation)
         check("key", key, RandomKey | None)
         expected = jax.tree.structure(self.initial_memory())
         if jax.tree.structure(memory) != expected:
             fail("memory", memory, f"the recurrent state of this policy, {expected}")
-        seen = Observations(given, seen.active, {group: given})
-        return self.actor.act(seen, memory, key)
+        return self.actor.act(Observations({group: given}, seen.active), memory, key)
 
 
 @functools.lru_cache(maxsize=32)

@@ -16,6 +16,7 @@ from mqe_jax.core.types import (
     Transition,
     VectorEnv,
     active_of,
+    final_observations,
     mean_of_team,
     observations,
     reset_memory,
@@ -121,9 +122,7 @@ def rollout(
             is_first=state.is_first,
             obs=seen,
             privileged_obs=before.privileged_obs,
-            final_obs=after.final_obs
-            if group == "policy"
-            else (after.final_groups or {}).get(group),
+            final_obs=final_observations(after).get(group),
             final_privileged_obs=after.final_privileged_obs,
             action=action,
             log_prob=log_prob,

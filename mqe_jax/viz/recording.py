@@ -104,7 +104,9 @@ def record_episodes(
         ```
     """
     seats = Seats.of(env, policy)
-    groups = tuple({*seats.groups, *([ONBOARD] if sensors else [])} - {"policy"})
+    groups = {*seats.groups}
+    if sensors:
+        groups.add(ONBOARD)
     size = env.mj_model.nq + 7 * env.mj_model.nmocap + (_DRAWN * env.num_agents if sensors else 0)
     numbers = episodes * round(seconds / env.dt) * size
     if 4 * numbers > CLIP_BYTES:
@@ -121,11 +123,9 @@ def record_episodes(
 
     def one_step(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
         state, memory = carry
-        seen = (
-            jax.vmap(functools.partial(env.with_observations, groups=groups))(state)
-            if groups
-            else state
-        )
+        seen = state
+        if not groups <= state.groups.keys():
+            seen = jax.vmap(functools.partial(env.with_observations, groups=[*groups]))(state)
         action, memory = seats.act(observations(seen), memory, key, still)
         state = jax.vmap(env.step)(dataclasses.replace(seen, groups=state.groups), action)
         done = state.terminated | state.truncated
