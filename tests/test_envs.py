@@ -511,7 +511,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
         r"step_task: \(3,\) float32; expected as before, None",
     ),
 }
-BLOCKS = {"one_hot": jnp.eye(2), "base": jnp.zeros((2, 6)), "teammates": jnp.zeros((2, 6))}
+BLOCKS = {"one_hot": jnp.eye(2), "base": jnp.zeros((2, 6)), "teammate": jnp.zeros((2, 6))}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

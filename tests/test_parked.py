@@ -176,9 +176,18 @@ def test_mates_of_a_frozen_robot_observe_a_smaller_team(task: str) -> None:
     assert not late[~np.asarray(states.active)].any() and (late.sum(axis=1) == 1).mean() > 0.9
 
 
-@pytest.mark.parametrize("params", [{"fewest_agents": 2}, {"num_agents": 1, "fewest_sheep": 3}])
-def test_teams_of_one_observe_entities_in_scenes_that_vary(params: dict[str, Any]) -> None:
-    env = make(BALL if "fewest_agents" in params else SHEEP, impl="c", num_envs=1, **params)
+@pytest.mark.parametrize(
+    ("task", "params"),
+    [
+        (BALL, {"fewest_agents": 2}),
+        (SHEEP, {"num_agents": 1, "fewest_sheep": 3}),
+        ("go1plane", {"num_agents": 3, "fewest_agents": 1}),
+    ],
+)
+def test_teams_of_one_observe_entities_in_scenes_that_vary(
+    task: str, params: dict[str, Any]
+) -> None:
+    env = make(task, impl="c", num_envs=1, **params)
     state = jax.eval_shape(
         lambda key: env.with_observations(env.begin(key), [ENTITIES]), jax.random.PRNGKey(0)
     )

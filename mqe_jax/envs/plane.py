@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from mqe_jax.core.limits import Length
 from mqe_jax.core.settings import settings_class
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
+from mqe_jax.envs.observation import ObservationLayout, observe_team, team_blocks
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.robots.index import RobotState
@@ -36,7 +36,7 @@ class Go1Plane(QuadrupedEnv[None, PlaneParams]):
     """Robots on flat ground.
 
     - Action: see `mqe_jax.skills.control`.
-    - Observation: one-hot, own base info, the others' base info.
+    - Observation: one-hot, own base info, the teammates' base info.
     - Reward: the robots' summed displacement along x.
     - End: a fall, or the time limit.
     """
@@ -58,15 +58,10 @@ class Go1Plane(QuadrupedEnv[None, PlaneParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        agents = self.num_agents
-        blocks = [one_hot(agents), Block("base", 6, BASE_INFO)]
-        blocks += [entities("teammates", "robot", agents - 1, 6, BASE_INFO)] if agents > 1 else []
-        return ObservationLayout(tuple(blocks))
+        return ObservationLayout(team_blocks(self.num_agents))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        info = robot_state.base_info
-        blocks = {"one_hot": jnp.eye(self.num_agents), "base": info}
-        return blocks | ({"teammates": others(info)} if self.num_agents > 1 else {})
+        return observe_team(robot_state.base_info)
 
     def rewards(self, before: Moment, after: Moment, collision: jax.Array) -> dict[str, jax.Array]:
         return {
