@@ -20,6 +20,25 @@ from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
 from mqe_jax.physics.robots.index import RobotState
 
+OF_AGENTS = ("groups", "final_groups", "reward", "active")
+"""Fields of a match's state that belong to its agents."""
+
+
+def team_view(state: Any, size: int) -> dict[str, Any]:
+    """Returns what team 0, the first `size` agents, has of a match's state, by field.
+
+    These are the fields of its agents, its outcome and its metrics; any leading axes.
+    """
+    leading = (slice(None),) * (state.reward.ndim - 1)
+
+    def cut(x: jax.Array) -> jax.Array:
+        return x[(*leading, slice(size))]
+
+    view = {name: jax.tree.map(cut, getattr(state, name)) for name in OF_AGENTS}
+    outcome = state.outcome.by_team(lambda x: x[..., :1])
+    metrics = {name: x for name, x in state.metrics.items() if not name.startswith("team1/")}
+    return {**view, "outcome": outcome, "metrics": metrics}
+
 
 class Match(QuadrupedEnv[S, P]):
     """Base of the competitive tasks.

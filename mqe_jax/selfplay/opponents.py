@@ -10,7 +10,7 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.acting.seats import Policy, check_policy
+from mqe_jax.acting.seats import Fixed, Policy, Seat, Seats, actor_of, check_policy
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import NonNegativeInt, Number
@@ -21,31 +21,61 @@ from mqe_jax.core.types import (
     AnyPolicy,
     Memory,
     Observations,
-    PyTree,
     RandomKey,
-    check_act,
     observations,
     where_rows,
 )
 from mqe_jax.envs import VectorEnv
+from mqe_jax.envs.match import OF_AGENTS, team_view
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.envs.wrappers import Outer, Wrapper
 from mqe_jax.policies import load_as
 from mqe_jax.train.policy import TrainedPolicy
 
+_OF_MATCH = (
+    "privileged_obs",
+    "final_privileged_obs",
+    "terminated",
+    "truncated",
+    "step",
+    "assistance",
+)
+"""Fields of a match's state that both teams share."""
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class OpponentState:
-    """The opponent of a block of B environments."""
+    """The opponent of a block of B environments; if it can change, it acts in the block's seat."""
 
-    arrays: PyTree  # arrays of the opponent; empty if it cannot change
-    before: PyTree  # arrays of the opponent before the last change
+    arrays: Any  # the opponent, an `Actor`; empty if it cannot change
+    before: Any  # the opponent before the last change
     # environments whose episode is still against the opponent before the change (B,) bool
     waiting: jax.Array
     memory: Memory  # recurrent state, leading axis B
     # episodes that team 0 won, drew and lost against it (3,) int32, in the order of `RESULTS`
     outcomes: jax.Array
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of observations that it sees."""
+        return self.arrays.groups
+
+    def initial_memory(self, num_envs: int) -> Memory:
+        """Returns the recurrent state at an episode's start, leading axis N."""
+        return self.arrays.initial_memory(num_envs)
+
+    def act(self, seen: Observations, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+        """Returns the actions (B, T, D) and the next recurrent state."""
+
+        def now() -> tuple[jax.Array, Memory]:
+            return self.arrays.act(seen, memory, key)
+
+        def either() -> tuple[jax.Array, Memory]:
+            before = self.before.act(seen, memory, key)
+            return where_rows(self.waiting, before, now())
+
+        return jax.lax.cond(jnp.any(self.waiting), either, now)
 
 
 @jax.tree_util.register_dataclass
@@ -82,30 +112,6 @@ class OneTeam(Outer):
         )
         return self.inner.step(match, action)
 
-    def _state(
-        self, match: EnvironmentState, of_agents: Any, of_match: Any, **own: Any
-    ) -> TeamState:
-        """Returns the state of the environments: fields of agents (N, A, ...) and others (N, ...)
-        mapped, or `own`.
-        """
-        agents = ("groups", "final_groups", "reward", "active")
-        others = (
-            "privileged_obs",
-            "final_privileged_obs",
-            "terminated",
-            "truncated",
-            "step",
-            "assistance",
-        )
-        others += ("metrics", "outcome")
-        metrics = {name: x for name, x in match.metrics.items() if not name.startswith("team1/")}
-        team0 = dataclasses.replace(
-            match, metrics=metrics, outcome=match.outcome.by_team(lambda x: x[:, :1])
-        )
-        fields = {name: jax.tree.map(of_agents, getattr(match, name)) for name in agents}
-        fields |= {name: jax.tree.map(of_match, getattr(team0, name)) for name in others}
-        return TeamState(**{**fields, "match": match, **own})
-
 
 class Versus(OneTeam):
     """N matches as N environments of team 0, in K equal blocks with one opponent each; see
@@ -122,14 +128,19 @@ class Versus(OneTeam):
         self.draw_reward = draw_reward
         for policy in opponents:
             check_policy(policy, matches, "an opponent")
-        self.opponents = tuple(opponents)  # of the blocks at the start
+        team = self.inner.teams[1]
+        self.seats = Seats(
+            tuple(
+                Seat(actor_of(policy), team, team, (block, len(opponents)))
+                for block, policy in enumerate(opponents)
+            )
+        )
+        """The opponents of the blocks at the start."""
         self._check_blocks(self.num_envs)
 
     def __repr__(self) -> str:
-        return (
-            f"<{type(self).__name__} of {self.num_envs} against {list(self.opponents)}: "
-            f"{self.inner!r}>"
-        )
+        opponents = [seat.policy for seat in self.seats.seats]
+        return f"<{type(self).__name__} of {self.num_envs} against {opponents}: {self.inner!r}>"
 
     def share(self, parts: int) -> Self:
         """Returns the environments of one of several processes; each process meets all
@@ -139,12 +150,10 @@ class Versus(OneTeam):
         return super().share(parts)
 
     def _check_blocks(self, num_envs: int) -> None:
-        if not self.opponents or num_envs % len(self.opponents):
-            fail(
-                "opponents",
-                len(self.opponents),
-                f"a divisor of the environments of a process, {num_envs}",
-            )
+        blocks = len(self.seats.seats)
+        if not blocks or num_envs % blocks:
+            allowed = f"a divisor of the environments of a process, {num_envs}"
+            fail("opponents", blocks, allowed)
 
     @single
     @check_arguments(key=RandomKey)
@@ -153,13 +162,13 @@ class Versus(OneTeam):
         key, match_key = jax.random.split(key)
         match = self.inner.reset(match_key)
         opponents = []
-        for policy in self.opponents:
-            arrays = _arrays(policy)
-            waiting = jnp.zeros((self._size,), bool)
-            memory = policy.initial_memory(self._size)
-            opponents.append(
-                OpponentState(arrays, arrays, waiting, memory, jnp.zeros((3,), jnp.int32))
-            )
+        memories = self.seats.initial_memory(self.num_envs)
+        for seat, memory in zip(self.seats.seats, memories, strict=True):
+            fixed = isinstance(seat.policy, Fixed)
+            policy = () if fixed else jax.tree.map(jnp.asarray, seat.policy)
+            waiting = jnp.zeros((self.num_envs // len(memories),), bool)
+            outcomes = jnp.zeros((3,), jnp.int32)
+            opponents.append(OpponentState(policy, policy, waiting, memory, outcomes))
         action = jnp.zeros((self.num_envs, self.inner.num_agents, self.action_size))
         return self._team_state(match, action, tuple(opponents), key)
 
@@ -169,28 +178,39 @@ class Versus(OneTeam):
         InputError; resets.
         """
         self.check_step(state, action, TeamState)
-        key, *keys = jax.random.split(state.key, 1 + len(self.opponents))
-        others = []
-        opponents = []
-        for i, (policy, opponent) in enumerate(zip(self.opponents, state.opponents, strict=True)):
-            block = jax.tree.map(lambda x: x[self._block(i)], observations(state.match))  # noqa: B023
-            shape = (self._size, self.num_agents, self.action_size)
-            returned = _act(policy, opponent, block.of(slice(self.num_agents, None)), keys[i])
-            other, memory = check_act("opponents", returned, shape, opponent.memory)
-            others.append(jnp.asarray(other, jnp.float32))
-            opponents.append(dataclasses.replace(opponent, memory=memory))
-        theirs = jnp.stack(others, axis=1).reshape(self.num_envs, *others[0].shape[1:])
-        both = jnp.concatenate([jnp.asarray(action, jnp.float32), theirs], axis=1)
+        key, *keys = jax.random.split(state.key, 1 + len(state.opponents))
+        seats = self._seats_of(state)
+        action = jnp.asarray(action, jnp.float32)
+        both = jnp.concatenate([action, jnp.zeros_like(action)], axis=1)
+        memories = tuple(opponent.memory for opponent in state.opponents)
+        both, memories = seats.act(observations(state.match), memories, tuple(keys), both)
         match = self._step_matches(state, both)
         done = match.terminated | match.truncated
         ended = done[:, None] & (match.outcome.result[:, 0] > 0)
-        match = dataclasses.replace(
-            match, reward=match.reward + self.draw_reward * ended[:, 1:2].astype(jnp.float32)
-        )
-        started = tuple(
-            self._restart(i, opponent, done, ended) for i, opponent in enumerate(opponents)
-        )
-        return self._team_state(match, both, started, key)
+        draw = self.draw_reward * ended[:, 1:2].astype(jnp.float32)
+        match = dataclasses.replace(match, reward=match.reward + draw)
+        opponents = []
+        memories = seats.restart(memories, done)
+        for seat, opponent, memory in zip(seats.seats, state.opponents, memories, strict=True):
+            block = seat.rows(self.num_envs)
+            counted = ended[block] & ~opponent.waiting[:, None]
+            opponents.append(
+                dataclasses.replace(
+                    opponent,
+                    memory=memory,
+                    waiting=opponent.waiting & ~done[block],
+                    outcomes=opponent.outcomes + jnp.sum(counted, axis=0, dtype=jnp.int32),
+                )
+            )
+        return self._team_state(match, both, tuple(opponents), key)
+
+    def _seats_of(self, state: TeamState) -> Seats:
+        """Returns the seats in which the opponents of a state act."""
+        seats = []
+        for seat, opponent in zip(self.seats.seats, state.opponents, strict=True):
+            fixed = isinstance(seat.policy, Fixed)
+            seats.append(seat if fixed else dataclasses.replace(seat, policy=opponent))
+        return Seats(tuple(seats))
 
     @check_arguments(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
     def change(
@@ -203,50 +223,25 @@ class Versus(OneTeam):
         before that replaces only the waiting opponent, also in environments in which it already
         plays.
         """
-        if not block < len(self.opponents):
-            fail("block", block, f"below {len(self.opponents)}, the number of blocks")
+        if not block < len(state.opponents):
+            fail("block", block, f"below {len(state.opponents)}, the number of blocks")
         check_policy(policy, self.inner)
-        first = self.opponents[block]
         opponent = state.opponents[block]
-        if not isinstance(first, TrainedPolicy):
+        if isinstance(self.seats.seats[block].policy, Fixed):
             raise InputError(
                 f"block: the opponent of block {block} is fixed; only trained policies can be "
                 "exchanged"
             )
         given = policy.form.by_name()
-        known = first.form.by_name()
+        known = opponent.arrays.form.by_name()
         for name in dict.fromkeys((*given, *known)):
             if given.get(name) != known.get(name):
                 other = f"{name} {given.get(name)!r}, not {known.get(name)!r}"
                 raise InputError(f"policy: of another form than block {block}: {other}")
-        alike = dataclasses.replace(policy.actor, form=first.form)
+        alike = dataclasses.replace(policy.actor, form=opponent.arrays.form)
         changed = exchange(opponent, alike, at_once=at_once)
         return dataclasses.replace(
             state, opponents=(*state.opponents[:block], changed, *state.opponents[block + 1 :])
-        )
-
-    @property
-    def _size(self) -> int:
-        return self.num_envs // len(self.opponents)
-
-    def _block(self, index: int) -> slice:
-        return slice(index, None, len(self.opponents))
-
-    def _restart(
-        self, index: int, opponent: OpponentState, done: jax.Array, ended: jax.Array
-    ) -> OpponentState:
-        """Counts the outcomes `ended` (N, 3); resets the recurrent state, and ends the waiting, of
-        ended episodes.
-        """
-        done = done[self._block(index)]
-        ended = ended[self._block(index)]
-        first = self.opponents[index].initial_memory(self._size)
-        memory = where_rows(done, first, opponent.memory)
-        outcomes = opponent.outcomes + jnp.sum(
-            ended & ~opponent.waiting[:, None], axis=0, dtype=jnp.int32
-        )
-        return dataclasses.replace(
-            opponent, memory=memory, waiting=opponent.waiting & ~done, outcomes=outcomes
         )
 
     def _team_state(
@@ -257,11 +252,9 @@ class Versus(OneTeam):
         key: jax.Array,
     ) -> TeamState:
         """Returns the state of team 0."""
-
-        def cut(x):
-            return x[:, : self.num_agents]
-
-        return self._state(match, cut, lambda x: x, action=action, opponents=opponents, key=key)
+        fields = {name: getattr(match, name) for name in _OF_MATCH}
+        fields |= team_view(match, self.num_agents)
+        return TeamState(**fields, match=match, action=action, opponents=opponents, key=key)
 
 
 @check_arguments(env=AnyBatch, draw_reward=Number)
@@ -329,20 +322,23 @@ class Mirror(OneTeam):
         def privileged(x: jax.Array) -> jax.Array:
             return jnp.concatenate([twice(x), jnp.tile(jnp.arange(2.0), len(x))[:, None]], axis=1)
 
-        names = "privileged_obs", "final_privileged_obs"
-        own = {name: jax.tree.map(privileged, getattr(match, name)) for name in names}
-        state = self._state(
-            match, teams, twice, action=action, opponents=(), key=jnp.zeros((2,), jnp.uint32), **own
-        )
+        team0 = team_view(match, self.num_agents)
+        shared = {name: getattr(match, name) for name in _OF_MATCH}
+        shared |= {name: team0[name] for name in ("outcome", "metrics")}
+        fields = {name: jax.tree.map(twice, value) for name, value in shared.items()}
+        for name in ("privileged_obs", "final_privileged_obs"):
+            fields[name] = jax.tree.map(privileged, getattr(match, name))
+        for name in OF_AGENTS:
+            fields[name] = jax.tree.map(teams, getattr(match, name))
         first = jnp.arange(self.num_envs) % 2 == 0
-        once = {
-            name: jnp.where(first, state.metrics[name], 0.0) for name in ("diverged", "overflow")
-        }
-        return dataclasses.replace(state, metrics=state.metrics | once)
+        for name in ("diverged", "overflow"):
+            fields["metrics"][name] = jnp.where(first, fields["metrics"][name], 0.0)
+        key = jnp.zeros((2,), jnp.uint32)
+        return TeamState(**fields, match=match, action=action, opponents=(), key=key)
 
 
-def exchange(opponent: OpponentState, arrays: PyTree, *, at_once: bool = False) -> OpponentState:
-    """Returns the opponent of a block with other arrays; see `Versus.change`."""
+def exchange(opponent: OpponentState, arrays: Any, *, at_once: bool = False) -> OpponentState:
+    """Returns the state of a block with another opponent of the same form; see `Versus.change`."""
     if at_once:
         return dataclasses.replace(
             opponent, arrays=arrays, before=arrays, waiting=jnp.zeros_like(opponent.waiting)
@@ -353,25 +349,3 @@ def exchange(opponent: OpponentState, arrays: PyTree, *, at_once: bool = False) 
     )
     waiting = jnp.where(pending, opponent.waiting, True)
     return dataclasses.replace(opponent, arrays=arrays, before=before, waiting=waiting)
-
-
-def _arrays(policy: Policy) -> PyTree:
-    """Returns the arrays in which a trained policy can change; none of others."""
-    return jax.tree.map(jnp.asarray, policy.actor) if isinstance(policy, TrainedPolicy) else ()
-
-
-def _act(
-    policy: Policy, opponent: OpponentState, obs: Observations, key: jax.Array
-) -> tuple[jax.Array, Any]:
-    """Returns the actions of a block's opponent (B, T, D) and its next recurrent state."""
-    if not isinstance(policy, TrainedPolicy):
-        return policy.act(obs.to(policy), opponent.memory, key)
-
-    def now() -> tuple[jax.Array, Any]:
-        return opponent.arrays.act(obs, opponent.memory, key)
-
-    def either() -> tuple[jax.Array, Any]:
-        before = opponent.before.act(obs, opponent.memory, key)
-        return where_rows(opponent.waiting, before, now())
-
-    return jax.lax.cond(jnp.any(opponent.waiting), either, now)
