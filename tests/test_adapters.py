@@ -19,12 +19,15 @@ from gymnasium.vector import AutoresetMode
 import mqe_jax
 from mqe_jax.adapters import task_env
 from mqe_jax.adapters.gymnasium import SingleEnv, VectorEnv, register
+from mqe_jax.adapters.host import HostEnvs
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.policies import SimplePolicy
+from mqe_jax.selfplay.opponents import versus
 from tests.inputs import refuses
+from tests.test_opponents import new_policy
 
 COUNT = 3
 STEPS = 14
@@ -254,6 +257,29 @@ def test_team_0_plays_the_same_match_and_sees_its_own_half() -> None:
     assert int(restarted.step) == 0 and restarted.rival_obs.shape == half.rival_obs.shape
     assert np.abs(restarted.obs - half.obs).max() > 1e-4
     np.testing.assert_array_equal(restarted.final_obs, half.obs)
+
+
+def test_opponents_of_one_form_share_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As do opponents of one name in tasks with equal parameters."""
+    traced = []
+    step = TeamEnv.step
+
+    def counted(env: TeamEnv, state: Any, action: Any) -> Any:
+        traced.append(env)
+        return step(env, state, action)
+
+    monkeypatch.setattr(TeamEnv, "step", counted)
+    batch = mqe_jax.VectorEnv(match("go1tug"), 2)
+    policies = [new_policy(versus(batch, ["idle"]), seed) for seed in (0, 1)]
+    ended = []
+    for opponent in (*policies, "forward", "forward"):
+        host: Any = HostEnvs(TeamEnv(match("go1tug"), opponent), 2)
+        host.reset([0, 1], np.random.default_rng(0))
+        host.step(np.zeros((2, 1, 12)))
+        ended.append(np.asarray(host.state.rival_obs))
+    assert len(traced) == 2
+    assert np.any(ended[0] != ended[1])
+    np.testing.assert_array_equal(ended[2], ended[3])
 
 
 def test_a_shipped_opponent_adds_its_memory_to_the_state() -> None:

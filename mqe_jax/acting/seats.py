@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Protocol, Self
 
 import jax
@@ -53,16 +53,24 @@ class Policy(Protocol):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Fixed:
-    """A policy that cannot be exchanged within a compiled program, which knows it by identity."""
+    """A policy that cannot be exchanged within a compiled program, which knows it by identity.
+
+    A policy may have an `identity`, which is equal for policies that act alike.
+    """
 
     policy: Any
     """The policy; one without `groups` gets the observations of the group `policy` as an array."""
 
+    @property
+    def _identity(self) -> Hashable:
+        identity = getattr(self.policy, "identity", None)
+        return id(self.policy) if identity is None else identity
+
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Fixed) and self.policy is other.policy
+        return isinstance(other, Fixed) and self._identity == other._identity
 
     def __hash__(self) -> int:
-        return id(self.policy)
+        return hash(self._identity)
 
     def __repr__(self) -> str:
         return repr(self.policy)

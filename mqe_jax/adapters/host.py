@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
+from mqe_jax.acting.seats import Seats
 from mqe_jax.adapters import select
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
@@ -47,7 +48,7 @@ class _Kind:
     """Environments that share compiled functions."""
 
     key: Any
-    env: TaskEnv = dataclasses.field(compare=False)
+    env: Any = dataclasses.field(compare=False)
 
 
 class HostEnvs:
@@ -75,16 +76,8 @@ class HostEnvs:
         self._mode = render_mode
         self._size = (width, height)
         self._camera: Camera | None = None
-        self._task = match = self.env.match if isinstance(self.env, TeamEnv) else self.env
-        opponent = self.env.identity if isinstance(self.env, TeamEnv) else None
-        self._key = (
-            type(match),
-            match.params,
-            match.impl,
-            match.control,
-            match.physics.num_envs,
-            opponent,
-        )
+        self._task = self.env.match if isinstance(self.env, TeamEnv) else self.env
+        self._seats = self.env.seats if isinstance(self.env, TeamEnv) else None
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns what a copy has: all but the compiled functions."""
@@ -92,7 +85,10 @@ class HostEnvs:
 
     @functools.cached_property
     def _programs(self) -> tuple[Callable[..., State], Callable[..., tuple[State, Step]]]:
-        return _compile(_Kind(self._key, self.env))
+        task = self._task
+        made = (type(task), task.params, task.impl, task.control, task.physics.num_envs)
+        begin, step = _compile(_Kind((type(self.env), *made), self.env))
+        return functools.partial(begin, self._seats), functools.partial(step, self._seats)
 
     def reset(
         self,
@@ -161,11 +157,20 @@ def info_of(state: State) -> dict[str, jax.Array]:
 def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[State, Step]]]:
     """Returns the compiled reset, and the step with the resets that its last argument names.
 
-    Both are for any batch size.
+    Both are for any batch size and any opponents of one form, their first argument.
     """
-    env = kind.env
 
-    def begin(seed: jax.Array, seeded: jax.Array, chosen: jax.Array, state: State | None) -> State:
+    def env_of(seats: Seats | None) -> TaskEnv:
+        return kind.env if seats is None else kind.env.with_seats(seats)
+
+    def begin(
+        seats: Seats | None,
+        seed: jax.Array,
+        seeded: jax.Array,
+        chosen: jax.Array,
+        state: State | None,
+    ) -> State:
+        env = env_of(seats)
         if state is None:
             return env.reset(jax.random.PRNGKey(seed))
         key, reset_key = jax.random.split(state.key)
@@ -173,7 +178,10 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
         fresh = dataclasses.replace(fresh, key=jnp.where(seeded, fresh.key, key))
         return select(env, chosen, fresh, state)
 
-    def advance(reset: AutoresetMode, state: State, action: jax.Array) -> tuple[State, Step]:
+    def advance(
+        seats: Seats | None, reset: AutoresetMode, state: State, action: jax.Array
+    ) -> tuple[State, Step]:
+        env = env_of(seats)
         shown = env.step(state, action)
         after = shown
         if reset is not AutoresetMode.DISABLED:
@@ -194,7 +202,10 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
         )
         return after, step
 
-    def steps(state: State, action: jax.Array, reset: AutoresetMode) -> tuple[State, Step]:
-        return jax.vmap(functools.partial(advance, reset))(state, action)
+    def steps(
+        seats: Seats | None, state: State, action: jax.Array, reset: AutoresetMode
+    ) -> tuple[State, Step]:
+        return jax.vmap(functools.partial(advance, seats, reset))(state, action)
 
-    return jax.jit(jax.vmap(begin)), jax.jit(steps, static_argnums=2)
+    begins = jax.vmap(begin, in_axes=(None, 0, 0, 0, 0))
+    return jax.jit(begins), jax.jit(steps, static_argnums=3)

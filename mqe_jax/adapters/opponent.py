@@ -2,9 +2,9 @@
 form.
 """
 
+import copy
 import dataclasses
-import hashlib
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.spaces import Box
 
-from mqe_jax.acting.seats import Policy
+from mqe_jax.acting.seats import Policy, Seat, Seats, actor_of
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, check_arguments
-from mqe_jax.core.types import AnySingle, Level, Memory, RandomKey
+from mqe_jax.core.types import AnySingle, Level, Memory, Observations, RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.envs.match import team_view
 from mqe_jax.envs.observation import box
 from mqe_jax.envs.state import with_final
-from mqe_jax.policies import SimplePolicy, load_as
-from mqe_jax.train.policy import TrainedPolicy, groups_of
+from mqe_jax.policies import load_as
 
 
 @jax.tree_util.register_dataclass
@@ -33,7 +33,7 @@ class TeamEnvState(State):
     """
 
     rival_obs: jax.Array  # observations of the opponent's agents (T, O)
-    rival_memory: Memory  # recurrent state of the opponent, leading axis 1
+    rival_memory: tuple[Memory]  # recurrent state of the opponent, leading axis 1
 
 
 class TeamEnv:
@@ -51,16 +51,17 @@ class TeamEnv:
         if len(match.teams) != 2:
             raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
         self.match = match
-        self.opponent: Policy = load_as("opponent", opponent, match)
         self.num_agents = len(match.teams[0])
-        if further := groups_of(self.opponent) - {"policy"}:
+        rivals = match.teams[1]
+        self.seats = Seats((Seat(actor_of(load_as("opponent", opponent, match)), rivals, rivals),))
+        """The opponent."""
+        if further := self.seats.groups - {"policy"}:
             raise InputError(
                 f"opponent: sees the groups {sorted(further)}; here it must see the group 'policy'"
             )
-        self._source = str(opponent) if isinstance(opponent, str | Path) else None
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} against {self.opponent}: {self.match}>"
+        return f"<{type(self).__name__} against {self.seats.seats[0].policy}: {self.match}>"
 
     def __getattr__(self, name: str) -> Any:
         if name == "match":  # while an instance is being copied
@@ -82,29 +83,19 @@ class TeamEnv:
         """Observations of team 0 (T, O)."""
         return box(np.inf, (self.num_agents, self.match.observation_size))
 
-    @property
-    def identity(self) -> Hashable:
-        """A value that is equal for opponents that act alike; compared where compiled functions are
-        shared.
-        """
-        if isinstance(self.opponent, TrainedPolicy):
-            digest = hashlib.sha256()
-            for leaf in jax.tree.leaves(self.opponent.actor):
-                digest.update(np.asarray(leaf).tobytes())
-            return str(self.opponent.form.by_name()), digest.hexdigest()
-        named = isinstance(self.opponent, SimplePolicy) and self._source is not None
-        return self._source if named else id(self.opponent)
-
     def with_num_envs(self, num_envs: int) -> "TeamEnv":
         """Returns an environment whose engine holds `num_envs` environments; see
         `QuadrupedEnv.with_num_envs`.
         """
-        match = self.match.with_num_envs(num_envs)
-        if match is self.match:
-            return self
-        larger = TeamEnv(match, self.opponent)
-        larger._source = self._source
-        return larger
+        other = copy.copy(self)
+        other.match = self.match.with_num_envs(num_envs)
+        return other
+
+    def with_seats(self, seats: Seats) -> "TeamEnv":
+        """Returns an environment with another opponent of the same form."""
+        other = copy.copy(self)
+        other.seats = seats
+        return other
 
     @single
     @check_arguments(key=RandomKey, assistance=Level)
@@ -116,7 +107,7 @@ class TeamEnv:
         """Returns the state of `reset` without observations."""
         rival = {
             "rival_obs": jnp.zeros((self.num_agents, self.match.observation_size)),
-            "rival_memory": self.opponent.initial_memory(1),
+            "rival_memory": self.seats.initial_memory(1),
         }
         return self._of_team(TeamEnvState(**vars(self.match.begin(key, assistance)), **rival))
 
@@ -131,33 +122,21 @@ class TeamEnv:
             )
         own: Any = state  # a `TeamEnvState`; the match's step keeps its further fields
         key = jax.random.fold_in(own.key, 1)
-        rival, memory = self.opponent.act(own.rival_obs[None], own.rival_memory, key)
-        both = jnp.concatenate(
-            [jnp.asarray(action, jnp.float32), jnp.asarray(rival[0], jnp.float32)]
-        )
-        after: Any = self.match.advance(own, both)
-        return with_final(
-            self.with_observations(self._of_team(dataclasses.replace(after, rival_memory=memory)))
-        )
+        seen = Observations(jnp.concatenate([own.obs, own.rival_obs])[None])
+        action = jnp.asarray(action, jnp.float32)
+        both = jnp.concatenate([action, jnp.zeros_like(action)])[None]
+        both, memory = self.seats.act(seen, own.rival_memory, key, both)
+        after: Any = self.match.advance(own, both[0])
+        return with_final(self.with_observations(dataclasses.replace(after, rival_memory=memory)))
 
     def with_observations(self, state: TeamEnvState, groups: Sequence[str] = ()) -> TeamEnvState:
         """Returns the state with the observations of both teams that belong to it."""
         seen: Any = self.match.with_observations(state, groups)
-        own = {name: obs[: self.num_agents] for name, obs in seen.groups.items()}
-        return dataclasses.replace(seen, groups=own, rival_obs=seen.obs[self.num_agents :])
+        return dataclasses.replace(self._of_team(seen), rival_obs=seen.obs[self.num_agents :])
 
     def _of_team(self, state: TeamEnvState) -> TeamEnvState:
-        """Reduces rewards, outcome and metrics of all agents to those of team 0."""
-        return dataclasses.replace(
-            state,
-            reward=state.reward[: self.num_agents],
-            outcome=state.outcome.by_team(lambda x: x[:1]),
-            metrics={
-                name: value
-                for name, value in state.metrics.items()
-                if not name.startswith("team1/")
-            },
-        )
+        """Returns a state of the match as team 0 sees it."""
+        return dataclasses.replace(state, **team_view(state, self.num_agents))
 
 
 TaskEnv = QuadrupedEnv | TeamEnv

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any, overload
 
@@ -50,6 +50,8 @@ class SimplePolicy:
     """Observations (N, A, O) and a key to actions (N, A, D)."""
     name: str = ""
     """Name for `load_policy`; empty if it has none."""
+    identity: Hashable = dataclasses.field(default=None, repr=False, compare=False)
+    """A value that is equal for policies that act alike; None: there is no other."""
 
     @check_arguments(num_envs=PositiveInt | None)
     def initial_memory(self, num_envs: int | None = None) -> Memory:
@@ -106,7 +108,9 @@ def load_policy(
     if str(source) in (*NAMES, *further):
         if env is None:
             raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
-        return SimplePolicy(env.name, len(env.teams[0]), _plan(str(source), env), str(source))
+        name = str(source)
+        identity = (name, type(env), env.params, env.control)
+        return SimplePolicy(env.name, len(env.teams[0]), _plan(name, env), name, identity)
     if str(source) in zoo.names():
         policy = zoo.load(str(source))
     elif not Path(source).exists() and os.sep not in str(source) and not Path(source).suffix:
