@@ -14,7 +14,7 @@ from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from mqe_jax.acting.results import Rate
-from mqe_jax.acting.seats import Policy, check_policy
+from mqe_jax.acting.seats import Policy, Seat, Seats, check_policy, exchangeable
 from mqe_jax.core.limits import NonNegativeInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import PathText, check_arguments, fail
@@ -22,8 +22,6 @@ from mqe_jax.core.types import (
     RESULTS,
     AnyBatch,
     AnyPolicy,
-    Memory,
-    Observations,
     RandomKey,
     observations,
 )
@@ -85,36 +83,31 @@ def _play(
         check_policy(policy, matches)
     env = Versus(matches, opponents)
     count = matches.num_envs
-
-    def turn(
-        i: int, seen: Observations, memories: tuple[Memory, ...], key: jax.Array
-    ) -> tuple[jax.Array, Any]:
-        action, memory = policies[i].act(seen.to(policies[i]), memories[i], key)
-        return action, (*memories[:i], memory, *memories[i + 1 :])
-
-    turns = [functools.partial(turn, i) for i in range(len(policies))]
+    still = jnp.zeros((count, env.num_agents, env.action_size))
+    (team,) = env.teams
 
     @jax.jit
-    def run(number: jax.Array, key: jax.Array) -> jax.Array:
+    def run(seats: Seats, key: jax.Array) -> jax.Array:
         def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
-            state, memories, finished, outcome = carry
-            action, memories = jax.lax.switch(number, turns, observations(state), memories, key)
+            state, memory, finished, outcome = carry
+            action, memory = seats.act(observations(state), memory, key, still)
             state = env.step(state, action)
             done = state.terminated | state.truncated
             now = state.outcome.result[:, 0] > 0
             outcome = jnp.where((done & ~finished)[:, None], now, outcome)
-            return (state, memories, finished | done, outcome), None
+            return (state, memory, finished | done, outcome), None
 
         key, reset_key = jax.random.split(key)
-        memories = tuple(policy.initial_memory(count) for policy in policies)
+        memory = seats.initial_memory(count)
         nothing = jnp.zeros((count,), bool), jnp.zeros((count, 3), bool)
-        start = env.reset(reset_key), memories, *nothing
+        start = env.reset(reset_key), memory, *nothing
         (_, _, _, outcome), _ = jax.lax.scan(
             advance, start, jax.random.split(key, matches.max_episode_steps)
         )
         return outcome
 
-    outcomes = np.stack([run(jnp.int32(number), key) for number, key in enumerate(keys)])
+    teams = [Seats((Seat(actor, team, team),)) for actor in exchangeable(policies)]
+    outcomes = np.stack([run(seats, key) for seats, key in zip(teams, keys, strict=True)])
     return outcomes.reshape(len(policies), -1, len(opponents), 3).sum(axis=1)
 
 
