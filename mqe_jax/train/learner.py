@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core import devices
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
@@ -98,6 +99,7 @@ def make_learner(
     dims = needs_of(env, config).dims
     check_environment(env, config, dims, processes)
     check_teacher(config, teacher)
+    guide = None if teacher is None else Seats.of(env, teacher)
     network = config.network.build(dims)
     features = config.network.features(dims)
     check_divisible(config, network, processes)
@@ -130,7 +132,7 @@ def make_learner(
                     is_first=jnp.ones((env.num_envs,), bool),
                     episode_steps=jnp.zeros((env.num_envs,), jnp.int32),
                     episode_return=jnp.zeros((env.num_envs,)),
-                    teacher_memory=() if teacher is None else teacher.initial_memory(env.num_envs),
+                    teacher_memory=() if guide is None else guide.initial_memory(env.num_envs)[0],
                 ),
                 key=key,
                 updates=jnp.zeros((), jnp.int32),
@@ -161,12 +163,12 @@ def make_learner(
             features=features,
             action_scale=config.action_scale,
             group=config.group,
-            teacher=teacher,
+            teacher=guide,
         )
         batch, value_normalizer, batch_metrics = _prepare(
             algorithm, now, state, transitions, features
         )
-        if teacher is not None:
+        if guide is not None:
             labels = moving(transitions.teacher_action) / config.action_scale
             batch = batch._replace(teacher_action=chunks(labels, network.chunk_length))
         carry = state.params, restart(state.optimizer, now.actor_begins), state.learning_rate

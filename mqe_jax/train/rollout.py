@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import Seats
 from mqe_jax.core import devices
 from mqe_jax.core.types import (
     Batch,
@@ -20,7 +21,6 @@ from mqe_jax.core.types import (
     mean_of_team,
     observations,
     reset_memory,
-    where_rows,
 )
 from mqe_jax.train.config import PPO
 from mqe_jax.train.networks import Network
@@ -77,7 +77,7 @@ def rollout(
     action_scale: float,
     group: str = "policy",
     features: Features | None = None,
-    teacher: Any = None,
+    teacher: Seats | None = None,
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
     """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and
     metrics ().
@@ -108,12 +108,10 @@ def rollout(
         label = ()
         teacher_memory = ()
         if teacher is not None:
-            teacher_memory = where_rows(
-                state.is_first, teacher.initial_memory(env.num_envs), state.teacher_memory
-            )
-            seen_by_teacher = observations(before).to(teacher)
-            label, teacher_memory = teacher.act(
-                seen_by_teacher, teacher_memory, jax.random.fold_in(key, 1)
+            remembered = teacher.restart((state.teacher_memory,), state.is_first)
+            teacher_key = jax.random.fold_in(key, 1)
+            label, (teacher_memory,) = teacher.act(
+                observations(before), remembered, teacher_key, jnp.zeros_like(action)
             )
         after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
