@@ -122,7 +122,7 @@ class TeamEnv:
             )
         own: Any = state  # a `TeamEnvState`; the match's step keeps its further fields
         key = jax.random.fold_in(own.key, 1)
-        seen = Observations(jnp.concatenate([own.obs, own.rival_obs])[None])
+        seen = Observations.at(jnp.concatenate([own.obs, own.rival_obs])[None])
         action = jnp.asarray(action, jnp.float32)
         both = jnp.concatenate([action, jnp.zeros_like(action)])[None]
         both, memory = self.seats.act(seen, own.rival_memory, key, both)
