@@ -162,7 +162,7 @@ class _Process:
 def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
     """Starts the processes of a team of robots that share one file, and yields its policy.
 
-    `mqe export --per-robot` writes such a file.
+    `mqe export` writes such a file with `--per-robot`.
 
     Example:
         ```python
