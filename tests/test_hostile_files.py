@@ -116,9 +116,9 @@ def test_bad_metrics(content: bytes, tmp_path: Path) -> None:
 def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
     before = peak()
     for read, limit in (
-        (read_curve, limits.CSV_BYTES),
+        (read_curve, limits.FILE_BYTES),
         (load_config, limits.YAML_BYTES),
-        (read_policy, limits.POLICY_BYTES),
+        (read_policy, limits.FILE_BYTES),
     ):
         path = tmp_path / "huge"
         with path.open("wb") as file:
@@ -193,7 +193,7 @@ def encrypted(content: bytes) -> bytes:
 
 LINEAR = named("weight", tensor((1,), (1,)))
 ARCHIVES: dict[str, Callable[[], bytes]] = {
-    "large member": lambda: archived(module(LINEAR), bytes(limits.WEIGHTS_BYTES)),
+    "large member": lambda: archived(module(LINEAR), bytes(limits.FILE_BYTES)),
     "one number as a large tensor": lambda: archived(
         module(named("w", tensor((2**14, 2**14), (0, 0))))
     ),

@@ -1,5 +1,6 @@
-"""A match against a fixed opponent as an environment of team 0; `opponents.Versus` is its batched
-form.
+"""A match against a fixed opponent as an environment of team 0.
+
+`opponents.Versus` is its batched form.
 """
 
 import copy
@@ -28,8 +29,9 @@ from mqe_jax.policies import load_as
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TeamEnvState(State):
-    """State of a match as seen by team 0, with T agents; observations, rewards and metrics are
-    those of team 0.
+    """State of a match as seen by team 0, with T agents.
+
+    Observations, rewards and metrics are those of team 0.
     """
 
     rival_obs: jax.Array  # observations of the opponent's agents (T, O)
@@ -45,8 +47,9 @@ class TeamEnv:
 
     @check_arguments(match=AnySingle)
     def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
-        """Creates the environment; `opponent` is a policy, which samples if it does, or what
-        `load_policy` accepts.
+        """Creates the environment; `opponent` is a policy, or what `load_policy` accepts.
+
+        The opponent samples if its policy does.
         """
         if len(match.teams) != 2:
             raise InputError(f"opponent: {match.name} is not a match; omit the opponent")
@@ -84,8 +87,9 @@ class TeamEnv:
         return box(np.inf, (self.num_agents, self.match.observation_size))
 
     def with_num_envs(self, num_envs: int) -> "TeamEnv":
-        """Returns an environment whose engine holds `num_envs` environments; see
-        `QuadrupedEnv.with_num_envs`.
+        """Returns an environment whose engine holds `num_envs` environments.
+
+        See `QuadrupedEnv.with_num_envs`.
         """
         other = copy.copy(self)
         other.match = self.match.with_num_envs(num_envs)

@@ -1,7 +1,6 @@
 """The command `view`."""
 
 import dataclasses
-import errno
 import importlib.util
 import socket
 from pathlib import Path
@@ -42,7 +41,7 @@ class View(PolicyOptions):
             raise InputError(
                 "view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')"
             )
-        _check_address(self.host, self.port)
+        _check_host(self.host)
         from mqe_jax.envs import ALIASES
         from mqe_jax.runs.build import players
         from mqe_jax.view.menu import DEFAULT, Entry, Menu, find_runs
@@ -75,17 +74,11 @@ class View(PolicyOptions):
         viewer.run(lambda: Session(env, vector_env, seats, self.seed))
 
 
-def _check_address(host: str, port: int) -> None:
-    """Raises an InputError for a host that is not this machine, on which viser would wait for ever.
-
-    A port in use is no error: viser takes the next one.
-    """
+def _check_host(host: str) -> None:
+    """Raises an InputError for a host that is not this machine: viser would wait for ever."""
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        family, kind, protocol, _, address = found[0]
-        with socket.socket(family, kind, protocol) as server:
-            server.bind(address)
+        family = socket.getaddrinfo(host, None)[0][0]
+        socket.create_server((host, 0), family=family).close()
     except (OSError, UnicodeError) as error:
-        if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
-            reason = getattr(error, "strerror", None) or error
-            fail("host", host, f"an address of this machine ({reason})")
+        reason = getattr(error, "strerror", None) or error
+        fail("host", host, f"an address of this machine ({reason})")

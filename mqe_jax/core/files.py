@@ -143,7 +143,7 @@ def read_text(path: Path, limit: int, what: str) -> str:
 
 def read_json(path: Path) -> Any:
     """Reads a JSON file."""
-    return parse_json(read_text(path, limits.JSON_BYTES, "JSON"), str(path))
+    return parse_json(read_text(path, limits.FILE_BYTES, "JSON"), str(path))
 
 
 def parse_json(text: str, name: str) -> Any:
@@ -200,7 +200,7 @@ def read_yaml(path: Path) -> Any:
 
 def read_rows(path: Path) -> Iterator[list[str]]:
     """Yields the rows of a CSV file, the columns' names first."""
-    check_file(path, limits.CSV_BYTES)
+    check_file(path, limits.FILE_BYTES)
     with parsing(path, "a CSV file"), path.open(encoding="utf-8", newline="") as file:
         yield from csv.reader(file, strict=True)
 
@@ -213,7 +213,7 @@ def read_tensors(file: Path, what: str) -> "dict[str, np.ndarray]":
     import numpy as np
     from safetensors.numpy import load_file
 
-    check_file(file, limits.WEIGHTS_BYTES)
+    check_file(file, limits.FILE_BYTES)
     with parsing(f"{what} {file}", "a safetensors file of finite floating-point numbers"):
         arrays = load_file(file)
         for name, array in arrays.items():

@@ -65,13 +65,9 @@ FILE_NAME = 255  # bytes of a part of a path
 SHOWN = 200  # characters of a value in a message
 DEPTH = 32  # nesting of settings
 YAML_BYTES = 2**17
-JSON_BYTES = 2**26
-CSV_BYTES = 2**27
-WEIGHTS_BYTES = 2**27  # of skills and actuator networks; all members and all tensors of an archive
-POLICY_BYTES = 2**28
+FILE_BYTES = 2**28  # of other files; of an archive, all members and all tensors
 CHECKPOINT_BYTES = 2**34
 WEIGHT = 1e4  # magnitude of a policy's or a skill's weight; trained ones are below 10
-RECORDING_BYTES = 2**28  # all members
 
 # -- memory, checked before it is allocated
 CLIP_BYTES = 2**30  # recorded episodes; images of a clip that is not streamed

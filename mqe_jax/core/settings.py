@@ -250,8 +250,9 @@ def _joined(kind: Any, first: Mapping[str, Any], changes: Mapping[str, Any]) -> 
 
 
 def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns changes with dotted names as nested ones; InputError for a name that is given
-    twice.
+    """Returns changes with dotted names as nested ones.
+
+    InputError for a name that is given twice.
     """
     made = merge({}, changes)  # which rejects what is nested too deep
     for name, following in itertools.pairwise(sorted(name for name, _ in leaves(changes))):

@@ -318,9 +318,7 @@ class Observations:
         return self.groups[name]
 
     def to(self, policy: Any) -> Any:
-        """Returns the argument of a policy's `act`: these, or an array for a policy that declares
-        no `groups`.
-        """
+        """Returns the argument of a policy's `act`: these, or an array for one without `groups`."""
         return self if hasattr(policy, "groups") else self.obs
 
     @classmethod

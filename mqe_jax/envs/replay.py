@@ -86,7 +86,7 @@ def load_recording(file: str | pathlib.Path) -> Recording:
     """Reads a recording; InputError if the file is missing, damaged or not a recording."""
     path = pathlib.Path(file)
     with (
-        archive(path, limits.RECORDING_BYTES, "a recording"),
+        archive(path, limits.FILE_BYTES, "a recording"),
         np.load(path, allow_pickle=False) as arrays,
     ):
         about = parse_json(str(arrays["about"]), "about")

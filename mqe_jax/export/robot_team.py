@@ -196,7 +196,7 @@ def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
 def _read(file: Path, seed: int) -> RobotTeam:
     if importlib.util.find_spec("onnxruntime") is None:
         raise InputError("export: needs onnxruntime (pip install 'mqe-jax[export]')")
-    check_file(file, limits.POLICY_BYTES)
+    check_file(file, limits.FILE_BYTES)
     with parsing(file, "an ONNX graph"):
         about = Robot(str(file)).properties
     if not {"needs", "actions"} <= about.keys():

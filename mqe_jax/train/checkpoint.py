@@ -21,7 +21,7 @@ from mqe_jax.core.types import is_typed_key, raw_keys
 FORMAT = "mqe_jax.train"
 VERSION = 4
 
-_LARGEST = {"policy": limits.POLICY_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
+_LARGEST = {"policy": limits.FILE_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
 _NAME = re.compile(r"step_(\d{12})\.safetensors")
 
 _FINITE = (-float(np.finfo(np.float32).max), float(np.finfo(np.float32).max))

@@ -145,9 +145,7 @@ class Session:
         self.moments.append(self.moment())
 
     def moment(self, back: int = 0) -> Scene:
-        """Returns the current step, or that of `back` steps ago, at most the oldest of the
-        history.
-        """
+        """Returns the current step, or that of `back` steps ago, at most the oldest one kept."""
         if back and self.moments:
             return self.moments[self.at(back)]
         data = self.state.data

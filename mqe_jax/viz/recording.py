@@ -58,8 +58,9 @@ class Episode:
         return len(self.qpos)
 
     def cut(self, frames: slice) -> "Episode":
-        """Returns the episode with a part of its frames, such as every n-th; `settled` stays that
-        of the whole.
+        """Returns the episode with a part of its frames, such as every n-th.
+
+        `settled` stays that of the whole.
         """
         poses = {name: getattr(self, name)[frames] for name in ("qpos", "mocap_pos", "mocap_quat")}
         marks = jax.tree.map(lambda x: x[frames], self.marks)
@@ -182,8 +183,9 @@ def best(episodes: list[Episode]) -> Episode:
 
 @check_arguments(episodes=Annotated[list[Episode], MinLen(1)])
 def typical(episodes: list[Episode]) -> Episode:
-    """Returns the median of the successful episodes, by success, then by average step reward; of
-    all if none is.
+    """Returns the median of the successful episodes, else of all.
+
+    They are ranked by success, then by average step reward.
     """
     successful = [episode for episode in episodes if episode.success > 0] or episodes
     ranked = sorted(successful, key=lambda episode: (episode.success, episode.reward))

@@ -48,7 +48,7 @@ class _Unpickler(_PurePython):
         self._archive = opened
         self._root = root
         self._storages: dict[str, np.ndarray] = {}
-        self._left = limits.WEIGHTS_BYTES  # of all tensors, which may share storages
+        self._left = limits.FILE_BYTES  # of all tensors, which may share storages
 
     def find_class(self, module: str, name: str) -> Any:
         if module.startswith("__torch__"):
@@ -92,7 +92,7 @@ class _Unpickler(_PurePython):
             raise ValueError("a tensor reaches beyond its storage")
         self._left -= 4 * math.prod(size)
         if self._left < 0:
-            raise ValueError(f"its tensors have more than {limits.WEIGHTS_BYTES} bytes")
+            raise ValueError(f"its tensors have more than {limits.FILE_BYTES} bytes")
         strides = [s * storage.itemsize for s in stride]
         tensor = np.array(
             np.lib.stride_tricks.as_strided(storage[offset:], size, strides), np.float32
@@ -110,7 +110,7 @@ def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     between each two.
     """
     kind = "a TorchScript Sequential of Linear and ELU layers"
-    with archive(Path(path), limits.WEIGHTS_BYTES, kind) as opened:
+    with archive(Path(path), limits.FILE_BYTES, kind) as opened:
         names = [name for name in opened.namelist() if re.fullmatch(r"[^/]*/data\.pkl", name)]
         if len(names) != 1:
             raise ValueError("no data.pkl in it")
