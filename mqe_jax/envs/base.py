@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,14 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, results, weights_of
-from mqe_jax.core.settings import check, check_arguments, differences, fail
+from mqe_jax.core.settings import (
+    Parameters,
+    check,
+    check_arguments,
+    differences,
+    fail,
+    override,
+)
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.assembly import make_controller, make_scene
 from mqe_jax.envs.observation import ObservationLayout, finite
@@ -49,7 +57,19 @@ _NOISE = 7919
 _SENSING = 7907
 
 
-class QuadrupedEnv(Task[S, P]):
+T = TypeVar("T")
+
+
+class _Recorded(type):
+    """Class of environments, which know the arguments with which they were made."""
+
+    def __call__(cls: type[T], *arguments: Any, **named: Any) -> T:
+        made = type.__call__(cls, *arguments, **named)
+        vars(made)["_arguments"] = arguments, named
+        return made
+
+
+class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
     """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by
     `jax.jit`.
 
@@ -59,6 +79,9 @@ class QuadrupedEnv(Task[S, P]):
         state = jax.jit(env.reset)(jax.random.PRNGKey(0))  # then jax.jit(env.step)(state, action)
         ```
     """
+
+    _arguments: tuple[tuple[Any, ...], dict[str, Any]]  # of the constructor
+    _later: tuple[str, ...] = ()  # attributes that were set after it
 
     @single
     def __init__(
@@ -126,6 +149,11 @@ class QuadrupedEnv(Task[S, P]):
             contact_forces=self.params.privileged_contact_forces,
         )
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_arguments" in vars(self):
+            vars(self)["_later"] = (*self._later, name)
+        super().__setattr__(name, value)
+
     def __repr__(self) -> str:
         size = self.observation_size
         actions = f"{self.control} {self.action_size}"
@@ -170,11 +198,66 @@ class QuadrupedEnv(Task[S, P]):
     @check_arguments(num_envs=Environments)
     def with_num_envs(self, num_envs: int) -> QuadrupedEnv[S, P]:
         """Returns an environment whose engine holds `num_envs` environments: itself, or one with
-        larger buffers.
+        larger buffers; errors as of `changed`.
         """
-        if self.physics.holds(num_envs):
+        return self.changed({}, num_envs)
+
+    @check_arguments(params=Parameters, num_envs=Environments)
+    def changed(self, params: Mapping[str, Any], num_envs: int = 1) -> QuadrupedEnv[S, P]:
+        """Returns an environment with other parameters, whose engine holds `num_envs` environments.
+
+        It is this one if nothing differs. Another one is made with the arguments of this one's
+        constructor, in which only parameters, control mode and `num_envs` differ.
+
+        Example:
+            ```python
+            env = mqe_jax.make("go1gate")
+            print(env.changed({"gate_width": 0.8, "control": "position"}))
+            ```
+
+        Raises:
+            InputError: for an unknown parameter or a value that is not allowed, and if another
+                environment is needed but would lose an attribute that was set on this one.
+        """
+        others = {name: value for name, value in params.items() if name != "control"}
+        control = params.get("control", self.control)
+        wanted = override(self.params, others)
+        arguments: dict[str, Any] = {}
+        if wanted != self.params:
+            arguments["params"] = wanted
+        if control != self.control:
+            arguments["control"] = control
+        if not self.physics.holds(num_envs):
+            arguments["num_envs"] = num_envs
+        if not arguments:
             return self
-        return type(self)(self.params, impl=self.impl, control=self.control, num_envs=num_envs)
+        made = self._repeat(arguments)
+        for name, value in differences(made.params, wanted).items():
+            raise InputError(f"{name}: the constructor of {type(self).__name__} makes it {value!r}")
+        return made
+
+    def _repeat(self, changes: Mapping[str, Any]) -> QuadrupedEnv[S, P]:
+        """Returns an environment made with the arguments of this one's constructor, of which some
+        are changed.
+        """
+        kind = type(self).__name__
+        names = ", ".join(changes)
+        if self._later:
+            raise InputError(
+                f"{names}: another {kind} is needed, and it would lose the attribute "
+                f"{self._later[0]!r}, which was set after the constructor"
+            )
+        signature = inspect.signature(type(self).__init__)
+        (_, *known) = signature.parameters
+        first, named = self._arguments
+        arguments = {**dict(zip(known, first, strict=False)), **named, **changes}
+        try:
+            signature.bind(self, **arguments)
+        except TypeError as error:
+            raise InputError(
+                f"{names}: another {kind} is needed, but its constructor rejects that ({error})"
+            ) from None
+        return type(self)(**arguments)
 
     @single
     @check_arguments(key=RandomKey, assistance=Level)
