@@ -22,7 +22,7 @@ from mqe_jax.core.files import lock, write_atomically
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import FrozenMapping, build, fail, settings_class
 from mqe_jax.envs.registry import task_id
-from mqe_jax.policies import load_policy
+from mqe_jax.names import find
 from mqe_jax.study.runs import PLAIN, table
 from mqe_jax.study.sweep import for_task, match_names, read_part
 from mqe_jax.train.policy import TrainedPolicy
@@ -140,7 +140,7 @@ def measure(
         try:
             with lock(item.file.parent):
                 result = pkgutil.resolve_name(MEASURES[part.measure])(
-                    item.task, **_for_robot(item.arguments)
+                    item.task, **_for_robot(item.task, item.arguments)
                 )
                 plain = result if isinstance(result, dict) else result.to_dict()
                 content = {"measure": part.measure, "arguments": item.arguments, "result": plain}
@@ -155,7 +155,7 @@ def measure(
     return [item for item in chosen if not item.file.is_file()]
 
 
-def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
+def _for_robot(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
     """Returns arguments whose policies act on the robot that `env` names, whichever they were
     trained on.
     """
@@ -163,12 +163,9 @@ def _for_robot(arguments: dict[str, Any]) -> dict[str, Any]:
     if robot is None:
         return arguments
     changed = dict(arguments)
-    for name in ("policy", "opponent"):
-        try:
-            policy = load_policy(arguments.get(name, ""))
-        except InputError:  # scripted and other policies fit every robot
-            continue
-        if isinstance(policy, TrainedPolicy):
+    for name in {"policy", "opponent"} & arguments.keys():
+        policy = find(arguments[name], task)
+        if isinstance(policy, TrainedPolicy):  # others fit every robot
             changed[name] = dataclasses.replace(
                 policy, needs=dataclasses.replace(policy.needs, robot=robot)
             )

@@ -17,14 +17,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mqe_jax.acting.results import Result
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
-    from mqe_jax.policies import load_policy
-    from mqe_jax.runs.build import make_learner
+    from mqe_jax.names import load_policy, versus
+    from mqe_jax.runs.cast import make_learner
     from mqe_jax.runs.exploiting import exploitability
     from mqe_jax.runs.learning import Run, learn, learn_seeds, load_run
     from mqe_jax.runs.playing import Clip, evaluate, render, tournament
     from mqe_jax.runs.sweeping import sweep
     from mqe_jax.runs.throughput import bench
-    from mqe_jax.selfplay.opponents import versus
     from mqe_jax.train.config import TrainConfig
     from mqe_jax.walk.evaluation import evaluate_skill
     from mqe_jax.walk.training import train_skill
@@ -66,11 +65,11 @@ _HOMES = {
     "bench": "runs.throughput",
     "evaluate_skill": "walk.evaluation",
     "exploitability": "runs.exploiting",
-    "load_policy": "policies",
-    "make_learner": "runs.build",
+    "load_policy": "names",
+    "make_learner": "runs.cast",
     "sweep": "runs.sweeping",
     "train_skill": "walk.training",
-    "versus": "selfplay.opponents",
+    "versus": "names",
 }
 """Modules of the names; those of the others are in `envs`."""
 

@@ -18,11 +18,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.cli import launch, main
+from mqe_jax import names
+from mqe_jax.cli import demo, launch, main
 from mqe_jax.core import devices
 from mqe_jax.core.types import Outcome
-from mqe_jax.envs import TASKS, EnvironmentState
-from mqe_jax.runs import build
+from mqe_jax.envs import TASKS, EnvironmentState, VectorEnv
+from mqe_jax.runs import cast, exploiting, playing, throughput
 
 SMALL = (
     "--num-envs 4 --rollout-steps 8 --total-steps 64 --ppo.minibatches 1 --network.no-recurrent"
@@ -89,6 +90,7 @@ class FakeEnv:
     def __init__(self) -> None:
         self.mj_model = mujoco.MjModel.from_xml_string(XML)
         self.physics = SimpleNamespace(impl="none", step=lambda data, ctrl: (data, False))
+        self.physics.holds = lambda num_envs: True
 
     def reset(self, key: jax.Array) -> FakeState:
         model = self.mj_model
@@ -188,12 +190,18 @@ def made(num_envs: int) -> tuple[FakeEnv, FakeVectorEnv]:
 
 def install(patch: pytest.MonkeyPatch) -> None:
     """Lets `mqe` know this task, besides the others."""
-    real = build.make_env
+    make = names.make
 
-    def make_env(task: str, *arguments: Any, **named: Any) -> Any:
-        return made(arguments[2]) if task == "fake" else real(task, *arguments, **named)
+    def make_env(task: str, **options: Any) -> Any:
+        return made(1)[0] if task == "fake" else make(task, **options)
 
-    patch.setattr(build, "make_env", make_env)
+    def batch(env: Any, num_envs: int, *others: Any, **named: Any) -> Any:
+        fake = isinstance(env, FakeEnv)
+        return made(num_envs)[1] if fake else VectorEnv(env, num_envs, *others, **named)
+
+    patch.setattr(names, "make", make_env)
+    for module in (names, cast, demo, exploiting, playing, throughput):
+        patch.setattr(module, "VectorEnv", batch)
     patch.setitem(TASKS, "fake", FakeEnv)  # pyright: ignore[reportArgumentType]
 
 

@@ -25,7 +25,7 @@ from mqe_jax.core.types import Observations
 from mqe_jax.export.robot_graph import verify_robot
 from mqe_jax.export.robot_team import RobotTeam, open_team
 from mqe_jax.export.task import readings_function
-from mqe_jax.runs.build import make_env
+from mqe_jax.names import environment
 from mqe_jax.train.policy import TrainedPolicy
 
 
@@ -87,7 +87,7 @@ def measure(
     policy = load_policy(target).acting(not sampled)
     task = str(policy.config.task)
     seed = 0
-    env, _ = make_env(task, "c", policy.config.env, 1)
+    env = environment(task, policy.config.env, impl="c")
     model, error = verify_robot(policy, env)
     options: dict[str, Any] = {
         "env": policy.config.env,

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax import names
 from mqe_jax.envs import Moment, QuadrupedEnv, State, make
 from mqe_jax.envs.reward import weigh
 from mqe_jax.envs.state import ENDINGS
@@ -25,6 +26,11 @@ def made(task: str) -> Any:
     process.
     """
     return make(task, impl="c" if jax.default_backend() == "cpu" else "jax", control="position")
+
+
+def needed(task: str, *sources: Any) -> dict[str, Any]:
+    """The parameters of a task that policies need, from names, files or policies."""
+    return names.parameters_of(task, [names.find(source, task) for source in sources])
 
 
 @functools.cache

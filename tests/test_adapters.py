@@ -24,8 +24,8 @@ from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
 from mqe_jax.envs.autoreset import autoreset
-from mqe_jax.policies import SimplePolicy
-from mqe_jax.selfplay.opponents import versus
+from mqe_jax.names import versus
+from mqe_jax.policies.simple import SimplePolicy
 from tests.inputs import refuses
 from tests.test_opponents import new_policy
 

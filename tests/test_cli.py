@@ -1,5 +1,6 @@
 """The command line: output, streams, settings, run folders and policies."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax import cli
+from mqe_jax import cli, names
 from mqe_jax.cli import arguments, demo
 from mqe_jax.cli.skill_train import parse_skill_train
 from mqe_jax.cli.train import parse_train
@@ -21,7 +22,6 @@ from mqe_jax.core.settings import override
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.presets import resolve
-from mqe_jax.runs import build
 from mqe_jax.train import checkpoint
 from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
@@ -65,7 +65,7 @@ def test_a_checkpoint_with_environments_of_an_earlier_version_is_rejected_by_nam
     """Version 0.3 stored the observations as `obs`."""
     run = Path(shutil.copytree(run_folder, tmp_path / "run"))
     path = checkpoint.list_checkpoints(run)[-1]
-    arrays, about = checkpoint._read(path, "checkpoint")
+    _, arrays, about = checkpoint.read_file(path, kind="checkpoint")
     own = "rollout/env_state/groups/policy"
     arrays["rollout/env_state/obs"] = arrays.pop(own)
     checkpoint.save_tree(path, arrays, about, kind="checkpoint")
@@ -186,12 +186,11 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
 ) -> None:
     played: list[tuple[str, bool]] = []
 
-    def load(source: str, env: Any = None, *, deterministic: bool = False) -> None:
-        if env is not None:
-            played.append((source, deterministic))
+    def seat(source: str, *of: Any, deterministic: bool) -> None:
+        played.append((source, deterministic))
         raise InputError("stop")
 
-    monkeypatch.setattr("mqe_jax.policies.load_policy", load)
+    monkeypatch.setattr(names, "seat", seat)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: True)  # for the viewer's packages
     flags = {"render": ["-o", "clip.png"], "view": ["--port", "49876"]}.get(command, [])
     for target in (str(run_folder), "go1gate", "fake"):
@@ -205,14 +204,17 @@ def test_set_keeps_the_other_parameters_of_a_run(
     run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
-    config = override(build.run_config(str(run_folder)), {"env": {"rewards": {"collision": -5.0}}})
-    monkeypatch.setattr(build, "run_config", lambda target: config)
+    run = names.load_policy(run_folder)
+    config = override(run.config, {"env": {"rewards": {"collision": -5.0}}})
+    monkeypatch.setattr(
+        names, "read_policy", lambda source: dataclasses.replace(run, config=config)
+    )
 
-    def make_env(task: str, impl: str, overrides: Any, num_envs: int) -> None:
-        made.append(overrides)
+    def environment(task: str, params: Any, **options: Any) -> None:
+        made.append(params)
         raise InputError("stop")
 
-    monkeypatch.setattr(build, "make_env", make_env)
+    monkeypatch.setattr(names, "environment", environment)
     assert (
         cli.main(
             [

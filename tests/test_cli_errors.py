@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import jax
 import pytest
 
-from mqe_jax import cli
+from mqe_jax import cli, names
 from mqe_jax.core.errors import NonFiniteError
-from mqe_jax.runs import build, learning
-from mqe_jax.train.nn import mlp_init
+from mqe_jax.runs import learning
+from mqe_jax.train.checkpoint import checkpoint_step
 from tests.fake_env import SMALL
 
 pytestmark = pytest.mark.usefixtures("fake_tasks")
@@ -85,7 +84,10 @@ BAD = {
         ["dump_diverged: /proc/none cannot be written"],
     ),
     "recording": (["replay", "none.npz"], ["none.npz"]),
-    "policy to start from": (["train", "fake", *SMALL, "--start", "nope"], ["start: 'nope'"]),
+    "policy to start from": (
+        ["train", "fake", *SMALL, "--start", "nope"],
+        ["start: unknown 'nope'"],
+    ),
     "host": (
         ["view", "go1plane", "--control", "position", "--host", "a..b"],
         ["host: 'a..b' is not allowed"],
@@ -98,7 +100,7 @@ BAD = {
     "no text": (["eval", "a\udcff"], ["control character"]),
     "task as a parameter": (
         ["eval", "go1gate", "--set", "task=go1tug"],
-        ["set.task: is not a task parameter"],
+        ["env.task: is not a task parameter"],
     ),
     "self as a parameter": (
         ["eval", "go1gate", "--set", "self=3"],
@@ -138,10 +140,8 @@ OUTPUTS = {
 def test_an_output_is_checked_first(
     name: str, kind: str, tmp_path: Path, monkeypatch: Any, capfd: Any
 ) -> None:
-    monkeypatch.setattr(build, "make_env", lambda *_: pytest.fail("it was not checked first"))
-    monkeypatch.setattr(
-        "mqe_jax.policies.load_policy", lambda *_: pytest.fail("it was not checked first")
-    )
+    monkeypatch.setattr(names, "environment", lambda *_: pytest.fail("it was not checked first"))
+    monkeypatch.setattr(names, "load_policy", lambda *_: pytest.fail("it was not checked first"))
     os.mkfifo("fifo")
     words, suffix = OUTPUTS[name]
     Path(f"folder{suffix}").mkdir()
@@ -264,7 +264,7 @@ def test_what_ends_a_training_has_its_exit_code(
 @pytest.mark.parametrize(
     ("defect", "error"),
     [
-        (lambda: mlp_init(jax.random.PRNGKey(0), [2]), ValueError),
+        (lambda: checkpoint_step(Path("x")), AssertionError),
         (lambda: {}["x"], KeyError),
         (lambda: 1 // 0, Exception),
     ],
@@ -273,6 +273,6 @@ def test_what_ends_a_training_has_its_exit_code(
 def test_defects_keep_their_traceback(
     defect: Any, error: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(build, "make_env", lambda *arguments: defect())
+    monkeypatch.setattr(names, "environment", lambda *of, **named: defect())
     with pytest.raises(error):
         cli.main(["bench", "fake"])

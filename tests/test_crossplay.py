@@ -17,7 +17,8 @@ from mqe_jax.acting.seats import Seat, Seats, exchangeable
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import Observations
 from mqe_jax.envs import make
-from mqe_jax.policies import SimplePolicy, load_policy
+from mqe_jax.names import load_policy
+from mqe_jax.policies.simple import SimplePolicy
 from mqe_jax.selfplay.league import games
 from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
 from mqe_jax.selfplay.league.games import Estimate

@@ -21,17 +21,17 @@ from mqe_jax.core import devices
 from mqe_jax.core.settings import build
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.wrappers import Deadline
-from mqe_jax.policies import load_policy, parameters_for
+from mqe_jax.names import load_policy, versus
 from mqe_jax.selfplay.demonstrations import Demonstrated
-from mqe_jax.selfplay.league.league import League
+from mqe_jax.selfplay.league.league import League, Roster
 from mqe_jax.selfplay.league.sides import BothSides
-from mqe_jax.selfplay.opponents import Mirror, versus
+from mqe_jax.selfplay.opponents import Mirror
 from mqe_jax.train.config import PPO, TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.rollout import minibatches
 from tests import fake_env
 from tests.inputs import refuses
-from tests.states import made
+from tests.states import made, needed
 from tests.training import assert_same, settings
 
 KEY = jax.random.PRNGKey(0)
@@ -185,7 +185,7 @@ def copied(value: Any) -> Any:
 
 def played(task: str) -> QuadrupedEnv:
     """The task with what its shipped policy needs."""
-    return make(task, impl="c", num_envs=2, **parameters_for(task, task))
+    return make(task, impl="c", num_envs=2, **needed(task, task))
 
 
 def matches() -> VectorEnv:
@@ -194,7 +194,7 @@ def matches() -> VectorEnv:
 
 def league() -> Any:
     values = {"num_envs": 2, "rollout_steps": 2, "total_steps": 8, "opponents": ["newest", "older"]}
-    return copied(League(matches(), ["newest", "older"], build(TrainConfig, values))).env
+    return copied(League(matches(), Roster(["newest", "older"]), build(TrainConfig, values))).env
 
 
 BATCHES: dict[str, Callable[[], Any]] = {

@@ -23,16 +23,15 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax import cli
+from mqe_jax import cli, names
 from mqe_jax.acting.evaluate import Evaluator
 from mqe_jax.cli import demo
 from mqe_jax.cli.arguments import COMMANDS, parse
 from mqe_jax.core.settings import override
 from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_SCRIPTED
-from mqe_jax.policies import load_policy
+from mqe_jax.names import load_policy
 from mqe_jax.policies.scripted import scripted_policy
-from mqe_jax.runs import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import NETWORKS
 from mqe_jax.walk.training import AGILE
@@ -125,13 +124,13 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """
     few: dict[str, Any] = {"num_envs": 8, "rollout_steps": 16, "total_steps": 256, "ppo.epochs": 1}
     few |= {"network": {"recurrent": False, "hidden_sizes": (8,)}}
-    real = build.settings
+    real = names.settings
 
     def settings(*arguments: Any, **named: Any) -> TrainConfig:
         config = real(*arguments, **named)
         return override(TrainConfig(task=config.task, env=config.env, seed=config.seed), few)
 
-    monkeypatch.setattr(build, "settings", settings)
+    monkeypatch.setattr(names, "settings", settings)
     monkeypatch.setattr(QuadrupedEnv, "max_steps", 20)
     monkeypatch.chdir(tmp_path)
 

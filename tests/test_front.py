@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 
 import mqe_jax
-from mqe_jax import cli
+from mqe_jax import cli, names
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.results import Rate, Result
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.core.types import Outcome
-from mqe_jax.runs import build, playing
+from mqe_jax.runs import playing
+from mqe_jax.runs.cast import prepare
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.train import algorithms
 from mqe_jax.train.algorithms import StagesSettings, register_stages
@@ -61,10 +62,10 @@ def test_settings_are_those_of_the_command(
     # in the empty folder of the test
     Path("file.yaml").write_text("{num_envs: 8, ppo: {epochs: 2}}")
     command = parse_train(words.split())
-    expected = build.settings(command.target, command.settings)
+    expected = names.settings(command.target, command.settings)
     if isinstance(config, TrainConfig):
         config = command.settings
-    assert build.settings(command.target, config, env=env) == expected
+    assert names.settings(command.target, config, env=env) == expected
 
 
 run = pytest.fixture(scope="module")(lambda shared_programs: mqe_jax.learn(fake(), FEW, seed=2))
@@ -245,7 +246,7 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
         (
             fake(),
             {"config": {"opponents": ["idle"]}},
-            r"opponents: \('idle',\) .* left out for a batch",
+            r"opponents: \['idle'\] .* left out for a batch",
         ),
     ],
 )
@@ -305,11 +306,11 @@ def test_an_environment_keeps_its_parameters() -> None:
     own: dict[str, Any] = {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}}
     env = mqe_jax.make("go1gate", impl="c", episode_length=8.0, **own)
     changes = {"robot": "go2", "episode_length": 5.0}
-    (config,), cast = build.prepare(env, {"num_envs": 2, "evaluation.every": 5}, changes)
+    (config,), cast = prepare(env, {"num_envs": 2, "evaluation.every": 5}, changes)
     assert config.env == own | changes
     assert to_mapping(cast.eval_env.env.params) == to_mapping(env.params) | changes
     assert cast.env.env.params.gate_width == 0.7 and cast.env.env.control == "position"
-    assert build.players(env, "idle").env.params == env.params
+    assert names.table(env, "idle").env.params == env.params
 
 
 @pytest.mark.parametrize(

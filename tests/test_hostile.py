@@ -32,9 +32,10 @@ from mqe_jax.envs import TASKS, QuadrupedEnv, VectorEnv, make, register_task
 from mqe_jax.envs.registry import register_scripted
 from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
 from mqe_jax.export.scene import scene_xml
+from mqe_jax.names import versus
 from mqe_jax.physics import robots
 from mqe_jax.selfplay.league import games, tournament
-from mqe_jax.selfplay.opponents import Mirror, versus
+from mqe_jax.selfplay.opponents import Mirror
 from mqe_jax.study.runs import read_curve
 from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.algorithms import register_stages
@@ -381,7 +382,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
     ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
     ("TrainConfig: ", lambda x, v: build(TrainConfig, v), (None, [1], "x")),
-    ("policy: ", lambda x, v: read_policy(v), (None, 3, "\0")),
+    ("run: ", lambda x, v: read_policy(v), (None, 3, "\0")),
     (
         "num_envs: ",
         lambda x, v: gymnasium.VectorEnv("go1plane", v, impl="c"),

@@ -272,7 +272,7 @@ def refuses_rewritten(
     starts so.
     """
     path = run / "policy.safetensors" if kind == "policy" else checkpoint.list_checkpoints(run)[-1]
-    arrays, about = checkpoint._read(path, kind)
+    _, arrays, about = checkpoint.read_file(path, kind=kind)
     name = next(other for other in arrays if other.startswith(name))
     changed = np.array(arrays[name])
     changed[(-1,) * changed.ndim] = value

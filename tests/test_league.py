@@ -13,19 +13,20 @@ import numpy as np
 import pytest
 
 from mqe_jax import cli
+from mqe_jax.acting.seats import Policy
 from mqe_jax.core.settings import build, override, to_mapping
 from mqe_jax.envs import make
 from mqe_jax.envs.wrappers import Deadline
+from mqe_jax.names import load_policy, versus
 from mqe_jax.presets import resolve
-from mqe_jax.runs import build as setup
+from mqe_jax.runs import cast, playing
 from mqe_jax.selfplay.league import tournament
-from mqe_jax.selfplay.league.league import League
-from mqe_jax.selfplay.opponents import versus
+from mqe_jax.selfplay.league.league import League, Roster
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.needs import needs_of
-from mqe_jax.train.policy import policy_of, save_policy
+from mqe_jax.train.policy import policy_of
 from mqe_jax.train.seeds import SeedBatch
 from mqe_jax.train.start import first_state, own_learner, without_environments
 from tests.inputs import refuses
@@ -34,6 +35,11 @@ from tests.training import assert_same_run, content, updated
 
 SOURCES = ("newest", "older", "uniform", "idle")
 SMALL = {"members": 4, "snapshot_steps": 32, "snapshot_win_rate": 1.0, "episodes": 1}
+
+
+def fixed() -> dict[str, Policy]:
+    """The opponents of `SOURCES` that no training changes."""
+    return {"idle": load_policy("idle", matches(num_envs=8).env)}
 
 
 def config_of(sources: tuple[str, ...] = SOURCES, **settings: Any) -> TrainConfig:
@@ -49,7 +55,7 @@ def history() -> list[TrainState]:
     is due every one.
     """
     config = config_of()
-    league = League(matches(num_envs=8), SOURCES, config)
+    league = League(matches(num_envs=8), Roster(SOURCES), config, fixed())
     return updated(league.env, config, 9, league=league)[0]
 
 
@@ -74,22 +80,20 @@ def test_a_league_begins_with_its_policies(
     resumed: bool, history: list[TrainState], tmp_path: Path
 ) -> None:
     """With that it starts from or, resumed without environments, with its members."""
-    start: dict[str, Any] = {} if resumed else {"start": str(tmp_path)}
+    start: dict[str, Any] = {} if resumed else {"start": "history"}
     config = config_of(**start)
     state = history[9]
     file = None
-    league = League(matches(num_envs=8), SOURCES, config)
+    league = League(matches(num_envs=8), Roster(SOURCES), config, fixed())
     if resumed:
         metadata = {"task": league.env.name, "config": to_mapping(config), "environments": False}
         file = save_checkpoint(
             tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1
         )
-    else:
-        save_policy(tmp_path, policy_of(state, league.env, config, env_steps=0))
+    policy = None if resumed else policy_of(state, league.env, config, env_steps=0)
     learner, processes = own_learner(league.env, config, league)
-    begun, _ = first_state(
-        league.env, learner, processes, config, file, SeedBatch(learner.init, 1).shared, league
-    )
+    shared = SeedBatch(learner.init, 1).shared
+    begun, _ = first_state(league.env, learner, processes, config, file, shared, league, policy)
     seats, before = (
         [seat.arrays for seat in each.rollout.env_state.opponents] for each in (begun, state)
     )
@@ -157,10 +161,10 @@ def test_a_league_has_more_members_than_blocks_and_environments_of_its_own_proce
         "league.members: 2 .*more than the blocks that play members, 2",
         League,
         matches(num_envs=8),
-        SOURCES,
+        Roster(SOURCES),
         few,
     )
-    env = League(matches(num_envs=8), SOURCES, config_of()).env.share(2)
+    env = League(matches(num_envs=8), Roster(SOURCES), config_of(), fixed()).env.share(2)
     assert env.num_envs == env.inner.num_envs == 4
 
 
@@ -274,28 +278,24 @@ def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> No
 def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(
     params: dict[str, Any],
 ) -> None:
-    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == [
+    assert cast.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1, **params)) == [
         "idle",
         "random",
     ]
     changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
-    assert (
-        setup.environments(
-            "c", override(resolve("go1revolvingdoor", "paper/mappo"), changes), 1
-        ).eval_env
-        is not None
-    )
+    config = override(resolve("go1revolvingdoor", "paper/mappo"), changes)
+    assert cast.environments(config, impl="c").eval_env is not None
 
 
 def test_a_tournament_meets_every_pair_on_both_sides(
     tmp_path: Path, monkeypatch: Any, capfd: Any
 ) -> None:
-    assert setup.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1)) == [
+    assert cast.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1)) == [
         "scripted",
         "idle",
         "random",
     ]
-    monkeypatch.setattr(setup, "reference_opponents", lambda env: ["scripted", "idle"])
+    monkeypatch.setattr(playing, "reference_opponents", lambda env: ["scripted", "idle"])
     capfd.readouterr()
     arguments = [
         "go1revolvingdoor",

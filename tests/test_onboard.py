@@ -13,15 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import make
+from mqe_jax import make, names
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import Batch, Observations
-from mqe_jax.policies import load_as, parameters_for, zoo
-from mqe_jax.runs import build
-from mqe_jax.runs.build import prepare
+from mqe_jax.policies import zoo
+from mqe_jax.runs.cast import prepare
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.needs import Needs, needs_of
 from mqe_jax.train.normalize import running_init
@@ -30,6 +29,7 @@ from mqe_jax.train.runner import train_seeds
 from mqe_jax.train.stages import Stages
 from tests import training as probes
 from tests.inputs import refuses
+from tests.states import needed
 from tests.training import (
     FAST,
     Probe,
@@ -69,8 +69,8 @@ def test_sensors_select_the_settings_of_policies_that_see_them() -> None:
     train = parse_train(flags)
     assert train.overrides() == SENSES and train.settings.imitation.teacher == "go1gate"
     assert (train.settings.group, train.settings.network.name) == ("onboard", "blocks")
-    learnt = build.settings("go1gate", {"imitation.teacher": "go1gate"}, env=SENSES)
-    assert build.settings("go1gate", train.settings) == learnt
+    learnt = names.settings("go1gate", {"imitation.teacher": "go1gate"}, env=SENSES)
+    assert names.settings("go1gate", train.settings) == learnt
     network: Any = parse_train(
         ["go1gate", "--set", "senses=onboard", "--network.gru-size", "7"]
     ).settings.network
@@ -78,9 +78,9 @@ def test_sensors_select_the_settings_of_policies_that_see_them() -> None:
     plain = parse_train(["go1gate", "--senses", "full"]).settings
     assert override(parse_train(["go1gate"]).settings, {"env.senses": "full"}) == plain
     assert plain.group == "policy"
-    demo = build.settings("go1gate", {"config": "demo", "group": "policy"}, env=SENSES)
+    demo = names.settings("go1gate", {"config": "demo", "group": "policy"}, env=SENSES)
     assert demo.group == "policy" and demo.num_envs == 128
-    assert build.settings("go1tug", env={"senses": ["lidar"]}).group == "onboard"
+    assert names.settings("go1tug", env={"senses": ["lidar"]}).group == "onboard"
     listed = parse_train(["go1gate", "--senses", "[lidar, {name: detections, range: 2.0}]"])
     assert listed.overrides() == {"senses": ["lidar", {"name": "detections", "range": 2.0}]}
     assert listed.settings.group == "onboard"
@@ -90,14 +90,14 @@ def test_a_task_gets_what_its_teacher_needs(monkeypatch: pytest.MonkeyPatch) -> 
     shipped: Any = zoo.load("go1gate")
     needs = override(shipped.needs, {"skill": "agile", "command_ranges": {"vx": (-1.0, 1.5)}})
     teacher = dataclasses.replace(shipped, needs=needs)
-    monkeypatch.setattr(zoo, "load", lambda name: teacher)
+    monkeypatch.setattr(names, "read_policy", lambda file: teacher)
     changes = {"imitation.teacher": "go1gate"}
-    assert build.settings("go1gate", changes, env=SENSES).env == {
+    assert names.settings("go1gate", changes, env=SENSES).env == {
         **SENSES,
         "skill": "agile",
         "command_ranges": needs.command_ranges,
     }
-    given = build.settings("go1gate", changes, env={**SENSES, "skill": "walk"})
+    given = names.settings("go1gate", changes, env={**SENSES, "skill": "walk"})
     assert given.env["skill"] == "walk"
     refuses(
         r"imitation\.teacher: go1gate needs skill 'agile'.* has 'walk'",
@@ -143,7 +143,7 @@ def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
     )
     env = make("go1gate", impl="c", num_envs=1, skill=("walk", "agile"), **SENSES)
     layout = env.layouts["onboard"]
-    met = load_as("opponent", policy, env)
+    met = names.seat(policy, env, "opponent")
     assert layout.size == needs.dims.observation + 1
     memory = met.initial_memory(3)
     own = policy.initial_memory(3)
@@ -185,7 +185,7 @@ def test_other_sensors_are_named_with_both_values() -> None:
     assert (
         forged.mismatches(needs) == {} != Needs(task="go1gate", dims=needs.dims).mismatches(needs)
     )
-    assert parameters_for("go1gate", policy) == {"senses": needs.senses}
+    assert needed("go1gate", policy) == {"senses": needs.senses}
     check_policy(zoo.load("go1gate"), blind)  # of before files described blocks
 
 
@@ -313,5 +313,5 @@ def test_a_training_with_sensors_resumes_bit_for_bit(tmp_path: Path) -> None:
     train([stopped], resume=True)
     assert_same_run(whole, stopped)
     policy = read_policy(whole)
-    assert parameters_for("go1gate", policy) == {"senses": policy.needs.senses}
-    check_policy(policy, make("go1gate", impl="c", num_envs=1, **parameters_for("go1gate", policy)))
+    assert needed("go1gate", policy) == {"senses": policy.needs.senses}
+    check_policy(policy, make("go1gate", impl="c", num_envs=1, **needed("go1gate", policy)))

@@ -19,10 +19,10 @@ from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Observations, observations
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.wrestling import WrestlingRewards
-from mqe_jax.policies import load_policy
-from mqe_jax.runs import build as setup
+from mqe_jax.names import load_policy, versus
+from mqe_jax.runs import cast
 from mqe_jax.selfplay.league.sides import BothSides
-from mqe_jax.selfplay.opponents import Mirror, Versus, versus
+from mqe_jax.selfplay.opponents import Mirror, Versus
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.monitor import score
@@ -110,10 +110,9 @@ def test_teams_may_see_different_groups_of_observations() -> None:
     learner = make_learner(Versus(env, [seeing]), config)
     after, _ = jax.eval_shape(learner.update, jax.eval_shape(learner.init, KEY))
     assert after.obs_normalizer.obs.mean.shape == (27,)
-    cast = setup.environments(
-        "c", override(config, {"task": "go1gate", "evaluation.every": 1, "seed": 0}), 1
-    )
-    assert cast.env.groups == cast.eval_env.groups == ("policy", "proprioception")
+    config = override(config, {"task": "go1gate", "evaluation.every": 1, "seed": 0})
+    made = cast.environments(config, impl="c")
+    assert made.env.groups == made.eval_env.groups == ("policy", "proprioception")
 
 
 door = pytest.fixture(scope="module")(lambda: matches())

@@ -15,12 +15,12 @@ import pytest
 from mqe_jax.core.settings import build
 from mqe_jax.envs import Moment, make
 from mqe_jax.envs.sizes import ENTITIES
+from mqe_jax.names import load_policy
 from mqe_jax.npc import flock
-from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.scripted.cooperative import _sides
 from mqe_jax.presets import resolve
-from mqe_jax.runs.build import make_learner
+from mqe_jax.runs.cast import make_learner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import needs_of
 from mqe_jax.train.normalize import running_init

@@ -10,7 +10,8 @@ import pytest
 
 from mqe_jax.cli.arguments import parse
 from mqe_jax.envs import TASKS
-from mqe_jax.policies import load_policy, zoo
+from mqe_jax.names import load_policy
+from mqe_jax.policies import zoo
 from mqe_jax.presets import resolve
 from mqe_jax.train.policy import save_policy
 from tests.fake_env import SMALL

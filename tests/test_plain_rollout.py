@@ -14,7 +14,7 @@ import pytest
 from mqe_jax.acting.evaluate import Evaluator
 from mqe_jax.acting.seats import Seats
 from mqe_jax.core.types import RESULTS, NetworkMemory, Observations, Outcome
-from mqe_jax.policies import load_policy
+from mqe_jax.names import load_policy
 from mqe_jax.selfplay.league import league, pool
 from mqe_jax.selfplay.opponents import Mirror, OpponentState, exchange
 from mqe_jax.train.networks import Network

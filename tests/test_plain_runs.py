@@ -22,7 +22,7 @@ from mqe_jax.envs.reward import crowding
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.npc import defend, flock, slow_down
 from mqe_jax.physics.robots.go1 import GO1
-from mqe_jax.policies import SimplePolicy
+from mqe_jax.policies.simple import SimplePolicy
 from mqe_jax.selfplay.league import league, pool, tournament
 from mqe_jax.terrain import Gate, Track
 from mqe_jax.train import learner as learning

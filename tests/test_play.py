@@ -217,9 +217,7 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     shutil.copy(zoo.file_of("go1wrestling"), run)
     (entry,) = entries(["go1wrestling", str(run)])
     assert (entry.name, list(entry.policies)) == ("go1wrestling", ["shipped", "mine", "scripted"])
-    (entry,) = entries(
-        ["go1wrestling", str(population.resolve("population/1/late", "go1wrestling"))]
-    )
+    (entry,) = entries(["go1wrestling", str(population.FOLDER / "1-go1wrestling-late.safetensors")])
     # they meet, each with its own skill
     assert list(entry.policies) == ["shipped", "1-go1wrestling-late", "scripted"]
     policy = zoo.load("go1wrestling")

@@ -22,21 +22,22 @@ from mqe_jax.core.settings import override
 from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_SCRIPTED, register_scripted
 from mqe_jax.envs.state import ENDINGS
+from mqe_jax.names import load_policy, table, versus
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.policies import SimplePolicy, load_policy, parameters_for, zoo
+from mqe_jax.policies import zoo
 from mqe_jax.policies.scripted import find_scripted
 from mqe_jax.policies.scripted.cooperative import plan_seesaw
 from mqe_jax.policies.scripted.matches import plan_tug
+from mqe_jax.policies.simple import SimplePolicy
 from mqe_jax.presets import resolve
-from mqe_jax.runs.build import players
-from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import SKILLS, Command, Skill
-from mqe_jax.train.checkpoint import read_metadata, save_tree
+from mqe_jax.train.checkpoint import read_file, save_tree
 from mqe_jax.train.config import load_config
 from mqe_jax.train.policy import Actor, TrainedPolicy, save_policy
 from mqe_jax.walk_policy import COMMANDS, WalkPolicy
 from tests.inputs import refuses
+from tests.states import needed
 from tools import ship
 
 MATCHES = [
@@ -56,7 +57,7 @@ def test_every_task_but_the_plane_has_a_shipped_policy() -> None:
 
 @pytest.mark.parametrize("task", zoo.names())
 def test_a_shipped_policy_fits_its_task_and_its_card_is_complete(task: str) -> None:
-    env = make(task, impl="c", num_envs=1, **parameters_for(task, task))
+    env = make(task, impl="c", num_envs=1, **needed(task, task))
     policy = load_policy(task, env)
     card = zoo.card(task)
     assert isinstance(policy, TrainedPolicy) and policy.task == task
@@ -115,7 +116,7 @@ def test_a_shipped_policy_does_what_its_card_says() -> None:
 
 def acting(target: str, **options: Any) -> list[Any]:
     """Returns who acts, one for each team: an `Actor`, or a policy."""
-    seats = players(**override(Eval(target=target, impl="c"), options).playing).seats
+    seats = table(**override(Eval(target=target, impl="c"), options).playing).seats
     return [getattr(seat.policy, "policy", seat.policy) for seat in seats.seats]
 
 
@@ -135,8 +136,8 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
 
 @pytest.mark.parametrize("task", AGILE)
 def test_a_shipped_policy_brings_the_skill_that_it_needs(task: str) -> None:
-    assert parameters_for(task, task) == {"skill": "agile", "gait": None, "command_ranges": RANGES}
-    env: Any = players(task, impl="c").env
+    assert needed(task, task) == {"skill": "agile", "gait": None, "command_ranges": RANGES}
+    env: Any = table(task, impl="c").env
     assert env.params.skill == "agile" and dict(env.params.action_ranges()) == RANGES
 
 
@@ -158,7 +159,7 @@ def test_parameters_are_those_that_policies_need_beyond_the_defaults(
         dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **change))
         for change in changes
     ]
-    assert parameters_for(task, "forward", "nobody", *policies) == expected
+    assert needed(task, "forward", *policies) == expected
 
 
 def test_a_batch_evaluates_only_policies_that_fit() -> None:
@@ -171,9 +172,7 @@ def test_a_batch_evaluates_only_policies_that_fit() -> None:
 
 def test_commands_apply_what_a_shipped_policy_needs(capfd: Any) -> None:
     for chosen in ((), ("go1tug",), ("scripted", "go1tug")):
-        env = players(
-            "go1tug", *chosen, impl="c", env={"episode_length": 5.0} if chosen else {}
-        ).env
+        env = table("go1tug", *chosen, impl="c", env={"episode_length": 5.0} if chosen else {}).env
         assert (env.params.skill, env.params.action_ranges()["vx"]) == ("agile", (-1.5, 2.5))
     words = ["--impl", "c", "--set", "skill=walk"]
     for command in (["eval", "go1tug", "--policy", "go1tug"], ["tournament", "go1tug", "go1tug"]):
@@ -225,7 +224,7 @@ def test_a_float16_policy_acts_as_the_float32_one(tmp_path: Path) -> None:
 def test_files_of_version_0_3_load_or_are_refused_in_one_line(tmp_path: Path) -> None:
     policy = load_policy("go1gate")
     file = save_policy(tmp_path, policy)
-    metadata = read_metadata(file, kind="policy")
+    metadata = read_file(file, kind="policy").metadata
     arrays = {"params": policy.params, "normalizer": policy.normalizer}
 
     def stored(mates: list[str], **more: Any) -> None:
@@ -451,9 +450,9 @@ def test_a_name_comes_before_a_folder_of_that_name(
 ) -> None:
     (tmp_path / "go1gate").mkdir()
     monkeypatch.chdir(tmp_path)
-    env, _, seats, _ = players(**Eval(target="go1gate", impl="c").playing)
+    env, _, seats, _ = table(**Eval(target="go1gate", impl="c").playing)
     assert env.name == "go1gate" and isinstance(seats.seats[0].policy, Actor)
-    refuses("go1gate", players, **Eval(target="./go1gate", impl="c").playing)
+    refuses("go1gate", table, **Eval(target="./go1gate", impl="c").playing)
 
 
 def test_what_a_user_makes_says_what_it_is() -> None:
@@ -473,7 +472,7 @@ def test_what_a_user_makes_says_what_it_is() -> None:
 
 def test_who_acts_is_named() -> None:
     def about(**options: Any) -> dict[str, Any]:
-        return players(**Eval(impl="c", **options).playing).about
+        return table(**Eval(impl="c", **options).playing).about
 
     match = {"policy": "population/1/middle", "actions": "sampled", "opponent": "idle"}
     assert about(target="go1wrestling", policy="population/1/middle") == match

@@ -12,10 +12,11 @@ import mqe_jax
 from mqe_jax.acting.results import Rate, Result
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import make
-from mqe_jax.policies import load_policy, parameters_for
+from mqe_jax.names import load_policy, versus
 from mqe_jax.policies.zoo import population
 from mqe_jax.runs import playing
-from mqe_jax.selfplay.opponents import versus
+from tests.inputs import refuses
+from tests.states import needed
 from tests.test_opponents import MATCHES, matches, new_policy
 from tools import ship
 
@@ -39,11 +40,11 @@ def check(name: str, task: str, *others: str) -> None:
     """
     members = population.members(name, task)
     assert 1 <= len(members) <= population.MEMBERS
-    env = make(task, impl="c", num_envs=1, **parameters_for(task, *members, *others))
+    env = make(task, impl="c", num_envs=1, **needed(task, *members, *others))
     for member in (*members, *others):
         assert load_policy(member, env).task == task
-        file = Path(population.resolve(member, task))
-        assert not file.suffix or file.stat().st_size <= ship.BYTES
+    for file in population.FOLDER.glob("*.safetensors"):
+        assert file.stat().st_size <= ship.BYTES
 
 
 @pytest.mark.parametrize("task", MATCHES)
@@ -71,12 +72,12 @@ def test_every_file_belongs_to_a_shipped_population() -> None:
 
 def test_the_scripted_member_walks_against_every_policy(fake: Path) -> None:
     ship.add_member("1", "go1bridge", "scripted")
-    assert parameters_for("go1bridge", "go1bridge", "scripted")["skill"] == "agile"
-    assert parameters_for("go1bridge", "go1bridge", "population/1/scripted")["skill"] == (
+    assert needed("go1bridge", "go1bridge", "scripted")["skill"] == "agile"
+    assert needed("go1bridge", "go1bridge", "population/1/scripted")["skill"] == (
         "walk",
         "agile",
     )
-    assert parameters_for(TASK, "population/1/scripted") == {}
+    refuses("policy: .* one of population/1/idle", needed, TASK, "population/1/scripted")
 
 
 def test_a_population_has_named_and_trained_members(fake: Path) -> None:
@@ -88,7 +89,7 @@ def test_a_population_has_named_and_trained_members(fake: Path) -> None:
         "population/1/idle",
         "population/1/early",
     ]
-    assert parameters_for(TASK, "population/1/early") == {"control": "position"}
+    assert needed(TASK, "population/1/early") == {"control": "position"}
     for name in ("a", "population/1/early", "population"):
         assert not population.is_named(name)
 
@@ -108,7 +109,7 @@ def test_a_published_version_does_not_change(fake: Path) -> None:
     with pytest.raises(
         InputError, match=r"early\.safetensors: is missing, or not the file of population/1"
     ):
-        population.resolve("population/1/early", TASK)
+        population.find("population/1/early", TASK)
 
 
 def test_a_member_that_is_too_large_is_refused(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:

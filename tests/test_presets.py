@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 import mqe_jax
+from mqe_jax import names
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import differences, load_yaml, override, to_mapping
 from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.presets import CONFIG_FOLDER, resolve
-from mqe_jax.runs import build
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import ActorCritic, Mat
 from tests.inputs import refuses
@@ -29,7 +29,7 @@ SENSES = {"env": {"senses": "onboard"}}
 APPROACH = {"rewards": {"approach": 1.0}}
 
 
-def names() -> list[str | None]:
+def shipped() -> list[str | None]:
     """Returns the names of the shipped settings, with None for a task's default ones."""
     parts = [
         f"{file}/{part}"
@@ -45,7 +45,7 @@ def digests() -> dict[str, str]:
     parameters, differ from the defaults.
     """
     found = {}
-    for task, name in itertools.product(SHIPPED, names()):
+    for task, name in itertools.product(SHIPPED, shipped()):
         resolved = []
         for algorithm, env in itertools.product((None, *ALGORITHMS), ENVS):
             config = resolve(task, name, algorithm, {"": {"env": env}})
@@ -128,7 +128,7 @@ def test_one_layer_may_name_a_parameter_of_training_and_of_evaluation() -> None:
 
 def test_parameters_beside_settings_count_in_training_too() -> None:
     tuned = mqe_jax.TrainConfig(train_env={"rewards.approach": 10.0, "frozen_time": 0.0})
-    config = build.settings("go1gate", tuned, env={"rewards.approach": 1.0})
+    config = names.settings("go1gate", tuned, env={"rewards.approach": 1.0})
     assert config.training_env == {**APPROACH, "frozen_time": 0.0}
 
 
@@ -137,7 +137,7 @@ def test_sensors_of_any_layer_select_what_reads_them(layers: Any) -> None:
     expected = parse_train(["go1gate", "--senses", "onboard"]).settings
     assert (expected.group, expected.network.name) == ("onboard", "blocks")
     assert resolve("go1gate", layers=layers) == expected
-    assert override(build.settings("go1gate", SENSES), {"task": expected.task}) == expected
+    assert override(names.settings("go1gate", SENSES), {"task": expected.task}) == expected
     blind = resolve("go1gate", layers={**layers, "": {"env.senses": "full"}})
     assert blind.group == "policy"
     assert blind.network == resolve("go1gate").network
@@ -161,12 +161,12 @@ def test_a_group_that_is_named_stays() -> None:
 
 def test_sensors_beside_settings_that_do_not_read_them_are_refused() -> None:
     message = r"^group: 'policy' is not allowed; it must be onboard"
-    refuses(message, build.settings, "go1gate", TrainConfig(), env={"senses": "onboard"})
+    refuses(message, names.settings, "go1gate", TrainConfig(), env={"senses": "onboard"})
     refuses(message, resolve, "go1gate", TrainConfig(), layers={"variants.a": SENSES})
-    reading = build.settings("go1gate", TrainConfig(group="onboard"), env={"senses": "onboard"})
+    reading = names.settings("go1gate", TrainConfig(group="onboard"), env={"senses": "onboard"})
     assert reading.group == "onboard"
     own = TrainConfig(env={"senses": "onboard"})
-    assert build.settings("go1gate", own, env={"senses": ["lidar"]}).group == "policy"
+    assert names.settings("go1gate", own, env={"senses": ["lidar"]}).group == "policy"
 
 
 def test_what_policies_need_lies_below_all_other_parameters() -> None:
@@ -176,9 +176,9 @@ def test_what_policies_need_lies_below_all_other_parameters() -> None:
 
     layers = {"": {"start": "other", "env": {"robot": "go1"}}}
     assert resolve("go1tug", layers=layers, needs=needs).env == {"skill": "agile", "robot": "go1"}
-    settings = build.settings("go1tug", {"start": "go1tug"})
+    settings = names.settings("go1tug", {"start": "go1tug"})
     assert settings.env["skill"] == "agile"
-    settings = build.settings("go1tug", {"start": "go1tug"}, env={"skill": "walk"})
+    settings = names.settings("go1tug", {"start": "go1tug"}, env={"skill": "walk"})
     assert settings.env["skill"] == "walk"
 
 
@@ -188,19 +188,19 @@ def test_a_parameter_that_is_given_counts_in_training_too() -> None:
     assert tuned.training_env["rewards"]["crossing"] == 10.0
     given = {"rewards.failure": 0.0, "frozen_time": 1.0}
     flags = [word for name, x in given.items() for word in ("--set", f"{name}={x}")]
-    parsed = build.settings("go1sheep-easy", parse_train(["go1sheep-easy", *flags]).settings)
-    for settings in (parsed, build.settings("go1sheep-easy", env=given)):
+    parsed = names.settings("go1sheep-easy", parse_train(["go1sheep-easy", *flags]).settings)
+    for settings in (parsed, names.settings("go1sheep-easy", env=given)):
         trained = settings.training_env
         assert trained["rewards"] == {**tuned.training_env["rewards"], "failure": 0.0}
         assert trained["frozen_time"] == 1.0
     changes = {"train_env": {"rewards.failure": -5.0}}
-    both = build.settings("go1sheep-easy", changes, env=given)
+    both = names.settings("go1sheep-easy", changes, env=given)
     assert both.training_env["rewards"]["failure"] == -5.0
 
 
 def test_settings_of_a_mapping_are_checked() -> None:
     with pytest.raises(InputError, match=r"config: .* is not allowed; it must be a shipped name"):
-        build.settings("go1gate", {"config": 3})  # pyright: ignore[reportArgumentType]
+        names.settings("go1gate", {"config": 3})  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

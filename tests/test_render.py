@@ -13,8 +13,8 @@ from viewer import Driven, session
 
 from mqe_jax import cli
 from mqe_jax.envs import TASKS
+from mqe_jax.names import load_policy
 from mqe_jax.physics.robots.index import trunk_bodies
-from mqe_jax.policies import load_policy
 from mqe_jax.sensors import marks as sensed
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.view.menu import Entry, Menu, find_runs

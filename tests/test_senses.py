@@ -11,7 +11,7 @@ import pytest
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import State, VectorEnv, make
-from mqe_jax.policies import load_policy
+from mqe_jax.names import load_policy
 from mqe_jax.sensors.depth import Depth
 from mqe_jax.sensors.detections import Detections
 from mqe_jax.sensors.lidar import Lidar

@@ -13,10 +13,10 @@ import pytest
 
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.envs import Moment, VectorEnv, make
+from mqe_jax.names import load_policy
 from mqe_jax.physics.appearance import ROBOT_COLORS, UNNUMBERED
 from mqe_jax.physics.collision import MAX_ROBOTS, robot_bits
 from mqe_jax.physics.robots.index import trunk_bodies
-from mqe_jax.policies import load_policy
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.scripted.cooperative import plan_sheep_hard
 from mqe_jax.viz.geometry import robot_color

@@ -9,19 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import VectorEnv, cli, evaluate, learn, make
+from mqe_jax import VectorEnv, cli, evaluate, learn, make, names
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import observations
 from mqe_jax.export.task import TaskFunctions, readings_function
+from mqe_jax.names import load_policy, table, versus
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.policies import load_as, load_policy
 from mqe_jax.policies.translated import Translated
 from mqe_jax.policies.zoo import population
-from mqe_jax.runs.build import players
 from mqe_jax.selfplay.league.sides import BothSides
-from mqe_jax.selfplay.opponents import versus
 from mqe_jax.skills import agile
 from mqe_jax.skills import make as make_skill
 from mqe_jax.skills.choice import HOLD
@@ -226,7 +224,7 @@ def test_policies_of_other_needs_are_refused(
     policy = load_policy(WALKING)
     policy = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **own))
     for source in (policy, *([] if own else ["population/1/late", str(WALKING)])):
-        refuses(rf"{field}: .* needs {said}", load_as, field, source, env)
+        refuses(rf"{field}: .* needs {said}", names.seat, source, env, field)
 
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
@@ -241,11 +239,11 @@ def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
     }
     policy = learn(batch, small).policy
     assert policy.config.env == {"control": "position", "position_scale": 2.0}
-    load_as("policy", policy, batch.env)
+    names.seat(policy, batch.env)
     with pytest.raises(
         InputError, match=r"policy: .* needs position_scale 2.0; the environment has 1.0"
     ):
-        load_as("policy", policy, make("go1plane", impl="c", num_envs=1, control="position"))
+        names.seat(policy, make("go1plane", impl="c", num_envs=1, control="position"))
 
 
 BOTH = ("walk", "agile")
@@ -362,8 +360,8 @@ def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(
     )
     obs = jax.random.normal(jax.random.PRNGKey(1), (64, 1, match.observation_size))
     key = jax.random.PRNGKey(2)
-    own = load_as("policy", policies[name], alone)
-    translated = load_as("policy", policies[name], match)
+    own = names.seat(policies[name], alone)
+    translated = names.seat(policies[name], match)
     assert isinstance(own, TrainedPolicy) and isinstance(translated, Translated)
     actions = [x.act(obs, x.initial_memory(64), key)[0][:, 0] for x in (own, translated)]
     commands = [
@@ -377,11 +375,10 @@ def test_a_policy_commands_by_its_own_skill_what_it_was_trained_with(
 
 def test_a_gait_is_of_the_skill_that_has_it(policies: Any) -> None:
     env = make(TASK, impl="c", num_envs=1, skill=BOTH, command_ranges=WIDE, gait="pace")
-    assert isinstance(load_as("policy", policies["agile"], env), Translated)
+    assert isinstance(names.seat(policies["agile"], env), Translated)
     refuses(
         r"policy: .* needs gait 'trot'; the environment has 'pace'",
-        load_as,
-        "policy",
+        names.seat,
         policies["walk"],
         env,
     )
@@ -399,7 +396,7 @@ def test_scripted_and_idle_policies_use_the_first_skill(skill: Any) -> None:
 def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     batch = VectorEnv(match, 4)
     env = versus(BothSides(batch), [policies["walk"], policies["agile"]])
-    own = load_as("policy", policies["agile"], match)
+    own = names.seat(policies["agile"], match)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     action = jax.jit(own.act)(
         observations(state).to(own), own.initial_memory(4), jax.random.PRNGKey(1)
@@ -414,7 +411,7 @@ def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
 
 
 def test_policies_of_two_skills_meet_in_the_viewer(policies: Any, match: Any) -> None:
-    playing = players(match, policies["agile"], policies["walk"], num_envs=4)
+    playing = table(match, policies["agile"], policies["walk"], num_envs=4)
     session = Session(match, playing.batch, playing.seats)
     session.advance()
     np.testing.assert_array_equal(session.state.control.skill["acting"], [[1, 0]] * 4)
@@ -423,9 +420,7 @@ def test_policies_of_two_skills_meet_in_the_viewer(policies: Any, match: Any) ->
 def test_policies_of_two_skills_meet_on_the_page(policies: Any, match: Any) -> None:
     chosen = []
     for name in BOTH:
-        act, shapes = readings_function(
-            load_as("policy", policies[name], match), match.observation_size
-        )
+        act, shapes = readings_function(names.seat(policies[name], match), match.observation_size)
         (action,) = jax.jit(act)({each: jnp.zeros(shape) for each, shape in shapes.items()})[
             "action"
         ]
@@ -486,4 +481,4 @@ def test_policies_that_the_actions_do_not_admit_are_refused(
     policies: Any, parameters: Any, said: str
 ) -> None:
     with pytest.raises(InputError, match=f"opponent: .* {said}"):
-        load_as("opponent", policies["walk"], make(TASK, impl="c", num_envs=1, **parameters))
+        names.seat(policies["walk"], make(TASK, impl="c", num_envs=1, **parameters), "opponent")

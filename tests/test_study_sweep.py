@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from mqe_jax import cli
+from mqe_jax import cli, names
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import lock
 from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast
 from mqe_jax.policies import zoo
 from mqe_jax.presets import Layers, resolve
-from mqe_jax.runs import build as setup
+from mqe_jax.runs import cast
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import Cell, read_runs
 from mqe_jax.study.sweep import Sweep
@@ -50,7 +50,7 @@ def config_of(cell: Cell, layers: Layers) -> TrainConfig:
 
 
 def of_train(cell: Cell, layers: Layers) -> TrainConfig:
-    return setup.settings(cell.task, layers=layers)
+    return names.settings(cell.task, layers=layers)
 
 
 def load(tmp_path: Path, text: str = FILE) -> Sweep:
@@ -204,7 +204,7 @@ def test_every_cell_is_checked_before_the_first_trains(
     text: str, message: str, tmp_path: Path
 ) -> None:
     sweep = load(tmp_path, text if text.startswith("tasks") else "tasks: [go1gate]\n" + text)
-    refuses(message, sweeps.plan, sweep, tmp_path, config_of, check=setup.check_start)
+    refuses(message, sweeps.plan, sweep, tmp_path, config_of, check=cast.check_start)
 
 
 @pytest.mark.parametrize(
@@ -264,7 +264,7 @@ def test_published_sweeps_can_be_planned_on_a_gpu(
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
     folder = CONFIGS if file == "zoo" else CONFIGS.parent / "lab"
     sweep = sweeps.load_sweep(folder / f"{file}.yaml", part)
-    assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=setup.check_start)
+    assert sweeps.plan(sweep, CONFIGS, of_train, [cell], [seed], check=cast.check_start)
 
 
 def test_a_cell_that_fails_is_named_and_the_others_are_trained(
@@ -278,7 +278,7 @@ def test_a_cell_that_fails_is_named_and_the_others_are_trained(
             raise InputError("opponents: this one cannot be read")
         trained.append(configs[0].ppo.ratio)
 
-    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: Cast(PROBE, PROBE))
+    monkeypatch.setattr(cast, "environments", lambda config, seeds, impl: Cast(PROBE, PROBE))
     monkeypatch.setattr(sweeps, "train_seeds", train)
     monkeypatch.setattr("mqe_jax.study.report.report", lambda folder: [])
     assert (
@@ -326,7 +326,7 @@ def test_the_commands_say_what_is_left_and_report(
     tmp_path: Path, monkeypatch: Any, capfd: Any
 ) -> None:
     load(tmp_path)
-    monkeypatch.setattr(setup, "environments", lambda impl, config, seeds: Cast(PROBE, PROBE))
+    monkeypatch.setattr(cast, "environments", lambda config, seeds, impl: Cast(PROBE, PROBE))
     arguments = ["sweep", str(tmp_path / "small.yaml"), "--folder", str(tmp_path / "study")]
     assert cli.main([*arguments, "--dry-run"]) == 0
     out = capfd.readouterr().out

@@ -23,8 +23,8 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.core.types import Observations
 from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
-from mqe_jax.policies import load_policy, parameters_for
-from mqe_jax.selfplay.league.league import League
+from mqe_jax.names import load_policy
+from mqe_jax.selfplay.league.league import League, Roster
 from mqe_jax.train.checkpoint import load_tree, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
@@ -32,6 +32,7 @@ from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
 from tests import training as probes
 from tests.inputs import refuses
+from tests.states import needed
 from tests.test_opponents import matches
 from tests.training import Probe, content, differences, settings
 
@@ -92,7 +93,7 @@ def test_the_loops_of_jax_step_every_task(task: str) -> None:
 )
 def test_policies_act_in_single_precision(task: str, name: str) -> None:
     with strict_x64():
-        env = make(task, impl="c", num_envs=2, **parameters_for(task, name))
+        env = make(task, impl="c", num_envs=2, **needed(task, name))
         policy = load_policy(name, env)
         seats = Seats.of_teams(env, *[policy] * len(env.teams))
         obs = jax.ShapeDtypeStruct((2, env.num_agents, env.observation_size), jnp.float32)
@@ -118,7 +119,10 @@ def test_networks_and_leagues_train_in_single_precision(learns: str) -> None:
     }[learns]
     with strict_x64():
         config = build(TrainConfig, values)
-        league = League(matches(), sources, config) if learns == "league" else None
+        league = None
+        if learns == "league":
+            idle = load_policy("idle", matches().env)
+            league = League(matches(), Roster(sources), config, {"idle": idle})
         learner = make_learner(PROBE if league is None else league.env, config, league=league)
         state = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
         assert kinds(jax.eval_shape(learner.update, state)[0]) == kinds(state)

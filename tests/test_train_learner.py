@@ -19,7 +19,7 @@ from mqe_jax.acting.evaluate import Evaluator, evaluate_batch
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import Batch
-from mqe_jax.policies import SimplePolicy
+from mqe_jax.policies.simple import SimplePolicy
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
 from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree

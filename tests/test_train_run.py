@@ -240,7 +240,7 @@ def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path)
 
 
 def spoil(path: Path, kind: str) -> None:
-    arrays, metadata = checkpoints._read(path, kind)
+    _, arrays, metadata = checkpoints.read_file(path, kind=kind)
     arrays[next(name for name in arrays if name.endswith("weight"))][0] = np.nan
     save_tree(path, arrays, metadata, kind=kind)
 
@@ -287,13 +287,14 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
 
 def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     run_dir, trained = straight
+    policy = read_policy(run_dir)
 
     def kill(state: TrainState, row: dict[str, float]) -> None:
         assert float(state.obs_normalizer.obs.samples) > float(trained.obs_normalizer.obs.samples)
         raise Stop
 
     with pytest.raises(Stop):
-        train(PROBE, settings(start=str(run_dir)), tmp_path / "a", on_update=kill)
+        train(PROBE, settings(start=str(run_dir)), tmp_path / "a", on_update=kill, start=policy)
     first = load_file(list_checkpoints(tmp_path / "a")[0])
     last = load_file(list_checkpoints(run_dir)[-1])
     same = [name for name in first if name.startswith(("params/actor/", "params/log_std"))]
@@ -303,10 +304,11 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
     with pytest.raises(
         InputError, match=r"action_scale: 0\.25 differs from that of the policy in .*straight, "
     ):
-        train(PROBE, settings(start=str(run_dir), action_scale=0.25), tmp_path / "b")
+        train(PROBE, settings(start=str(run_dir), action_scale=0.25), tmp_path / "b", start=policy)
     other = settings(start=str(run_dir), network__hidden_sizes=(8,))
     said = r"start: .*straight.* is not allowed; it must be a policy with this run's network"
-    refuses(said, train, PROBE, other, tmp_path / "b")
+    refuses(said, train, PROBE, other, tmp_path / "b", start=policy)
+    refuses("start: .* argument `start`", train, PROBE, other, tmp_path / "b")
 
 
 def test_a_policy_that_is_missing_or_of_another_kind(

@@ -17,8 +17,8 @@ from fake_env import FakeEnv, FakeVectorEnv
 
 from mqe_jax import skills
 from mqe_jax.acting.seats import Seats
+from mqe_jax.names import load_policy
 from mqe_jax.physics.robots.go1 import GO1
-from mqe_jax.policies import load_policy
 from mqe_jax.skills.control import Controller
 from mqe_jax.view.session import Session
 

@@ -13,10 +13,9 @@ import jax
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
-from mqe_jax import make
+from mqe_jax import make, names
 from mqe_jax.acting.seats import Seats
 from mqe_jax.envs import TASKS
-from mqe_jax.policies import load_policy, parameters_for
 from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import write_clip
 from mqe_jax.viz.framing import legend
@@ -44,10 +43,10 @@ SIZES: dict[str, tuple[str, dict[str, Any]]] = {
 
 def write(name: str) -> None:
     """Writes the clip of a task or an entry of `SIZES`, from a fixed camera."""
-    task, settings = SIZES.get(name) or (name, parameters_for(name, name))
+    task, settings = SIZES.get(name) or (name, names.parameters_of(name, [names.find(name, name)]))
     env = make(task, impl="c", num_envs=EPISODES, **settings)
-    scripted = load_policy("scripted", env)
-    policy = scripted if name in SIZES else load_policy(task, env)
+    scripted = names.seat("scripted", env)
+    policy = scripted if name in SIZES else names.seat(task, env)
     seats = Seats.of_teams(env, *[policy, scripted][: len(env.teams)])
     limit = env.params.episode_length
     key = jax.random.PRNGKey(0)

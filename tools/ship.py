@@ -25,7 +25,8 @@ from mqe_jax.core.files import write_atomically
 from mqe_jax.core.settings import build, fail, to_mapping
 from mqe_jax.envs import TASKS
 from mqe_jax.envs.match import Match
-from mqe_jax.policies import load_policy, zoo
+from mqe_jax.names import load_policy
+from mqe_jax.policies import zoo
 from mqe_jax.policies.zoo import population
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, fail
+from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.core.types import (
     AnyPolicy,
     Memory,
@@ -316,6 +316,7 @@ class _Function:
         return self.memory
 
 
+@check_arguments(policy=AnyPolicy)
 def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "policy") -> None:
     """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, and
     what it finds `unmet`, as a trained policy does.
@@ -323,7 +324,6 @@ def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "p
     Raises:
         InputError: naming `field`, the policy and what differs, with the values of both.
     """
-    check("policy", policy, AnyPolicy)
     pairs: dict[str, tuple[Any, Any]] = {
         "task": (policy.task, env.name),
         "agents": (policy.agents, len(teams_of(env)[0])),

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax import envs
+from mqe_jax import envs, names
 from mqe_jax.acting.seats import Policy
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.settings import check
-from mqe_jax.envs import ALIASES, QuadrupedEnv, State
-from mqe_jax.policies import parameters_for
+from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.envs.registry import task_id
 
 
 def missing(library: str, error: ImportError) -> InputError:
@@ -50,23 +50,26 @@ def task_env(
     Raises:
         InputError: for an argument that is not allowed.
     """
+    name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
+    rival = None if opponent is None else names.find(opponent, name, field="opponent")
     if isinstance(task, QuadrupedEnv):
         passed = [*overrides]
         if max_steps is not None:
             passed.append(limit)
         if passed:
-            names = ", ".join(passed)
-            raise InputError(f"task: overrides ({names}) need the id of a task, not an environment")
+            given = ", ".join(passed)
+            raise InputError(f"task: overrides ({given}) need the id of a task, not an environment")
         env = task
     else:
-        overrides = parameters_for(ALIASES.get(task, task), opponent) | overrides
-        if max_steps is not None:
-            steps: int = check(limit, max_steps, PositiveInt)
-            if "episode_length" in overrides:
-                raise InputError(f"episode_length: give either this or {limit}, not both")
-            overrides["episode_length"] = steps * envs.make(task, **overrides).dt
-        env = envs.make(task, **overrides)
-    return env if opponent is None else TeamEnv(env, opponent)
+        steps = check(limit, max_steps, PositiveInt | None)
+        if steps is not None and "episode_length" in overrides:
+            raise InputError(f"episode_length: give either this or {limit}, not both")
+        env = envs.make(name, **names.parameters_of(name, [rival]) | overrides)
+        if steps is not None:
+            env = env.changed({"episode_length": steps * env.dt})
+    if opponent is None:
+        return env
+    return TeamEnv(env, names.fit(rival, env, field="opponent", name=str(opponent)))
 
 
 def agent_names(env: TaskEnv) -> list[str]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.spaces import Box
 
+from mqe_jax import names
 from mqe_jax.acting.seats import Policy, Seat, Seats, actor_of
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
@@ -23,7 +24,6 @@ from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.match import team_view
 from mqe_jax.envs.observation import box
 from mqe_jax.envs.state import with_final
-from mqe_jax.policies import load_as
 
 
 @jax.tree_util.register_dataclass
@@ -56,7 +56,8 @@ class TeamEnv:
         self.match = match
         self.num_agents = len(match.teams[0])
         rivals = match.teams[1]
-        self.seats = Seats((Seat(actor_of(load_as("opponent", opponent, match)), rivals, rivals),))
+        rival = actor_of(names.seat(opponent, match, "opponent"))
+        self.seats = Seats((Seat(rival, rivals, rivals),))
         """The opponent."""
         if further := self.seats.groups - {"policy"}:
             raise InputError(

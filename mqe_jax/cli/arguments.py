@@ -2,9 +2,7 @@
 
 import dataclasses
 import itertools
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -13,7 +11,7 @@ from mqe_jax.cli import commands, exploit, export, programs, render, skill, stud
 from mqe_jax.core import limits
 from mqe_jax.core.errors import known_name
 from mqe_jax.core.settings import TEXT, fail, is_text
-from mqe_jax.envs.registry import task_id
+from mqe_jax.envs.registry import find_task, task_id
 
 FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 
@@ -106,8 +104,8 @@ def parse(arguments: Sequence[str]) -> Any:
     options = (tyro.conf.FlagCreatePairsOff,)
     command = tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=options)
     target = getattr(command, "target", None) or getattr(command, "task", None)
-    if isinstance(target, str) and os.sep not in target and not Path(target).exists():
-        task_id(target)  # before JAX and MuJoCo are imported, which take seconds
+    if isinstance(target, str):
+        find_task(target)  # before JAX and MuJoCo are imported, which take seconds
     return command
 
 

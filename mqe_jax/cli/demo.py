@@ -8,12 +8,13 @@ from typing import Any
 
 import jax
 
+from mqe_jax import names
 from mqe_jax.acting.results import Rate
 from mqe_jax.core import interrupts
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_folder, write_atomically
 from mqe_jax.core.literal import echo
-from mqe_jax.runs import build
+from mqe_jax.envs import VectorEnv
 from mqe_jax.runs.learning import learn
 from mqe_jax.runs.playing import evaluate, render
 from mqe_jax.train.folder import CONFIG_FILE
@@ -32,12 +33,11 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     Resumes an interrupted run.
     """
     began = time.perf_counter()
-    config = build.settings(DEMO_TASK, settings)
+    config = names.settings(DEMO_TASK, settings)
     check_folder(run_dir)
     resume = (run_dir / CONFIG_FILE).exists()
-    _, batch = build.make_env(
-        DEMO_TASK, impl, config.env, config.num_envs, final=config.network.critic_reads
-    )
+    env = names.environment(DEMO_TASK, config.env, impl=impl, num_envs=config.num_envs)
+    batch = VectorEnv(env, config.num_envs, final=config.network.critic_reads)
     size = f"{config.num_envs} environments, {config.total_steps / 1e6:g} M steps"
     echo(f"mqe demo: {DEMO_TASK}, {size}, into {run_dir}")
     playing: dict[str, Any] = {"env": config.env, "impl": impl, "deterministic": True}

@@ -32,8 +32,7 @@ class Export:
 
     def run(self) -> dict[str, Any]:
         """Writes the graph if it agrees with JAX; prints a table, or returns the JSON object."""
-        from mqe_jax.policies import load_policy
-        from mqe_jax.runs.build import make_env
+        from mqe_jax import names
 
         _check_installed()
         if self.sampled and not self.per_robot:
@@ -45,7 +44,7 @@ class Export:
                 f"onnx: {str(self.onnx)!r} is not allowed; it must be a file that ends in .onnx"
             )
         check_output(self.onnx, "onnx")
-        policy = load_policy(self.run_dir)
+        policy = names.load_policy(self.run_dir)
         task = policy.config.task
         if task is None:
             raise InputError(f"{self.run_dir}: its settings have no 'task' entry")
@@ -54,7 +53,7 @@ class Export:
         from mqe_jax.export.policy import shapes
         from mqe_jax.export.robot_graph import verify_robot
 
-        env, _ = make_env(task, "auto", policy.config.env, 1)
+        env = names.environment(task, policy.config.env)
         if self.per_robot:
             model, error = verify_robot(policy if self.sampled else policy.acting(True), env)
         else:

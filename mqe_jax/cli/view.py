@@ -42,8 +42,8 @@ class View(PolicyOptions):
                 "view: the viewer needs viser and mjviser (pip install 'mqe-jax[view]')"
             )
         _check_host(self.host)
-        from mqe_jax.envs import ALIASES
-        from mqe_jax.runs.build import players
+        from mqe_jax.envs.registry import find_task
+        from mqe_jax.names import table
         from mqe_jax.view.menu import DEFAULT, Entry, Menu, find_runs
         from mqe_jax.view.session import Session
         from mqe_jax.view.viewer import Viewer
@@ -57,11 +57,11 @@ class View(PolicyOptions):
             options = dataclasses.replace(
                 self, target=target, policy=names[0], opponent=names[1], set=[]
             )
-            return Session(*players(**options.playing, **shown)[:3], self.seed)
+            return Session(*table(**options.playing, **shown)[:3], self.seed)
 
-        env, vector_env, seats, _ = players(**self.playing, **shown)
+        env, vector_env, seats, _ = table(**self.playing, **shown)
         runs = find_runs([Path("runs"), Path(self.target).parent])
-        own = self.policy or (DEFAULT if self.target in (env.name, *ALIASES) else self.target)
+        own = self.policy or (DEFAULT if find_task(self.target) else self.target)
         menu = Menu(open_choice, Entry(env.name, own, self.opponent or DEFAULT), runs)
         viewer = Viewer(self.host, self.port, menu)
         viewer.announce(env, self.num_envs)

@@ -8,6 +8,7 @@ identity, and rows are all rows.
 """
 
 import contextlib
+import os
 import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -39,6 +40,20 @@ PEER_ENDED = "another process of the training, or its host, has ended"
 
 _WHOLE = PartitionSpec()
 _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
+
+
+def platform() -> str:
+    """Returns the platform of JAX; raises an InputError if JAX_PLATFORMS selects an unavailable
+    one.
+    """
+    try:
+        return jax.default_backend()
+    except (RuntimeError, AssertionError) as error:
+        requested = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error) or "no such device"
+        raise InputError(
+            f"JAX_PLATFORMS: {requested!r} cannot be used here ({reason}); try cpu"
+        ) from None
 
 
 def size() -> int:

@@ -134,6 +134,13 @@ def parsing(path: Path | str, what: str) -> Iterator[None]:
         raise InputError(f"{path}: damaged, or not {what} ({reason})") from None
 
 
+def read_bytes(path: Path, limit: int) -> bytes:
+    """Reads a file of at most `limit` bytes."""
+    check_file(path, limit)
+    with parsing(path, "a file that can be read"):
+        return path.read_bytes()
+
+
 def read_text(path: Path, limit: int, what: str) -> str:
     """Reads a UTF-8 file of at most `limit` bytes."""
     check_file(path, limit)

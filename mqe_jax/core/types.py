@@ -375,6 +375,8 @@ class Cast(NamedTuple):
     """Gives the environments their opponents between updates."""
     teacher: Any = None
     """The policy that imitation imitates."""
+    start: Any = None
+    """The trained policy from which the training starts."""
 
 
 class NetworkMemory(NamedTuple):

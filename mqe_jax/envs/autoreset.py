@@ -14,7 +14,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, PositiveInt
 from mqe_jax.core.memory import bytes_of, check_memory
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments, fail
+from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import FINAL, State, with_final
@@ -117,6 +117,7 @@ class VectorEnv(EnvBatch):
     groups: tuple[str, ...] = ("policy",)
     """Groups that are observed, `policy` among them."""
 
+    @check_arguments(num_envs=Environments, copies=PositiveInt)
     def __init__(
         self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = FINAL
     ) -> None:
@@ -129,9 +130,7 @@ class VectorEnv(EnvBatch):
         """
         if not isinstance(env, QuadrupedEnv):
             fail("env", env, "the environment of a task, such as mqe_jax.make('go1gate')")
-        num_envs = check("num_envs", num_envs, Environments)
-        copies = check("copies", copies, PositiveInt)
-        self.env = env.with_num_envs(check("num_envs", num_envs * copies, Environments))
+        self.env = env.with_num_envs(num_envs * copies)
         self.num_envs = num_envs
         self.copies = copies
         self.final = tuple(final)

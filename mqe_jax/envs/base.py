@@ -195,7 +195,6 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         """Environment steps until the time limit."""
         return round(self.params.episode_length / self.dt)
 
-    @check_arguments(num_envs=Environments)
     def with_num_envs(self, num_envs: int) -> QuadrupedEnv[S, P]:
         """Returns an environment whose engine holds `num_envs` environments: itself, or one with
         larger buffers; errors as of `changed`.
@@ -231,17 +230,18 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             arguments["num_envs"] = num_envs
         if not arguments:
             return self
-        made = self._repeat(arguments)
+        differing = [*differences(wanted, self.params)]
+        made = self._repeat(arguments, differing + [x for x in arguments if x != "params"])
         for name, value in differences(made.params, wanted).items():
             raise InputError(f"{name}: the constructor of {type(self).__name__} makes it {value!r}")
         return made
 
-    def _repeat(self, changes: Mapping[str, Any]) -> QuadrupedEnv[S, P]:
+    def _repeat(self, changes: Mapping[str, Any], needed: Sequence[str]) -> QuadrupedEnv[S, P]:
         """Returns an environment made with the arguments of this one's constructor, of which some
-        are changed.
+        are changed; errors name what `needed` it.
         """
         kind = type(self).__name__
-        names = ", ".join(changes)
+        names = ", ".join(needed)
         if self._later:
             raise InputError(
                 f"{names}: another {kind} is needed, and it would lose the attribute "

@@ -7,8 +7,10 @@ nor MuJoCo.
 from __future__ import annotations
 
 import importlib
+import os
 from collections import UserDict
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from mqe_jax.core.errors import InputError, known_name
@@ -222,6 +224,16 @@ def task_id(name: str) -> str:
         ```
     """
     return known_name("task: unknown id", ALIASES.get(name, name), TASKS)
+
+
+def find_task(target: str) -> str | None:
+    """Returns the id of a task that is named by id or alias; None for the path of a run or a file.
+
+    InputError for an unknown id.
+    """
+    if ALIASES.get(target, target) not in TASKS and (os.sep in target or Path(target).exists()):
+        return None
+    return task_id(target)
 
 
 def load(package: str, path: str) -> Any:

@@ -9,7 +9,6 @@ sampled by the task's own `reset`. Skills are shared by all tasks, as files name
 import dataclasses
 import hashlib
 import json
-import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -19,11 +18,12 @@ import jax
 import numpy as np
 import onnx
 
+from mqe_jax import names
 from mqe_jax.acting.seats import Policy
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
 from mqe_jax.core.settings import fail, override
-from mqe_jax.envs import ALIASES, SCRIPTED, TASKS, QuadrupedEnv, make
+from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.export.check import verify
 from mqe_jax.export.libraries import add_libraries
@@ -32,8 +32,8 @@ from mqe_jax.export.scene import scene_settings, scene_xml
 from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, state_arrays
 from mqe_jax.export.translate import Function
 from mqe_jax.physics import robots
-from mqe_jax.policies import load_policy, parameters_for, zoo
-from mqe_jax.policies.translated import together, translate
+from mqe_jax.policies import zoo
+from mqe_jax.policies.translated import together
 from mqe_jax.sensors.suite import ONBOARD
 from mqe_jax.skills.agile import AgileSkill
 from mqe_jax.train.policy import TrainedPolicy
@@ -139,7 +139,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
     playable = [task for task in TASKS if task in SCRIPTED or task in zoo.names()]
     found: list[tuple[str, dict[str, Any], Entry]] = []
     for source in dict.fromkeys(sources or [*playable, *LARGER]):
-        task, params, policies = _source(source, playable)
+        task, params, policies = _named(source)
         params = _with_both_skills(task, params)
         entry = next((entry for *key, entry in found if key == [task, params]), None)
         if entry is None:
@@ -149,7 +149,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
                 for name, value in params.items()
                 if not name.startswith("randomization")
             }
-            env = make(task, num_envs=1, randomization=Randomization(), **own)
+            env = names.environment(task, {**own, "randomization": Randomization()})
             entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
@@ -161,42 +161,29 @@ def entries(sources: Sequence[str]) -> list[Entry]:
             if images := [block.name for block in policy.needs.dims.blocks if block.image]:
                 raise InputError(f"{source}: sees {images[0]}; the page has no images")
             short = name if name == "shipped" else _short(Path(name), entry.policies)
-            entry.policies[short] = translate(policy, entry.env, source)
+            entry.policies[short] = names.fit(policy, entry.env, name=source)
     for task, _, entry in found:
         if task in SCRIPTED and entry.env.params.commands == type(entry.env.params).commands:
-            entry.policies.setdefault("scripted", load_policy("scripted", entry.env))
+            entry.policies.setdefault("scripted", names.seat("scripted", entry.env))
     return [entry for *_, entry in found]
 
 
-def _source(
-    source: str, playable: Sequence[str]
-) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
+def _named(source: str) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
     """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a
     source stands for.
     """
-    if sized := _SIZED.fullmatch(source):
+    read: names.Read = {}
+    sized = _SIZED.fullmatch(source)
+    task, params, run = names.target(sized[1] if sized else source, read)
+    if run is not None:
+        return task, dict(params), {str(Path(source).resolve()): names.find(run, read=read)}
+    if task not in SCRIPTED and task not in zoo.names():
+        fail("run", source, "a run folder, a policy file, or a task with a policy")
+    if sized:
         pairs = (pair.split("=") for pair in sized[2].split(","))
-        return _source(sized[1], playable)[0], {name: int(value) for name, value in pairs}, {}
-    task = ALIASES.get(source, source)
-    if os.sep not in source and (task in playable or not Path(source).exists()):
-        if task not in playable:
-            hint = nearest(task, playable)
-            kinds = (
-                "a run folder, a policy file, a task's id, one with sizes such as "
-                "go1gate:num_agents=4"
-            )
-            raise InputError(f"run: {source!r} is not allowed{hint}; allowed: {kinds}")
-        return (
-            task,
-            parameters_for(task, task),
-            {"shipped": zoo.load(task)} if task in zoo.names() else {},
-        )
-    policy = load_policy(source)
-    if policy.task not in TASKS:
-        raise InputError(
-            f"{source}: its task {policy.task!r} is unknown; allowed: {', '.join(TASKS)}"
-        )
-    return policy.task, dict(policy.config.env), {str(Path(source).resolve()): policy}
+        return task, {name: int(value) for name, value in pairs}, {}
+    shipped = {"shipped": zoo.load(task)} if task in zoo.names() else {}
+    return task, names.parameters_of(task, shipped.values()), shipped
 
 
 def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:

@@ -84,52 +84,52 @@ class Silent(Composed):
         ), memory
 
 
-def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str) -> Policy:
+def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str, field: str = "policy") -> Policy:
     """Returns a trained policy as it acts in a task: itself, or of several skills with its own one,
     or silent.
 
     Raises:
-        InputError: if the policy does not fit the task.
+        InputError: naming `field`, if the policy does not fit the task.
     """
     policy = policy.at_size(env)
     needs = policy.needs
-    if (numbers := sum(sensor.action_size for sensor in env.params.senses)) and not needs.senses:
-        view = _changed(env, params=dataclasses.replace(env.params, senses=()))
-        return Silent(translate(policy, view, name), numbers)
+    params = env.params
+    numbers = 0 if needs.senses else sum(sensor.action_size for sensor in params.senses)
+    if numbers:
+        params = dataclasses.replace(params, senses=())
+    own = None
     if needs.control == "command" == env.control and len(env.controller.skill.parts) > 1:
-        gait = needs.gait and env.params.gait  # a skill may have no gaits
-        params = dataclasses.replace(
-            env.params, skill=needs.skill, gait=gait, command_ranges=needs.command_ranges
-        )
-        own = params.commander
-        here = env.params.commander
-        if here.admits(own):
+        changes = {"skill": needs.skill, "command_ranges": needs.command_ranges}
+        changes["gait"] = needs.gait and params.gait  # a skill may have no gaits
+        trained = dataclasses.replace(params, **changes)
+        if params.commander.admits(trained.commander):
+            params = trained
+            own = trained.commander
             if beyond := own.skill.untrained_commands(params.action_ranges()):
                 raise InputError(
-                    f"policy: {name} commands beyond what its skill is trained for: "
+                    f"{field}: {name} commands beyond what its skill is trained for: "
                     f"{', '.join(beyond)}"
                 )
-            controller = dataclasses.replace(env.controller, commands=own.commands)
-            # as it was trained
-            check_policy(policy, _changed(env, params=params, controller=controller), name)
-            layout = env.layouts[needs.group]
-            sensed = layout.slice("action") if needs.senses and "action" in layout.names else None
-            if sensed is not None and sensed.stop - sensed.start != env.controller.action_size:
-                raise InputError(
-                    f"policy: {name} remembers actions or sends messages; it meets its own skill "
-                    "only"
-                )
-            return Translated(policy, own, here, sensed)
-    check_policy(policy, env, name)
-    return policy
-
-
-def _changed(env: QuadrupedEnv, **attributes: Any) -> QuadrupedEnv:
-    """Returns a task with other attributes, to which a policy is compared."""
-    other = copy.copy(env)
-    vars(other).update(attributes)
-    vars(other).pop("suite", None)  # which depends on them
-    return other
+    as_trained = env
+    if params is not env.params:
+        as_trained = copy.copy(env)
+        vars(as_trained).update(params=params)
+        vars(as_trained).pop("suite", None)  # which depends on them
+    if own is not None:
+        controller = dataclasses.replace(env.controller, commands=own.commands)
+        vars(as_trained).update(controller=controller)
+    check_policy(policy, as_trained, name, field)
+    translated: Policy = policy
+    if own is not None:
+        layout = env.layouts[needs.group]
+        remembers = needs.senses and "action" in layout.names
+        sensed = layout.slice("action") if remembers else None
+        if sensed is not None and sensed.stop - sensed.start != env.controller.action_size:
+            raise InputError(
+                f"{field}: {name} remembers actions or sends messages; it meets its own skill only"
+            )
+        translated = Translated(policy, own, env.params.commander, sensed)
+    return Silent(translated, numbers) if numbers else translated
 
 
 def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from mqe_jax.core.limits import Seed, SeedCount
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import PathText, check, check_arguments, fail
 from mqe_jax.core.types import Cast
-from mqe_jax.runs.build import Config, TaskLike, prepare
+from mqe_jax.names import Config
+from mqe_jax.runs.cast import TaskLike, prepare
 from mqe_jax.runs.divergence import guard
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_run, write_config
@@ -157,7 +158,9 @@ def learn(
         ```
 
     Args:
-        task: id, environment, or a batch of environments, which is trained on as it is.
+        task: id, environment, or a batch of environments. An environment or a batch is trained on
+            as it is. With other parameters, an environment is made again with the arguments of its
+            constructor.
         config: a shipped name, a file, settings, or a mapping of changes of the task's default
             settings. In a mapping, `config` and `algorithm` name other settings to change. Default:
             those of `mqe train`.

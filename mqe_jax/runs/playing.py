@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import jax
 from annotated_types import MinLen
 
+from mqe_jax import names
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.results import Result, pool
 from mqe_jax.core.limits import (
@@ -24,14 +25,13 @@ from mqe_jax.core.limits import (
     Seed,
     Speed,
 )
-from mqe_jax.core.settings import PathText, check, check_arguments, fail, merge
+from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, fail, merge
 from mqe_jax.core.types import AnySingle
-from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.envs.registry import task_id
-from mqe_jax.policies import load_policy, parameters_for
+from mqe_jax.names import Read, Source, Table
 from mqe_jax.policies.zoo import population
-from mqe_jax.runs import build
-from mqe_jax.runs.build import Player, parameters_of
+from mqe_jax.runs.cast import REFERENCES, reference_opponents
 from mqe_jax.runs.divergence import guard
 from mqe_jax.selfplay.league import tournament as league
 from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
@@ -46,8 +46,8 @@ Camera = Literal["follow", "near", "scene", "side"]
 )
 def evaluate(
     task: str | Path | QuadrupedEnv,
-    policy: Player = None,
-    opponent: Player = None,
+    policy: Source | None = None,
+    opponent: Source | None = None,
     *,
     env: Mapping[str, Any] | None = None,
     impl: str = "auto",
@@ -91,44 +91,50 @@ def evaluate(
     Raises:
         InputError: for a task, parameters or a policy that is not allowed.
     """
-    if isinstance(opponent, str) and population.is_named(opponent):
-        options = {
-            "env": env,
-            "impl": impl,
-            "episodes": episodes,
-            "sides": sides,
-            "num_envs": num_envs,
-        }
-        options |= {"deterministic": deterministic, "seed": seed, "dump_diverged": dump_diverged}
-        match = build.players(task, policy, env=env, impl=impl).env.name
-        every = {
-            name: evaluate(task, policy, name, **options)
-            for name in population.members(opponent, match)
-        }
-        return pool(every, opponent)
-    num_envs = min(num_envs, episodes)
-    playing = build.players(
-        task, policy, opponent, env=env, impl=impl, num_envs=num_envs, deterministic=deterministic
-    )
+    read: Read = {}
+    options: dict[str, Any] = {
+        "env": env,
+        "impl": impl,
+        "num_envs": min(num_envs, episodes),
+        "deterministic": deterministic,
+        "read": read,
+    }
+    counted: dict[str, Any] = {"episodes": episodes, "sides": sides, "seed": seed}
+    counted["dump_diverged"] = dump_diverged
+    if not isinstance(opponent, str) or not population.is_named(opponent):
+        return _measure(names.table(task, policy, opponent, **options), **counted)
+    match = names.target(task, read).task
+    every = {
+        member: _measure(names.table(task, policy, member, **options), **counted)
+        for member in population.members(opponent, match)
+    }
+    return pool(every, opponent)
+
+
+def _measure(
+    playing: Table, *, episodes: int, sides: str, seed: int, dump_diverged: str | Path | None
+) -> Result:
+    """Returns the result of those who sit at a table."""
     batch = playing.batch
-    about = dict(playing.about)
+    about = {**playing.about, "seed": seed}
     if len(playing.env.teams) > 1 and sides == "both":
-        for name, count in {"episodes": episodes, "num_envs": num_envs}.items():
+        for name, count in {"episodes": episodes, "num_envs": batch.num_envs}.items():
             if count % 2:
-                fail(
-                    name,
-                    count,
-                    "even: the policy plays half of the episodes on each side (sides: both)",
-                )
+                allowed = "even: the policy plays half of the episodes on each side (sides: both)"
+                fail(name, count, allowed)
         batch = BothSides(batch)
-        about["sides"] = sides
+        about = {**playing.about, "sides": sides, "seed": seed}
     with guard(batch, dump_diverged) as guarded:
         result = evaluate_batch(guarded, playing.seats, episodes, jax.random.PRNGKey(seed))
-    return dataclasses.replace(result, about={**about, "seed": seed}, labels=playing.env.labels)
+    return dataclasses.replace(result, about=about, labels=playing.env.labels)
 
 
 @check_arguments(
-    policies=Annotated[Sequence[str], MinLen(1)], episodes=Candidates, deterministic=bool, seed=Seed
+    policies=Annotated[Sequence[str], MinLen(1)],
+    env=Parameters | None,
+    episodes=Candidates,
+    deterministic=bool,
+    seed=Seed,
 )
 def tournament(
     task: str | QuadrupedEnv,
@@ -162,27 +168,33 @@ def tournament(
     Raises:
         InputError: as `evaluate`.
     """
-    task = task_id(task) if isinstance(task, str) else task
-    policies = population.expand(policies, task if isinstance(task, str) else task.name)
-    needed = parameters_for(task, *policies) if isinstance(task, str) else parameters_of(task)
-    params = merge(needed, env or {})
-    single, _ = build.make_env(task, impl, params, 1)
-    references = build.reference_opponents(single)
+    name = task_id(task) if isinstance(task, str) else task.name
+    policies = population.expand(policies, name)
+    found = {source: names.find(source, name) for source in policies}
+    params = dict(env or {})
+    if isinstance(task, str):
+        params = merge(names.parameters_of(name, found.values()), params)
+    room = (len(found) + len(REFERENCES)) * episodes
+    made = names.environment(task, params, impl=impl, num_envs=room)
+    match = len(made.teams) > 1
+    own = tuple(found)
+    references = reference_opponents(made)
+    if not match:
+        references = [each for each in references if each not in ("random", *own)]
+    everyone = tuple(dict.fromkeys([*own, *references]))
+    envs, copies = (len(everyone) * episodes, 1) if match else (episodes, len(everyone))
+    batch = VectorEnv(made, envs, copies, final=())
+    teams = {
+        each: names.seat(each, made, "policy", found, deterministic=deterministic)
+        for each in everyone
+    }
     key = jax.random.PRNGKey(seed)
-    match = len(single.teams) > 1
-    own = tuple(dict.fromkeys(policies))
     if not match:
-        references = [name for name in references if name not in ("random", *own)]
-    names = tuple(dict.fromkeys([*own, *references]))
-    envs, copies = (len(names) * episodes, 1) if match else (episodes, len(names))
-    _, batch = build.make_env(task, impl, params, envs, copies)
-    teams = {name: load_policy(name, batch.env, deterministic=deterministic) for name in names}
-    if not match:
-        return CrossPlay(
-            single.name, own, tuple(references), episodes, cross_play(batch, teams, episodes, key)
-        )
+        results = cross_play(batch, teams, episodes, key)
+        return CrossPlay(made.name, own, tuple(references), episodes, results)
     results = league.round_robin(batch, teams, key)
-    return Standings(single.name, names, results, league.rate(results, names.index(references[0])))
+    ratings = league.rate(results, everyone.index(references[0]))
+    return Standings(made.name, everyone, results, ratings)
 
 
 @check_arguments(
@@ -197,8 +209,8 @@ def tournament(
 )
 def render(
     task: str | Path | QuadrupedEnv,
-    policy: Player = None,
-    opponent: Player = None,
+    policy: Source | None = None,
+    opponent: Source | None = None,
     *,
     env: Mapping[str, Any] | None = None,
     impl: str = "auto",
@@ -242,7 +254,7 @@ def render(
 
     threading.Thread(target=gl_backend, daemon=True).start()  # while the episode is computed
     options: Any = {"env": env, "impl": impl, "num_envs": episodes, "deterministic": deterministic}
-    playing = build.players(task, policy, opponent, **options, sensors=sensors)
+    playing = names.table(task, policy, opponent, **options, sensors=sensors)
     key = jax.random.PRNGKey(seed)
     recorded = record_episodes(
         playing.env, playing.seats, key, episodes=episodes, seconds=seconds, sensors=sensors

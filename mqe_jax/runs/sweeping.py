@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from mqe_jax import names
 from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.files import write_atomically
 from mqe_jax.core.limits import Positive, Seed
@@ -16,7 +17,7 @@ from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import PathText, check_arguments, to_mapping
 from mqe_jax.envs.registry import task_id
 from mqe_jax.presets import Layers
-from mqe_jax.runs import build
+from mqe_jax.runs import cast
 from mqe_jax.study import report as reports
 from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import Cell
@@ -81,18 +82,18 @@ def sweep(
         named = {"config": settings.config and settings.config.replace("{task}", cell.task)}
         if cell.algorithm != "default":
             named["algorithm"] = cell.algorithm
-        return build.settings(cell.task, named, layers=layers)
+        return names.settings(cell.task, named, layers=layers)
 
     def stop() -> bool:
         return time_limit is not None and time.monotonic() - began > 60.0 * time_limit
 
     sweeps.prepare(settings, folder, write=False)
-    check = functools.partial(build.check_start, impl=impl)
+    check = functools.partial(cast.check_start, impl=impl)
     jobs = sweeps.plan(settings, folder, config_of, cells, seeds, check)
     if dry_run:
         return {"left": _estimate(folder, jobs), "report": []}
     sweeps.prepare(settings, folder)
-    make = functools.partial(build.environments, impl)
+    make = functools.partial(cast.environments, impl=impl)
 
     def report_failure(job, error):
         return echo(f"mqe: {_names([job])} failed: {one_line(error)}")
@@ -108,8 +109,8 @@ def sweep(
         echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")
     if failed:
         kind = NonFiniteError if isinstance(failed[0][1], NonFiniteError) else InputError
-        names = _names([job for job, _ in failed])
-        raise kind(f"cells: {len(failed)} of {len(jobs)} trainings failed: {names}")
+        cells = _names([job for job, _ in failed])
+        raise kind(f"cells: {len(failed)} of {len(jobs)} trainings failed: {cells}")
     return {"left": _estimate(folder, left), "report": [str(file) for file in files]}
 
 

@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax import names
 from mqe_jax.core.limits import Environments, Horizon, Seed
-from mqe_jax.core.settings import check_arguments, merge
+from mqe_jax.core.settings import Parameters, check_arguments
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
-from mqe_jax.runs import build
 from mqe_jax.sensors.suite import ONBOARD
 
 WARM_UP = 4  # calls after the compiling one that are not counted: episodes spread, clocks settle
@@ -62,7 +62,9 @@ def programs(
     )
 
 
-@check_arguments(num_envs=Environments, steps=Horizon, repeats=Horizon, seed=Seed)
+@check_arguments(
+    env=Parameters | None, num_envs=Environments, steps=Horizon, repeats=Horizon, seed=Seed
+)
 def bench(
     task: str | QuadrupedEnv,
     *,
@@ -100,8 +102,10 @@ def bench(
     Raises:
         InputError: for a task or parameters that are not allowed.
     """
-    made, batch = build.make_env(task, impl, merge(build.parameters_of(task), env or {}), num_envs)
-    batch = batch.with_groups([ONBOARD]) if made.params.senses else batch
+    made = names.environment(task, env or {}, impl=impl, num_envs=num_envs)
+    batch = VectorEnv(made, num_envs, final=())
+    if made.params.senses:
+        batch = batch.with_groups([ONBOARD])
     whole, bare = programs(made, batch, steps, lambda state: jnp.sum(state.metrics["overflow"]))
     key = jax.random.PRNGKey(seed)
     state = jax.block_until_ready(jax.jit(batch.reset)(key))

@@ -1,10 +1,9 @@
-"""A match as an environment of one team: against opponents (`versus`), or with both teams learning
+"""A match as an environment of one team: against opponents (`Versus`), or with both teams learning
 (`Mirror`).
 """
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Self
 
 import jax
@@ -29,7 +28,6 @@ from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.match import OF_AGENTS, team_view
 from mqe_jax.envs.state import EnvironmentState
 from mqe_jax.envs.wrappers import Outer, Wrapper
-from mqe_jax.policies import load_as
 from mqe_jax.train.policy import TrainedPolicy
 
 _OF_MATCH = (
@@ -115,7 +113,7 @@ class OneTeam(Outer):
 
 class Versus(OneTeam):
     """N matches as N environments of team 0, in K equal blocks with one opponent each; see
-    `versus`.
+    `mqe_jax.versus`.
 
     Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
     """
@@ -255,34 +253,6 @@ class Versus(OneTeam):
         fields = {name: getattr(match, name) for name in _OF_MATCH}
         fields |= team_view(match, self.num_agents)
         return TeamState(**fields, match=match, action=action, opponents=opponents, key=key)
-
-
-@check_arguments(env=AnyBatch, draw_reward=Number)
-def versus(
-    env: VectorEnv | Wrapper,
-    opponents: Policy | str | Path | Sequence[Policy | str | Path],
-    *,
-    draw_reward: float = 0.0,
-) -> Versus:
-    """Returns matches as environments of team 0, against opponents that control team 1.
-
-    Opponents are policies or what `load_policy` accepts; equally many environments meet each of
-    them. Trained policies act as they are loaded (sampled, unless deterministic) and can be
-    exchanged (`Versus.change`). A draw adds `draw_reward`. InputError for a task that is not a
-    match, and for a policy of another task.
-
-    Example:
-        ```python
-        batch = mqe_jax.VectorEnv(mqe_jax.make("go1tug"), 8)
-        matches = mqe_jax.versus(batch, ["scripted", "idle"])  # four against each
-        print(matches.num_agents)  # 1
-        ```
-    """
-    alone = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
-    given: Any = [opponents] if alone else opponents
-    if not isinstance(given, Sequence):
-        fail("opponents", given, "a policy, or a list of policies")
-    return Versus(env, [load_as("opponents", each, env.env) for each in given], draw_reward)
 
 
 class Mirror(OneTeam):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.literal import line
-from mqe_jax.train.checkpoint import read_metadata
+from mqe_jax.train.checkpoint import read_file
 from mqe_jax.train.folder import CONFIG_FILE, CSV_FILE, load_run_config
 from mqe_jax.train.logs import number, read_metrics
 from mqe_jax.train.monitor import read_evaluations
@@ -70,7 +70,7 @@ def is_finished(run_dir: Path) -> bool:
         return False
     config = load_run_config(run_dir)
     total = config.num_updates * config.steps_per_update
-    if read_metadata(run_dir / POLICY_FILE, kind="policy").get("env_steps") != total:
+    if read_file(run_dir / POLICY_FILE, kind="policy").metadata.get("env_steps") != total:
         return False
     if config.evaluation.every is None:
         return True

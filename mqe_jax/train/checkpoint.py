@@ -9,18 +9,19 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, brief
-from mqe_jax.core.files import check_file, make_folder, parse_json, parsing, write_atomically
+from mqe_jax.core.files import make_folder, parse_json, parsing, read_bytes, write_atomically
 from mqe_jax.core.settings import PathText, check_arguments, fail
 from mqe_jax.core.types import is_typed_key, raw_keys
 
 FORMAT = "mqe_jax.train"
 VERSION = 4
 
+_LENGTH = 8  # bytes of a safetensors file that hold the length of its header
 _LARGEST = {"policy": limits.FILE_BYTES, "checkpoint": limits.CHECKPOINT_BYTES}
 _NAME = re.compile(r"step_(\d{12})\.safetensors")
 
@@ -97,16 +98,80 @@ def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind:
     write_atomically(Path(path), content)
 
 
-def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Returns arrays by name and metadata; raises an InputError that names the file and what is
-    wrong.
+class Stored(NamedTuple):
+    """What a file holds, read and checked."""
+
+    path: Path
+    arrays: dict[str, np.ndarray]
+    """Arrays by path name."""
+    metadata: dict[str, Any]
+
+    def tree(self, template: Any, *, half: bool = False, part: str = "") -> Any:
+        """Returns a pytree; `template` has its structure, and leaves of the expected shapes and
+        dtypes.
+
+        With `half`, float16 leaves are converted to float32. With `part`, it has only the leaves
+        below this path name, such as "extra/pool/". InputError, naming the file, for leaves that
+        are missing, unknown, impossible or of another shape or dtype.
+        """
+        arrays = {
+            name.removeprefix(part): array
+            for name, array in self.arrays.items()
+            if name.startswith(part)
+        }
+        expected, structure = _flatten(template)
+        for name in expected:
+            if name not in arrays:
+                raise InputError(
+                    f"{self.path}: {name} is missing; the file has other settings or is of another "
+                    "version"
+                )
+        for name in arrays:
+            if name not in expected:
+                raise InputError(
+                    f"{self.path}: unexpected entry {name}, not defined by the current settings"
+                )
+        for name, leaf in _flatten(jax.eval_shape(raw_keys, template))[0].items():
+            found = arrays[name]
+            about = f"{self.path}: {name} has"
+            if tuple(found.shape) != tuple(leaf.shape):
+                raise InputError(
+                    f"{about} shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed"
+                )
+            if half and found.dtype == np.float16 and leaf.dtype == np.float32:
+                arrays[name] = found.astype(np.float32)
+            elif found.dtype != leaf.dtype:
+                raise InputError(f"{about} dtype {found.dtype}; {leaf.dtype} is needed")
+            _check_range(self.path, part + name, arrays[name])
+        leaves = []
+        for name, leaf in expected.items():
+            array = jax.device_put(arrays[name])
+            if is_typed_key(leaf):
+                array = jax.random.wrap_key_data(array, impl=leaf.dtype)
+            leaves.append(array)
+        return jax.tree_util.tree_unflatten(structure, leaves)
+
+
+@check_arguments(path=PathText, kind=Kind)
+def read_file(path: str | Path, *, kind: str) -> Stored:
+    """Reads a file of a kind, opening it once.
+
+    Raises:
+        InputError: naming the file, if it is missing, damaged, of another kind or another version.
     """
+    path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file; a {kind} written by this package is needed")
-    check_file(path, _LARGEST[kind])
+    return parse_file(path, read_bytes(path, _LARGEST[kind]), kind)
+
+
+def parse_file(path: Path, content: bytes, kind: str) -> Stored:
+    """Returns what the content of a file holds; errors as `read_file`."""
     try:
-        with parsing(path, f"a {kind}, or truncated"), safe_open(path, framework="numpy") as file:
-            found = file.metadata() or {}
+        with parsing(path, f"a {kind}, or truncated"):
+            arrays = load(content)
+            size = int.from_bytes(content[:_LENGTH], "little")
+            found = json.loads(content[_LENGTH : _LENGTH + size]).get("__metadata__", {})
             if FORMAT not in found:
                 raise InputError(
                     f"not a file of this package, or of a version before 0.2.0; a {kind} is needed"
@@ -119,7 +184,6 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
                     f"has format version {brief(str(header['version']))}; version {VERSION} is "
                     "needed"
                 )
-            arrays = {name: file.get_tensor(name) for name in file.keys()}
             metadata = parse_json(header["metadata"], "metadata")
             if not isinstance(metadata, dict):
                 raise ValueError("its metadata is not a mapping")
@@ -128,59 +192,14 @@ def _read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]
     except InputError as error:
         text = str(error)
         raise InputError(text if str(path) in text else f"{path}: {text}") from None
-    return arrays, metadata
+    return Stored(path, arrays, metadata)
 
 
-@check_arguments(path=PathText, kind=Kind)
-def read_metadata(path: str | Path, *, kind: str) -> dict[str, Any]:
-    """Returns the metadata of a file, after checking the file."""
-    return _read(Path(path), kind)[1]
-
-
-@check_arguments(path=PathText, kind=Kind, half=bool, part=str)
-def load_tree(
-    path: str | Path, template: Any, *, kind: str, half: bool = False, part: str = ""
-) -> Checkpoint:
-    """Reads a pytree; `template` has its structure, and leaves of the expected shapes and dtypes.
-
-    With `half`, float16 leaves are converted to float32. With `part`, only the leaves below this
-    path name are read, such as "extra/pool/". InputError, naming the file, if it is missing,
-    damaged or of another version, and for leaves that are missing, unknown, impossible or of
-    another shape or dtype.
-    """
-    path = Path(path)
-    arrays, metadata = _read(path, kind)
-    arrays = {
-        name.removeprefix(part): array for name, array in arrays.items() if name.startswith(part)
-    }
-    expected, structure = _flatten(template)
-    for name in expected:
-        if name not in arrays:
-            raise InputError(
-                f"{path}: {name} is missing; the file has other settings or is of another version"
-            )
-    for name in arrays:
-        if name not in expected:
-            raise InputError(
-                f"{path}: unexpected entry {name}, not defined by the current settings"
-            )
-    for name, leaf in _flatten(jax.eval_shape(raw_keys, template))[0].items():
-        found = arrays[name]
-        if tuple(found.shape) != tuple(leaf.shape):
-            raise InputError(
-                f"{path}: {name} has shape {tuple(found.shape)}; {tuple(leaf.shape)} is needed"
-            )
-        if half and found.dtype == np.float16 and leaf.dtype == np.float32:
-            arrays[name] = found.astype(np.float32)
-        elif found.dtype != leaf.dtype:
-            raise InputError(f"{path}: {name} has dtype {found.dtype}; {leaf.dtype} is needed")
-        _check_range(path, part + name, arrays[name])
-    put = {name: jax.device_put(arrays[name]) for name in expected}
-    leaves = [
-        jax.random.wrap_key_data(put[name], impl=leaf.dtype) if is_typed_key(leaf) else put[name]
-        for name, leaf in expected.items()
-    ]
-    return Checkpoint(jax.tree_util.tree_unflatten(structure, leaves), metadata)
+@check_arguments(path=PathText, kind=Kind, part=str)
+def load_tree(path: str | Path, template: Any, *, kind: str, part: str = "") -> Checkpoint:
+    """Reads a pytree and the metadata of a file; errors as `read_file` and `Stored.tree`."""
+    stored = read_file(path, kind=kind)
+    return Checkpoint(stored.tree(template, part=part), stored.metadata)
 
 
 def _check_range(path: Path, name: str, array: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
@@ -26,7 +26,7 @@ from mqe_jax.core.types import (
     group_sizes,
     shapes_of,
 )
-from mqe_jax.train.checkpoint import load_tree, nonfinite, read_metadata, save_tree
+from mqe_jax.train.checkpoint import Stored, nonfinite, read_file, save_tree
 from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.needs import Needs, needs_of, unmet
@@ -291,10 +291,6 @@ def policy_of(
     return TrainedPolicy(policy_params, state.obs_normalizer.obs, needs, config, metadata)
 
 
-NAMED: dict[str, Callable[[], TrainedPolicy]] = {}
-"""Reads the policies that have names, the shipped ones, which `mqe_jax.policies.zoo` adds."""
-
-
 @check_arguments(run_dir=PathText, policy=TrainedPolicy, name=PathText, half=bool)
 def save_policy(
     run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False
@@ -343,6 +339,7 @@ def _file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], di
 
 
 @single
+@check_arguments(run=PathText)
 def read_policy(run: str | Path) -> TrainedPolicy:
     """Reads the policy of a run folder, or a policy file; parameters stored as float16 become
     float32.
@@ -351,18 +348,30 @@ def read_policy(run: str | Path) -> TrainedPolicy:
         InputError: in one line naming the file, if it is missing, damaged, of another format or
             non-finite.
     """
-    path = Path(check("policy", run, PathText))
-    path = path / POLICY_FILE if path.is_dir() else path
-    metadata = read_metadata(path, kind="policy")
+    file = policy_path(run)
+    return policy_in(read_file(file, kind="policy"))
+
+
+def policy_path(run: str | Path) -> Path:
+    """Returns the policy file of a run folder, or a policy file itself."""
+    path = Path(run)
+    return path / POLICY_FILE if path.is_dir() else path
+
+
+@single
+def policy_in(stored: Stored) -> TrainedPolicy:
+    """Returns the policy that a file holds; errors as `read_policy`."""
+    metadata = dict(stored.metadata)
     if "members" in metadata:
-        raise InputError(f"{path}: holds a mixture of policies, which version 0.4 does not read")
+        raise InputError(
+            f"{stored.path}: holds a mixture of policies, which version 0.4 does not read"
+        )
     try:
         needs = build(Needs, metadata.pop("needs"))
         config = build(TrainConfig, without_retired(metadata.pop("config")))
         deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, AttributeError, InputError) as error:
-        raise InputError(f"{path}: its settings cannot be read ({error})") from None
-    template = _template(needs.dims, config.network)
-    tree = load_tree(path, template, kind="policy", half=True).tree
+        raise InputError(f"{stored.path}: its settings cannot be read ({error})") from None
+    tree = stored.tree(_template(needs.dims, config.network), half=True)
     return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)

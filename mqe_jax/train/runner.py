@@ -46,20 +46,22 @@ def train(
     eval_env: VectorEnv | None = None,
     league: Matchmaker | None = None,
     teacher: Any = None,
+    start: TrainedPolicy | None = None,
 ) -> TrainState:
     """Trains until `config.total_steps` and returns the last state; without a `run_dir`, nothing is
     written.
 
     `resume` continues the run in the folder from its newest checkpoint; in an empty folder a new
     run starts. `on_update` gets the state and the row of metrics.csv of every update. `eval_env`
-    has an environment for each of `config.evaluation.episodes`, `teacher` is the policy that
-    `config.imitation` imitates.
+    has an environment for each of `config.evaluation.episodes`. `teacher` and `start` are the
+    policies that `config.imitation` and `config.start` name.
 
     InputError, before anything is changed, for a folder that cannot be written, is in use, or holds
     a run that cannot be resumed. NonFiniteError after the first update with a loss or weight that
     is not finite; what is on disk is from before that update.
     """
-    return train_seeds(env, [config], [run_dir], resume, on_update, eval_env, league, teacher)[0]
+    others = (eval_env, league, teacher, start)
+    return train_seeds(env, [config], [run_dir], resume, on_update, *others)[0]
 
 
 def train_seeds(
@@ -71,6 +73,7 @@ def train_seeds(
     eval_env: VectorEnv | None = None,
     league: Matchmaker | None = None,
     teacher: Any = None,
+    start: TrainedPolicy | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[TrainState]:
     """Trains several seeds in one program, equivalently to separate runs, each with its own run
@@ -79,7 +82,8 @@ def train_seeds(
     `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to
     all. If `stop()` is true before an update, they are saved and end.
     """
-    with open_training(env, configs, run_dirs, resume, eval_env, league, teacher) as training:
+    others = (eval_env, league, teacher, start)
+    with open_training(env, configs, run_dirs, resume, *others) as training:
         return training.run(on_update, stop)
 
 
@@ -92,6 +96,7 @@ def open_training(
     eval_env: VectorEnv | None = None,
     league: Matchmaker | None = None,
     teacher: Any = None,
+    start: TrainedPolicy | None = None,
 ) -> Iterator["Training"]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
     check("env", env, AnyBatch)
@@ -133,6 +138,7 @@ def open_training(
                 checkpoints,
                 eval_env,
                 league,
+                start,
                 progress,
             )
 
@@ -152,6 +158,7 @@ class Training:
         checkpoints: Sequence[Path | None],
         eval_env: VectorEnv | None,
         league: Matchmaker | None,
+        start: TrainedPolicy | None,
         progress: ProgressLog,
     ) -> None:
         self._env = env
@@ -161,8 +168,9 @@ class Training:
         self._processes = processes
         self._progress = progress
         self._seeds = seeds = SeedBatch(learner.init, len(configs))
+        others = (seeds.shared, league, start, progress.doing)
         first = [
-            first_state(env, learner, processes, own, path, seeds.shared, league, progress.doing)
+            first_state(env, learner, processes, own, path, *others)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stack(seeds.shared)

@@ -17,11 +17,11 @@ from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import fail, is_settings, leaves, override, to_mapping
 from mqe_jax.core.types import Matchmaker, Params, PyTree, VectorEnv, generator
-from mqe_jax.train.checkpoint import checkpoint_step, load_tree, read_metadata
+from mqe_jax.train.checkpoint import checkpoint_step, read_file
 from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
-from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
+from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.seeds import with_shared, without_shared
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
@@ -72,31 +72,29 @@ def first_state(
     checkpoint: Path | None,
     shared: PyTree,
     league: Matchmaker | None = None,
+    start: TrainedPolicy | None = None,
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> tuple[TrainState, float]:
     """Returns this process's initial or restored state and the seconds already spent; `shared` as
     in `SeedBatch`.
+
+    `start` is the policy of the settings' `start`.
     """
-    start = processes.compile(learner.init, start=True)
+    begin = processes.compile(learner.init, start=True)
 
     def init(key: jax.Array) -> TrainState:
         with doing("compiling"):
-            return processes.own(start(key))
+            return processes.own(begin(key))
 
     if checkpoint is None:
-        policy = (
-            None if config.start is None else policy_to_start(env, processes.whole.params, config)
-        )
+        if (config.start is None) != (start is None):
+            fail("start", config.start, "a policy, which is the training's argument `start`")
+        if start is not None:
+            start = policy_to_start(start, env, processes.whole.params, config)
         state = init(initial_key(config))
-        if policy is not None:
-            normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
-            state = dataclasses.replace(
-                state, params={**state.params, **policy.params}, obs_normalizer=normalizer
-            )
-            if league is not None:
-                state = league.seat(dataclasses.replace(state, extra=league.begin(state)))
-        return state, 0.0
-    metadata = read_metadata(checkpoint, kind="checkpoint")
+        return (state if start is None else start_from(start, state, league)), 0.0
+    stored = read_file(checkpoint, kind="checkpoint")
+    metadata = stored.metadata
     run = checkpoint.parent.parent
     if metadata.get("task") != env.name:
         raise InputError(f"{checkpoint}: belongs to task {metadata.get('task')}, not {env.name}")
@@ -120,7 +118,7 @@ def first_state(
         if whole
         else without_environments(template)
     )
-    tree = load_tree(checkpoint, saved, kind="checkpoint").tree
+    tree = stored.tree(saved)
     updates = int(tree.updates if whole else tree["updates"])
     if updates * config.steps_per_update != steps:
         held = f"{updates} updates of {config.steps_per_update} environment steps"
@@ -135,19 +133,27 @@ def first_state(
     return jax.tree.map(jnp.asarray, tree), float(seconds)
 
 
-def policy_to_start(env: VectorEnv, params: Params, config: TrainConfig) -> TrainedPolicy:
-    """Returns the policy that `config.start` names; InputError unless it fits environment,
-    parameters and settings.
+def start_from(
+    policy: TrainedPolicy, state: TrainState, league: Matchmaker | None = None
+) -> TrainState:
+    """Returns an initial state with the parameters and the observation statistics of a policy."""
+    normalizer = state.obs_normalizer._replace(obs=policy.normalizer)
+    params = {**state.params, **policy.params}
+    state = dataclasses.replace(state, params=params, obs_normalizer=normalizer)
+    if league is None:
+        return state
+    return league.seat(dataclasses.replace(state, extra=league.begin(state)))
+
+
+def policy_to_start(
+    policy: TrainedPolicy, env: VectorEnv, params: Params, config: TrainConfig
+) -> TrainedPolicy:
+    """Returns the policy to start from, at an environment's size.
+
+    InputError, naming the settings' `start`, unless it fits environment, parameters and settings.
     """
     start = str(config.start)
-    if start not in NAMED and not Path(start).exists():
-        shipped = (
-            f"one of {', '.join(NAMED)}"
-            if NAMED
-            else "a shipped one's task, after `import mqe_jax.policies.zoo`"
-        )
-        fail("start", start, f"a run folder, a policy file, or {shipped}")
-    policy = (NAMED[start]() if start in NAMED else read_policy(start)).at_size(env)
+    policy = policy.at_size(env)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     check_policy(policy, env, start, "start")
     if shapes != jax.tree.map(jnp.shape, policy.params):

@@ -21,16 +21,18 @@ _FAR = 1e3  # m, x and y of who takes no part
 GAIN = 1.5  # 1/s, commanded speed per distance from the goal
 
 
-def find_scripted(task: str, name: str = "scripted") -> ScriptedPolicy:
+def find_scripted(task: str, name: str = "scripted", field: str = "policy") -> ScriptedPolicy:
     """Returns a task's scripted policy: one team's observation blocks (A, width) by name -> its
     actions (A, 3).
 
     Raises:
-        InputError: if the task has none of this name.
+        InputError: naming `field`, if the task has none of this name.
     """
     policy = SCRIPTED.get(task) if name == "scripted" else NAMED_SCRIPTED.get(task, {}).get(name)
     if policy is None:
-        raise InputError(f"policy: {task} has no {name} policy; allowed for: {', '.join(SCRIPTED)}")
+        raise InputError(
+            f"{field}: {task} has no {name} policy; allowed for: {', '.join(SCRIPTED)}"
+        )
     return load("mqe_jax.policies.scripted", policy) if isinstance(policy, str) else policy
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -11,8 +10,7 @@ from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Episodes, Fraction, NonNegative
 from mqe_jax.core.settings import build, check_arguments, settings_class
-from mqe_jax.train.checkpoint import read_metadata
-from mqe_jax.train.policy import NAMED, TrainedPolicy, read_policy
+from mqe_jax.train.policy import TrainedPolicy, read_policy
 
 FOLDER = Path(__file__).parent
 
@@ -67,20 +65,17 @@ def file_of(task: str) -> Path:
 
 
 @check_arguments(task=str)
-def card(task: str) -> Card:
-    """Returns the card of a task's shipped policy.
+def load(task: str) -> TrainedPolicy:
+    """Returns a task's shipped policy.
 
     Raises:
         InputError: if the task has none.
     """
     if task not in names():
         raise InputError(f"policy: none is shipped for {task!r}; shipped: {', '.join(names())}")
-    return build(Card, read_metadata(file_of(task), kind="policy")["card"])
+    return read_policy(file_of(task))
 
 
-def load(task: str) -> TrainedPolicy:
-    """Returns a task's shipped policy, which acts as its card declares; errors as `card`."""
-    return read_policy(file_of(task)).acting(card(task).mode == "deterministic")
-
-
-NAMED.update({name: functools.partial(load, name) for name in names()})
+def card(task: str) -> Card:
+    """Returns the card of a task's shipped policy; errors as `load`."""
+    return build(Card, load(task).metadata["card"])

@@ -5,23 +5,23 @@ Source: prioritised fictitious self-play (AlphaStar, doi 10.1038/s41586-019-1724
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.acting.seats import Policy
 from mqe_jax.core import devices
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import fail
+from mqe_jax.core.settings import FrozenMapping, fail
 from mqe_jax.core.types import RESULTS
 from mqe_jax.envs import VectorEnv
 from mqe_jax.envs.wrappers import Wrapper
-from mqe_jax.policies import load_as
 from mqe_jax.selfplay.league import pool
 from mqe_jax.selfplay.league.pool import Pool
-from mqe_jax.selfplay.opponents import Versus, exchange, versus
+from mqe_jax.selfplay.opponents import Versus, exchange
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.needs import needs_of
@@ -74,15 +74,19 @@ class League:
 
     @single
     def __init__(
-        self, matches: VectorEnv | Wrapper, opponents: Sequence[str], config: TrainConfig
+        self,
+        matches: VectorEnv | Wrapper,
+        roster: Roster,
+        config: TrainConfig,
+        policies: Mapping[str, Policy] = FrozenMapping(),
     ) -> None:
-        """Creates the matches of a training run; `opponents` are those of
-        `TrainConfig.opponents`.
+        """Creates the matches of a training run; `policies` has those of `Roster.fixed`, by
+        name.
         """
-        needs = needs_of(versus(matches, ["idle"]), config)
+        needs = needs_of(matches, config)
         self._dims = needs.dims
         self._config = config
-        self._roster = Roster(opponents)
+        self._roster = roster
         drawn = int(self._roster.members.sum())
         if drawn and config.league.members <= drawn:
             fail(
@@ -95,10 +99,8 @@ class League:
         first = TrainedPolicy(params, statistics, needs, config, {})
         self._form = first.form
 
-        def load(name):
-            return load_as("opponent", name, matches.env) if name in self._roster.fixed else first
-
-        self.env = Versus(matches, list(map(load, opponents)), config.draw_reward)
+        opponents = [policies[name] if name in roster.fixed else first for name in roster.names]
+        self.env = Versus(matches, opponents, config.draw_reward)
         self._members = config.league.members if drawn else 1
 
     def begin(self, state: TrainState) -> LeagueState:

@@ -17,6 +17,8 @@ from annotated_types import MaxLen
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import read_json
 from mqe_jax.core.settings import check, fail
+from mqe_jax.train.checkpoint import parse_file
+from mqe_jax.train.policy import TrainedPolicy, policy_in
 
 FOLDER = Path(__file__).parent
 MEMBERS = 5
@@ -64,27 +66,29 @@ def expand(sources: Any, task: str) -> list[Any]:
     ]
 
 
-def resolve(source: Any, task: str) -> Any:
-    """Returns the file or the name of a population's member; another source as it is.
+def find(source: str, task: str, field: str = "policy") -> TrainedPolicy | str | None:
+    """Returns a population's member, its policy or the name that it has in the match; None for
+    another source.
 
     Raises:
-        InputError: for a whole population, an unknown member, or a file that is not that of the
-            population.
+        InputError: naming `field`, for a whole population or an unknown member; naming the file, if
+            it is not that of the population.
     """
-    found = _NAME.fullmatch(str(source))
+    found = _NAME.fullmatch(source)
     if found is None:
-        return source
+        return None
     version, member = found.groups()
     known = members(f"population/{version}", task)
     if source not in known:
-        fail("policy", str(source), f"one of {', '.join(known)}")
+        fail(field, source, f"one of {', '.join(known)}")
     digest = manifest(version)[task][member]
+    if digest is None:
+        return member
     file = FOLDER / f"{version}-{task}-{member}.safetensors"
-    if digest is not None and (
-        not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != digest
-    ):
+    content = file.read_bytes() if file.is_file() else b""
+    if hashlib.sha256(content).hexdigest() != digest:
         raise InputError(f"{file}: is missing, or not the file of population/{version}")
-    return member if digest is None else file
+    return policy_in(parse_file(file, content, "policy"))
 
 
 def manifest(version: str, folder: Path | None = None) -> Mapping[str, Mapping[str, str | None]]:

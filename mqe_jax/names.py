@@ -1,0 +1,477 @@
+"""The front door: what users name becomes what the program uses, and each file is read once.
+
+`find` reads a policy, `parameters_of` says what policies need of a task, `environment` makes it,
+and `fit` lets a policy act in it. `table` does all four for those who play. `settings` does the
+first two for those who learn.
+"""
+
+import dataclasses
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, overload
+
+from mqe_jax.acting.seats import Act, Policy, Seats, check_policy
+from mqe_jax.core import devices
+from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.limits import Number
+from mqe_jax.core.literal import echo
+from mqe_jax.core.settings import (
+    FrozenMapping,
+    Parameters,
+    PathText,
+    check,
+    check_arguments,
+    differences,
+    fail,
+    merge,
+    nested,
+    override,
+)
+from mqe_jax.core.types import AnyBatch, AnyEnvironment, PolicyOrAct
+from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs.registry import SCRIPTED, TASKS, find_task, task_id
+from mqe_jax.envs.wrappers import Wrapper
+from mqe_jax.policies import simple, zoo
+from mqe_jax.policies.translated import together, translate
+from mqe_jax.policies.zoo import population
+from mqe_jax.presets import resolve
+from mqe_jax.selfplay.opponents import Versus
+from mqe_jax.sensors.suite import ONBOARD, sensors_of
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.needs import Needs
+from mqe_jax.train.policy import (
+    POLICY_FILE,
+    TrainedPolicy,
+    read_policy,
+)
+
+Source = str | Path | Policy | Act
+"""What users pass as a policy: a name, a path, a policy, or its function `act` without recurrent
+state."""
+Config = str | Path | TrainConfig | Mapping[str, Any] | None
+"""Settings of a training: a shipped name, a file, settings, or changes of the task's default
+ones."""
+Params = Mapping[str, Any]
+"""Task parameters by name; the control mode may be among them."""
+
+_NOTHING: Params = FrozenMapping()
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """A policy that needs no file and exists only in an environment, such as `scripted`."""
+
+    name: str
+    """One of `mqe_jax.policies.simple.names`."""
+    usual: bool = False
+    """Whether it acts with the task's default skill, as the member of a population does."""
+
+
+Found = Any
+"""A `TrainedPolicy`, a `Named`, a policy or a function: what `find` returns."""
+Read = dict[str, Found]
+"""Policies by name or path, so that each is read once in a call."""
+
+
+def find(
+    source: Source, task: str = "", *, field: str = "policy", read: Read | None = None
+) -> Found:
+    """Returns the policy of a name, a path or an object; makes no environment.
+
+    A name is one of `mqe_jax.policies.simple`, a task with a shipped policy, a member of a
+    population, or that of a file or folder with a suffix, or below another folder. `read` has the
+    policies that are already read, and gets further ones.
+
+    Raises:
+        InputError: naming `field`, for an unknown name; naming the file, if it cannot be read.
+    """
+    named = isinstance(source, str | Path)
+    check(field, source, PathText if named else PolicyOrAct)
+    if not named:
+        return source
+    known = {} if read is None else read
+    if str(source) not in known:
+        known[str(source)] = _find(str(source), task, field)
+    return known[str(source)]
+
+
+def _find(name: str, task: str, field: str) -> Found:
+    member = population.find(name, task, field)
+    if member is not None:
+        return Named(member, usual=True) if isinstance(member, str) else member
+    if name in simple.names(task):
+        return Named(name)
+    shipped = name in zoo.names()
+    if shipped or os.sep in name or Path(name).suffix or Path(name).exists():
+        return read_policy(zoo.file_of(name) if shipped else name)
+    allowed = (*simple.names(task), *zoo.names())
+    raise InputError(
+        f"{field}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}, "
+        "a run folder, or a policy file"
+    )
+
+
+def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
+    """Returns the parameters, with the control mode, that policies need and that differ from a
+    task's defaults.
+
+    Only trained policies of the task need something, their sensors among it, and the scripted
+    member of a population: it acts with the task's default skill. Policies of different skills get
+    parameters with which they can meet.
+    """
+    found = list(found)
+    needed = [each.needs for each in found if _needs(each, task)]
+    params: dict[str, Any] = {}
+    for needs in needed:
+        usual = TASKS[task].Params().actions(needs.control) | {"control": "command"}
+        own = {name: getattr(needs, name) for name in usual}
+        own = {name: value for name, value in own.items() if value != usual[name]}
+        if needs.senses:
+            own["senses"] = needs.senses
+        params = own | {name: value for name, value in params.items() if value is not None}
+    skills = [needs.by_name() for needs in needed]
+    usual = any(isinstance(each, Named) and each.usual for each in found)
+    if usual and all(needs.control == "command" for needs in needed):
+        skills.append(TASKS[task].Params().actions("command"))
+    return params | together(skills)
+
+
+def _needs(policy: Any, task: str) -> bool:
+    """Returns whether a policy needs something of a task's parameters."""
+    needs = getattr(policy, "needs", None)
+    return isinstance(needs, Needs) and needs.task == task and needs.control is not None
+
+
+@check_arguments(impl=str)
+def environment(
+    task: str | QuadrupedEnv,
+    params: Params = _NOTHING,
+    *,
+    impl: str = "auto",
+    num_envs: int = 1,
+) -> QuadrupedEnv:
+    """Returns the environment of a task's id; one that is passed as it is, or with other
+    parameters.
+
+    `num_envs` environments fit into the buffers of a new one. `impl` is the physics engine of an
+    id's.
+    """
+    if isinstance(task, QuadrupedEnv):
+        if impl not in ("auto", task.impl):
+            fail("impl", impl, f"left out for an environment, whose engine is {task.impl!r}")
+        return task.changed(params)
+    device = devices.platform()
+    if impl == "warp" and device != "gpu":
+        raise InputError(
+            f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax"
+        )
+    return make(task, impl=impl, num_envs=num_envs, **params)
+
+
+def fit(
+    found: Found,
+    env: QuadrupedEnv,
+    *,
+    deterministic: bool = False,
+    field: str = "policy",
+    name: str = "",
+) -> Policy:
+    """Returns a policy as it acts for a team of an environment: of its size, with its own skill.
+
+    With `deterministic`, a trained policy acts with its mean actions.
+
+    Raises:
+        InputError: naming `field`, the policy, by default its text, and what does not fit.
+    """
+    if isinstance(found, Named):
+        return simple.named(found.name, env, field)
+    name = name or repr(found)
+    if isinstance(found, TrainedPolicy):
+        return translate(found.acting(True) if deterministic else found, env, name, field)
+    if not hasattr(found, "act"):
+        return simple.from_function(found, env)
+    if hasattr(found, "task"):
+        check_policy(found, env, name, field)
+    return found
+
+
+class Table(NamedTuple):
+    """An environment, and who sits in it."""
+
+    env: QuadrupedEnv
+    """The task."""
+    batch: VectorEnv
+    """Environments with automatic reset."""
+    seats: Seats
+    """Who acts for which agents."""
+    about: dict[str, Any]
+    """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
+
+
+@check_arguments(env=Parameters | None, deterministic=bool)
+def table(
+    task: str | Path | QuadrupedEnv,
+    policy: Source | None = None,
+    opponent: Source | None = None,
+    *,
+    env: Params | None = None,
+    impl: str = "auto",
+    num_envs: int = 1,
+    deterministic: bool = False,
+    sensors: bool = False,
+    read: Read | None = None,
+) -> Table:
+    """Returns what is evaluated, rendered and viewed; arguments and errors as `mqe_jax.evaluate`.
+
+    With `sensors`, robots that have none get the sensors of the set `onboard`.
+
+    A run brings its own task, parameters and policy. Without a policy and parameters, a task has
+    its shipped policy, on both sides of a match. Otherwise it has its scripted one, or `forward`,
+    or `random` if actions are not commands. A task by its id has the parameters that trained
+    policies need, such as their skill.
+    """
+    read = {} if read is None else read
+    name, own, run = target(task, read)
+    given = dict(env or {})
+    params = merge(own, given)
+    first: Any = policy or run
+    second: Any = opponent
+    if first is None:
+        first = _usual_policy(name, params)
+        second = first if first == name and second is None else second
+    policies = [find(first, name, read=read)]
+    if opponent is not None:
+        policies.append(find(opponent, name, field="opponent", read=read))
+    place = task if isinstance(task, QuadrupedEnv) else name
+    if isinstance(place, str):
+        given = merge(merge(params, parameters_of(name, policies)), given)
+    if sensors and not sensors_of({**params, **given}.get("senses", ())):
+        given["senses"] = ONBOARD
+    made = environment(place, given, impl=impl, num_envs=num_envs)
+    sources = {"policy": first}
+    if len(made.teams) > 1:
+        sources["opponent"] = "idle" if second is None else second
+    elif opponent is not None:
+        raise InputError(f"opponent: {name} is not a competitive task; omit the opponent")
+    teams = [
+        seat(source, made, field, read, deterministic=deterministic)
+        for field, source in sources.items()
+    ]
+    seats = Seats.of_teams(made, *teams)
+    groups = seats.groups | {ONBOARD} if sensors else seats.groups
+    batch = VectorEnv(made, num_envs, final=()).with_groups(groups)
+    return Table(made, batch, seats, _about(sources, teams[0]))
+
+
+def _about(sources: Mapping[str, Source], policy: Any) -> dict[str, Any]:
+    """Returns the names of who plays, and the kind of actions of a trained policy."""
+    about: dict[str, Any] = {"policy": str(sources["policy"])}
+    mean = getattr(getattr(policy, "policy", policy), "deterministic", None)
+    if mean is not None:
+        about["actions"] = "mean" if mean else "sampled"
+    if "opponent" in sources:
+        about["opponent"] = str(sources["opponent"])
+    return about
+
+
+class Target(NamedTuple):
+    """What a task's id, an environment, a run folder or a policy file stands for."""
+
+    task: str
+    """Id of the task."""
+    params: Mapping[str, Any]
+    """The parameters that it brings, which differ from the task's defaults."""
+    run: str | None = None
+    """Source of the policy of a run."""
+
+
+def target(task: str | Path | QuadrupedEnv, read: Read | None = None) -> Target:
+    """Returns what is named as a task; `read` gets the policy of a run.
+
+    Raises:
+        InputError: for an unknown id, or a folder without a policy.
+    """
+    if isinstance(task, QuadrupedEnv):
+        return Target(task.name, own_parameters(task))
+    source = str(check("task", task, PathText))
+    name = find_task(source)
+    if name is not None:
+        return Target(name, {})
+    if not source.endswith(".safetensors") and not (Path(source) / POLICY_FILE).is_file():
+        runs = sorted(str(path.parent) for path in Path(source).glob(f"*/{POLICY_FILE}"))
+        hint = f"; did you mean {runs[0]}?" if runs else ""
+        allowed = "a run folder, a policy file (*.safetensors), or a task's id"
+        raise InputError(f"run: {source!r} has no {POLICY_FILE}{hint}; allowed: {allowed}")
+    policy = read_policy(source)
+    if read is not None:
+        read[source] = policy
+    return Target(task_id(policy.task), policy.config.env, source)
+
+
+def _usual_policy(name: str, params: Params) -> str:
+    """Returns the policy that a task has by default."""
+    if name in zoo.names() and not {*params} - {"senses"}:
+        return name
+    if params.get("control", "command") != "command":
+        return "random"
+    return "scripted" if name in SCRIPTED else "forward"
+
+
+def own_parameters(env: QuadrupedEnv) -> dict[str, Any]:
+    """Returns the parameters of an environment, with the control mode, that differ from its task's
+    defaults.
+    """
+    control = {} if env.control == "command" else {"control": env.control}
+    return {**control, **differences(env.params, env.Params())}
+
+
+def settings(
+    task: Any,
+    config: Config = None,
+    *,
+    env: Params | None = None,
+    layers: Mapping[str, Params] = _NOTHING,
+    read: Read | None = None,
+) -> TrainConfig:
+    """Returns the settings of a training on a task, with the task and its parameters.
+
+    The task is an id, an environment or a batch of environments. Layers lie between those of
+    `config` and `env`. A task by its id gets the parameters that the teacher and the policy to
+    start from need, which `read` gets. A line says if the settings are for another task.
+    """
+    changes: dict[str, Any] = nested(config) if isinstance(config, Mapping) else {"config": config}
+    source = changes.pop("config", None)
+    algorithm = changes.pop("algorithm", None)
+    kinds = str | Path | TrainConfig | None
+    if not isinstance(source, kinds) or not isinstance(algorithm, str | None):
+        fail("config", config, "a shipped name, a file, a TrainConfig, or a mapping of settings")
+    inner = task if isinstance(task, str | QuadrupedEnv) else getattr(task, "env", None)
+    name = ""
+    own: dict[str, Any] = {}
+    if isinstance(inner, str):
+        name = task_id(inner)
+    elif isinstance(inner, QuadrupedEnv):
+        name = inner.name
+        own = own_parameters(inner)
+    asked = check("env", changes.get("env", {}), Parameters)
+    changes["env"] = merge(merge(own, asked), env or {})
+
+    def needs(made: TrainConfig) -> dict[str, Any]:
+        named = {"imitation.teacher": made.imitation.teacher, "start": made.start}
+        sources = {field: source for field, source in named.items() if source is not None}
+        return parameters_of(
+            name, [find(x, name, field=field, read=read) for field, x in sources.items()]
+        )
+
+    made = resolve(
+        name if inner is task else "",
+        source,
+        algorithm,
+        {**layers, "": changes},
+        needs if isinstance(task, str) else lambda made: {},
+    )
+    if made.task not in (None, name) and name:
+        echo(f"mqe: the settings are for {made.task!r}; training {name!r} with them")
+    return override(made, {"task": name or made.task})
+
+
+@overload
+def load_policy(source: str | Path, env: None = None, *, deterministic: bool = False) -> Any: ...
+@overload
+def load_policy(
+    source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False
+) -> Policy: ...
+@check_arguments(source=PathText, env=AnyEnvironment | None, deterministic=bool)
+def load_policy(
+    source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False
+) -> Policy:
+    """Returns the policy of a name, a run folder or a policy file.
+
+    Example:
+        ```python
+        env = mqe_jax.make("go1gate")
+        team = mqe_jax.load_policy("go1gate", env)  # the shipped one
+        obs = jax.numpy.zeros((1, 2, 16))
+        action, memory = team.act(obs, team.initial_memory(1), jax.random.PRNGKey(0))
+        ```
+
+    Args:
+        source: scripted, random, idle, forward, one of the task's `NAMED_SCRIPTED`, a task with a
+            shipped policy (`mqe_jax.policies.zoo`), a member of a population (`zoo.population`), or
+            a path. A folder with one of these names is ./NAME.
+        env: the task; in a match the policy acts for one team. Names need it, and policies of paths
+            are checked against it.
+        deterministic: whether a trained policy acts with its mean actions. It also does if its file
+            says so.
+
+    Returns:
+        A `TrainedPolicy` for a shipped one or a path, else a `SimplePolicy`.
+
+    Raises:
+        InputError: for an unknown name, a file that cannot be read, a policy of another task, or a
+            task without a scripted policy.
+    """
+    env = getattr(env, "env", env)  # of a batch
+    found = find(source, "" if env is None else env.name)
+    if env is not None:
+        return fit(found, env, deterministic=deterministic, name=str(source))
+    if isinstance(found, Named):
+        raise InputError(f"policy: {source!r} needs a task: load_policy({source!r}, env)")
+    return found.acting(True) if deterministic else found
+
+
+@check_arguments(env=AnyBatch, draw_reward=Number)
+def versus(
+    env: VectorEnv | Wrapper,
+    opponents: Source | Sequence[Source],
+    *,
+    draw_reward: float = 0.0,
+) -> Versus:
+    """Returns matches as environments of team 0, against opponents that control team 1.
+
+    Opponents are policies or what `load_policy` accepts; equally many environments meet each of
+    them. Trained policies act as they are loaded (sampled, unless deterministic) and can be
+    exchanged (`Versus.change`). A draw adds `draw_reward`. InputError for a task that is not a
+    match, and for a policy of another task.
+
+    Example:
+        ```python
+        batch = mqe_jax.VectorEnv(mqe_jax.make("go1tug"), 8)
+        matches = mqe_jax.versus(batch, ["scripted", "idle"])  # four against each
+        print(matches.num_agents)  # 1
+        ```
+    """
+    alone = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
+    given: Any = [opponents] if alone else opponents
+    if not isinstance(given, Sequence):
+        fail("opponents", given, "a policy, or a list of policies")
+    read: Read = {}
+    policies = [seat(each, env.env, "opponents", read) for each in given]
+    return Versus(env, policies, draw_reward)
+
+
+def seats(
+    roles: Mapping[str, Iterable[str | None]], env: QuadrupedEnv, read: Read | None = None
+) -> dict[str, Policy]:
+    """Returns the policies that settings name, by name, as they act for a team of an environment.
+
+    `roles` has the names, or None, by setting. Errors are those of `find` and `fit`.
+    """
+    every = [(name, role) for role, sources in roles.items() for name in sources]
+    return {name: seat(name, env, role, read) for name, role in every if name is not None}
+
+
+def seat(
+    source: Source,
+    env: QuadrupedEnv,
+    field: str = "policy",
+    read: Read | None = None,
+    *,
+    deterministic: bool = False,
+) -> Policy:
+    """Returns the policy of a name, a path or an object as it acts for a team of an environment;
+    arguments and errors as `find` and `fit`.
+    """
+    found = find(source, env.name, field=field, read=read)
+    return fit(found, env, deterministic=deterministic, field=field, name=str(source))

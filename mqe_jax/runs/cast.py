@@ -1,0 +1,290 @@
+"""Who learns where: the settings, environments and policies of a training, from what users pass."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+
+from mqe_jax import names
+from mqe_jax.acting.seats import Policy, Seats
+from mqe_jax.core.limits import Environments, SeedCount, bounds
+from mqe_jax.core.settings import check_arguments, fail, leaves, override, to_mapping
+from mqe_jax.core.types import Cast
+from mqe_jax.core.types import VectorEnv as AnyVectorEnv
+from mqe_jax.envs import SCRIPTED, QuadrupedEnv, TaskParams, VectorEnv
+from mqe_jax.envs.autoreset import EnvBatch
+from mqe_jax.envs.wrappers import Deadline
+from mqe_jax.names import Config, Read
+from mqe_jax.presets import resolve
+from mqe_jax.selfplay.demonstrations import Demonstrated
+from mqe_jax.selfplay.league.league import League, Roster
+from mqe_jax.selfplay.league.sides import BothSides
+from mqe_jax.selfplay.opponents import Mirror, Versus
+from mqe_jax.train import learner
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.learner import Learner
+from mqe_jax.train.logs import check_loggers
+from mqe_jax.train.needs import needs_of
+from mqe_jax.train.policy import TrainedPolicy, groups_of
+from mqe_jax.train.start import initial_key, policy_to_start, start_from
+
+_MOST = int(bounds(Environments)[1])
+_NO_EFFECT = (
+    "opponents",
+    "both_sides",
+    "draw_reward",
+    "curriculum.demonstrator",
+    "imitation.teacher",
+    "evaluation.every",
+)
+"""Settings with which a training makes environments, so that they do nothing for a batch."""
+
+REFERENCES = ("scripted", "idle", "random")
+"""Fixed opponents in a match, the strongest first, of which a task may lack `scripted`."""
+
+TaskLike = str | QuadrupedEnv | AnyVectorEnv
+"""A task's id, its environment, or a batch of environments."""
+
+
+@check_arguments(env=Mapping[str, Any] | None, impl=str)
+def prepare(
+    task: TaskLike,
+    config: Config = None,
+    env: Mapping[str, Any] | None = None,
+    *,
+    impl: str = "auto",
+    seeds: Sequence[int] | None = None,
+) -> tuple[list[TrainConfig], Cast]:
+    """Returns the settings of each seed and the environments of a training; arguments and errors as
+    `mqe_jax.learn`.
+
+    `seeds` are trained in one program; by default the one of the settings.
+    """
+    if len(set(seeds or ())) < len(seeds or ()):
+        fail("seeds", seeds, "a list without repetitions")
+    read: Read = {}
+    made = names.settings(task, config, env=env, read=read)
+    if isinstance(task, str | QuadrupedEnv):
+        cast = environments(made, len(seeds or (0,)), task=task, impl=impl, read=read)
+    elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
+        made, cast = _around(task, made, env, impl, read)
+    else:
+        allowed = "an environment such as that of mqe_jax.make, or a batch of environments"
+        fail("task", task, f"a task's id, {allowed}")
+    configs = [made] if seeds is None else [override(made, {"seed": seed}) for seed in seeds]
+    return configs, cast
+
+
+@check_arguments(seeds=SeedCount)
+def make_learner(
+    task: TaskLike,
+    config: Config = None,
+    *,
+    env: Mapping[str, Any] | None = None,
+    impl: str = "auto",
+    seeds: int = 1,
+) -> Learner:
+    """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure
+    functions, not compiled.
+
+    Example:
+        ```python
+        init, update = mqe_jax.make_learner("go1gate", "demo")
+        state = jax.jit(init)(jax.random.PRNGKey(0))
+        state, metrics = jax.jit(update)(state)
+        ```
+
+    Args:
+        task: as in `mqe_jax.learn`, and so are config, env and impl.
+        config: settings; nothing is evaluated during training.
+        env: task parameters.
+        impl: physics engine.
+        seeds: number of states under an outer `jax.vmap`, for which buffers are sized.
+
+    Raises:
+        InputError: as `mqe_jax.learn`.
+    """
+    (made, *_), cast = prepare(task, config, env, impl=impl, seeds=range(seeds))
+    init, update = learner.make_learner(cast.env, made, league=cast.league, teacher=cast.teacher)
+    policy = _check_start(cast, made)
+    if policy is None:
+        return Learner(init, update)
+    return Learner(lambda key: start_from(policy, init(key), cast.league), update)
+
+
+@check_arguments(impl=str)
+def environments(
+    config: TrainConfig,
+    seeds: int = 1,
+    *,
+    task: str | QuadrupedEnv | None = None,
+    impl: str = "auto",
+    read: Read | None = None,
+) -> Cast:
+    """Returns the environments of seeds trained together, and who else plays in them.
+
+    The task is that of the settings, or `task`, an id or an environment. `read` has policies that
+    are already read.
+
+    In a match the policy is team 0 against `opponents`. Without opponents, both teams of each of
+    `num_envs` / 2 matches are environments of the policy. It is then evaluated against the scripted
+    policy, or an idle team if that does not fit. InputError for a task or a policy that is not
+    allowed.
+    """
+    task = task or config.task or ""
+    read = {} if read is None else read
+    num_envs = config.num_envs
+    trained = names.environment(task, config.training_env, impl=impl, num_envs=num_envs * seeds)
+    _check_teams(trained, config)
+    match = len(trained.teams) > 1
+    roster = Roster(config.opponents if match else ())
+    roles = {
+        "opponents": roster.fixed,
+        "imitation.teacher": [config.imitation.teacher],
+        "curriculum.demonstrator": [config.curriculum.demonstrator],
+    }
+    policies = names.seats(roles, trained, read)
+    teacher = policies.get(config.imitation.teacher or "")
+    demonstrator = policies.get(config.curriculum.demonstrator or "")
+    groups = {config.group, *groups_of(*(policies[name] for name in roster.fixed), teacher)}
+    both = match and not config.opponents
+    batch = _batch(trained, config, num_envs // 2 if both else num_envs, seeds, demonstrator)
+    env: Any = batch.with_groups(groups)
+    if config.time_limit_ends:
+        env = Deadline(env)
+    league = None
+    if both:
+        env = Mirror(env)
+    elif match:
+        league = League(BothSides(env) if config.both_sides else env, roster, config, policies)
+        env = league.env
+    evaluated = _evaluated(trained, task, config, seeds, impl)
+    eval_env = None
+    if config.evaluation.every is not None:
+        eval_env = VectorEnv(evaluated, config.evaluation.episodes, 2 * seeds).with_groups(groups)
+        if match:
+            eval_env = _evaluation_matches(eval_env, config, roster, read)
+    return Cast(env, eval_env, league, teacher, _start(config, trained.name, read))
+
+
+def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:
+    """Raises an InputError if a training of seeds could not start."""
+    check_loggers(config.loggers)
+    cast = environments(config, seeds, impl=impl)
+    learner.make_learner(cast.env, config, league=cast.league, teacher=cast.teacher)
+    _check_start(cast, config)
+
+
+def _check_start(cast: Cast, config: TrainConfig) -> TrainedPolicy | None:
+    """Returns the policy to start from; InputError unless it fits the environments and settings."""
+    if cast.start is None:
+        return None
+    network = config.network.build(needs_of(cast.env, config).dims)
+    params = jax.eval_shape(network.init, initial_key(config))
+    return policy_to_start(cast.start, cast.env, params, config)
+
+
+def _batch(
+    env: QuadrupedEnv,
+    config: TrainConfig,
+    num_envs: int,
+    seeds: int,
+    demonstrator: Policy | None,
+) -> VectorEnv:
+    """Returns the environments of a training, whose episodes may start in a demonstrator's
+    states.
+    """
+    final = config.network.critic_reads
+    if demonstrator is None:
+        return VectorEnv(env, num_envs, seeds, final=final)
+    seats = Seats.of_teams(env, *[demonstrator] * len(env.teams))
+    return Demonstrated(env, num_envs, seats, seeds, final=final)
+
+
+def _evaluated(
+    trained: QuadrupedEnv, task: str | QuadrupedEnv, config: TrainConfig, seeds: int, impl: str
+) -> QuadrupedEnv:
+    """Returns the environment in which the policy is evaluated: that of the training, unless
+    parameters or the buffers of a new one differ.
+
+    InputError if the policy could not act there.
+    """
+    sized = isinstance(task, str) and not trained.physics.holds(_MOST)
+    if not config.train_env and not (sized and config.evaluation.every is not None):
+        return trained
+    num_envs = 2 * seeds * config.evaluation.episodes
+    env = names.environment(task, config.env, impl=impl, num_envs=num_envs)
+    differing = needs_of(trained, config).mismatches(needs_of(env, config))
+    for name, (value, evaluated) in differing.items():
+        allowed = f"that of env, {evaluated!r}, in which the policy is evaluated"
+        fail(f"train_env.{name}", value, allowed)
+    return env
+
+
+def _evaluation_matches(
+    batch: VectorEnv, config: TrainConfig, roster: Roster, read: Read
+) -> Versus:
+    """Returns matches against the fixed opponents, else the strongest reference, of a training."""
+    against = roster.fixed or reference_opponents(batch.env)[:1]
+    episodes = config.evaluation.episodes
+    if episodes % len(against):
+        allowed = f"a multiple of the number of opponents in evaluations, {len(against)}"
+        fail("evaluation.episodes", episodes, allowed)
+    policies = names.seats({"opponents": against}, batch.env, read)
+    sides = BothSides(batch) if config.both_sides else batch
+    return Versus(sides, [policies[name] for name in against])
+
+
+def _start(config: TrainConfig, task: str, read: Read) -> TrainedPolicy | None:
+    """Returns the policy to start from, which the learner compares with its settings."""
+    if config.start is None:
+        return None
+    policy = names.find(config.start, task, field="start", read=read)
+    if not isinstance(policy, TrainedPolicy):
+        fail("start", config.start, "a run folder, a policy file, or a shipped policy's task")
+    return policy
+
+
+def _around(
+    batch: Any, config: TrainConfig, env: Mapping[str, Any] | None, impl: str, read: Read
+) -> tuple[TrainConfig, Cast]:
+    """Returns the settings and the cast of a training on a batch of environments.
+
+    InputError for what has no effect, because the batch is trained on as it is.
+    """
+    usual = resolve("")
+    defaults = dict(leaves(to_mapping(usual)))
+    asked = {name: value for name, value in leaves(to_mapping(config)) if name in _NO_EFFECT}
+    ignored = {name: value for name, value in asked.items() if value != defaults[name]}
+    if env:
+        ignored["env"] = env
+    if impl not in ("auto", getattr(getattr(batch, "env", None), "impl", "auto")):
+        ignored["impl"] = impl
+    for name, value in ignored.items():
+        fail(name, value, "left out for a batch of environments, which has its own")
+    if config.num_envs not in (usual.num_envs, batch.num_envs):
+        fail("num_envs", config.num_envs, f"{batch.num_envs}, or left out, for this batch")
+    if config.time_limit_ends:
+        if not isinstance(batch, EnvBatch):
+            fail("time_limit_ends", True, f"false for {batch.name}, whose states are its own")
+        batch = Deadline(batch)
+    config = override(config, {"num_envs": batch.num_envs, "evaluation.every": None})
+    return config, Cast(batch, start=_start(config, batch.name, read))
+
+
+def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
+    if len(env.teams) < 2 and config.opponents:
+        allowed = f"empty: {env.name} is not a match; it has one team"
+        fail("opponents", list(config.opponents), allowed)
+    if config.both_sides and not config.opponents:
+        fail("both_sides", True, "false without opponents")
+    if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
+        fail("num_envs", config.num_envs, "even: both teams of a match are environments")
+
+
+def reference_opponents(env: QuadrupedEnv) -> list[str]:
+    """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated
+    against that one.
+    """
+    walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
+    return [name for name in REFERENCES if name != "scripted" or (walking and env.name in SCRIPTED)]
