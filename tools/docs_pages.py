@@ -212,7 +212,9 @@ def task_page(task: Any) -> str:
     )
     body = next(filter(None, bodies))  # that of a base class if the task's is one line
     body = re.sub(r"see `\w+Rewards`", "the terms below", body)
-    policy = "shipped" if name in zoo.names() else "scripted" if name in SCRIPTED else "forward"
+    policy = "scripted" if name in SCRIPTED else "forward"
+    if name in zoo.names():
+        policy = "shipped"
     match = len(env.teams) > 1
     flags = " --opponent scripted" if match else ""
     against = " against the scripted one" if match else ""
