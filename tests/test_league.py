@@ -15,6 +15,7 @@ import pytest
 from mqe_jax import cli
 from mqe_jax.acting.seats import Policy
 from mqe_jax.core.settings import build, override, to_mapping
+from mqe_jax.core.types import Cast
 from mqe_jax.envs import make
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.names import load_policy, versus
@@ -91,9 +92,10 @@ def test_a_league_begins_with_its_policies(
             tmp_path, without_environments(state), 9 * config.steps_per_update, metadata, keep=1
         )
     policy = None if resumed else policy_of(state, league.env, config, env_steps=0)
-    learner, processes = own_learner(league.env, config, league)
+    cast = Cast(league.env, league=league, start=policy)
+    learner, processes = own_learner(cast, config)
     shared = SeedBatch(learner.init, 1).shared
-    begun, _ = first_state(league.env, learner, processes, config, file, shared, league, policy)
+    begun, _ = first_state(cast, learner, processes, config, file, shared)
     seats, before = (
         [seat.arrays for seat in each.rollout.env_state.opponents] for each in (begun, state)
     )

@@ -18,7 +18,7 @@ from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.seats import Seats
 from mqe_jax.core.blocks import Block, entities
 from mqe_jax.core.settings import override
-from mqe_jax.core.types import NetworkMemory, Params
+from mqe_jax.core.types import Cast, NetworkMemory, Params
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.presets import preset
 from mqe_jax.skills.agile import FRAME_SIZE, NOW_SIZE
@@ -228,8 +228,8 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
         if row["updates"] == 2 and not stopped.exists():  # with the checkpoints of update 1
             shutil.copytree(whole, stopped)
 
-    expected = train_seeds(env, configs, folders[0], on_update=copy, eval_env=env)
-    assert_same(train_seeds(env, configs, folders[1], resume=True, eval_env=env), expected)
+    expected = train_seeds(Cast(env, env), configs, folders[0], on_update=copy)
+    assert_same(train_seeds(Cast(env, env), configs, folders[1], resume=True), expected)
     one, other = (jax.tree.leaves(state.params) for state in expected)
     assert all(np.all(np.isfinite(leaf)) for leaf in one)
     assert any(not np.array_equal(a, b) for a, b in zip(one, other, strict=True))

@@ -18,7 +18,7 @@ from mqe_jax.acting.seats import check_policy
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
-from mqe_jax.core.types import Batch, Observations
+from mqe_jax.core.types import Batch, Cast, Observations
 from mqe_jax.policies import zoo
 from mqe_jax.runs.cast import prepare
 from mqe_jax.train.learner import make_learner
@@ -306,7 +306,7 @@ def test_a_training_with_sensors_resumes_bit_for_bit(tmp_path: Path) -> None:
     (config,), cast = prepare("go1gate", TINY, {"senses": senses}, impl="c")
     whole = tmp_path / "whole"
     stopped = tmp_path / "stopped"
-    train = functools.partial(train_seeds, cast.env, [config], teacher=Pacer())
+    train = functools.partial(train_seeds, Cast(cast.env, teacher=Pacer()), [config])
     train([whole])
     with pytest.raises(Stop):
         train([stopped], on_update=stop_after(1))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from mqe_jax.core.settings import build, to_mapping
-from mqe_jax.core.types import Outcome
+from mqe_jax.core.types import Cast, Outcome
 from mqe_jax.envs import TASKS, Randomization
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.reward import crowding
@@ -106,9 +106,10 @@ def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(
 ) -> None:
     env = Probe(probes.show_hidden, probes.pay_one, N)
     config = settings(checkpoint__environments=False, network__recurrent=False)
-    learner, processes = own_learner(env, config)
+    cast = Cast(env)
+    learner, processes = own_learner(cast, config)
     shared = SeedBatch(learner.init, 1).shared
-    start, _ = first_state(env, learner, processes, config, None, shared)
+    start, _ = first_state(cast, learner, processes, config, None, shared)
     keys = [start.rollout.env_state.key.tolist()]
     metadata = {
         "task": "probe",
@@ -119,7 +120,7 @@ def test_environments_made_anew_for_a_resumed_run_are_not_those_of_its_start(
     for updates in (1, 2):
         later = without_environments(start) | {"updates": jnp.int32(updates)}
         path = save_checkpoint(tmp_path, later, 16 * updates, metadata, keep=2)
-        state, seconds = first_state(env, learner, processes, config, path, shared)
+        state, seconds = first_state(cast, learner, processes, config, path, shared)
         keys.append(state.rollout.env_state.key.tolist())
         assert (
             seconds == 1.0

@@ -16,6 +16,7 @@ from mqe_jax.cli import programs
 from mqe_jax.core import files
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import lock, replacing, write_atomically
+from mqe_jax.core.types import Cast
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -180,11 +181,11 @@ def test_seeds_killed_between_two_checkpoints_resume(
 
     monkeypatch.setattr(runner, "save_checkpoint", killed)
     with pytest.raises(Stop):
-        train_seeds(PROBE, configs, folders)
+        train_seeds(Cast(PROBE), configs, folders)
     newest = [checkpoint_step(list_checkpoints(folder)[-1]) for folder in folders]
     assert newest == [48, 32]
     monkeypatch.setattr(runner, "save_checkpoint", save)
-    states = train_seeds(PROBE, configs, folders, resume=True)
+    states = train_seeds(Cast(PROBE), configs, folders, resume=True)
     assert [int(state.updates) for state in states] == [5, 5]
     for folder in folders:
         assert [row["env_steps"] for row in rows(folder)] == ["16", "32", "48", "64", "80"]
@@ -195,7 +196,9 @@ def test_a_seed_without_a_checkpoint_is_named(tmp_path: Path) -> None:
     checkpoint.parent.mkdir(parents=True)
     checkpoint.touch()
     folders = [tmp_path / "old", tmp_path / "new"]
-    refuses("old 80, new none", train_seeds, PROBE, [seeded(1), seeded(2)], folders, resume=True)
+    refuses(
+        "old 80, new none", train_seeds, Cast(PROBE), [seeded(1), seeded(2)], folders, resume=True
+    )
     assert not (tmp_path / "new").exists()
 
 
@@ -203,8 +206,8 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
     configs = [seeded(seed, evaluation__every=2, evaluation__episodes=4) for seed in (0, 1)]
     folders = [tmp_path / f"seed{config.seed}" for config in configs]
     with pytest.raises(Stop):
-        train_seeds(PROBE, configs, folders, on_update=stop_after(4), eval_env=PROBE)
-    train_seeds(PROBE, configs, folders, resume=True, eval_env=PROBE)
+        train_seeds(Cast(PROBE, PROBE), configs, folders, on_update=stop_after(4))
+    train_seeds(Cast(PROBE, PROBE), configs, folders, resume=True)
     for folder in folders:
         record = json.loads((folder / "evaluations.json").read_text())
         assert [e["env_steps"] for e in record["evaluations"]] == [32, 64, 80]
@@ -225,7 +228,7 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
 
 def test_seeds_need_the_same_settings_and_evaluation_needs_environments(tmp_path: Path) -> None:
     seeds = [seeded(0), seeded(1, ppo__clip=0.3)]
-    refuses("only in the seed", train_seeds, PROBE, seeds, [tmp_path / "a", tmp_path / "b"])
+    refuses("only in the seed", train_seeds, Cast(PROBE), seeds, [tmp_path / "a", tmp_path / "b"])
     refuses(r"evaluation\.every", train, PROBE, seeded(0, evaluation__every=2), tmp_path)
 
 

@@ -273,7 +273,7 @@ def test_a_cell_that_fails_is_named_and_the_others_are_trained(
     load(tmp_path)
     trained: list[str] = []
 
-    def train(configs: list[TrainConfig], **named: object) -> None:
+    def train(made: Cast, configs: list[TrainConfig], *given: object, **named: object) -> None:
         if configs[0].ppo.ratio == "dimension":
             raise InputError("opponents: this one cannot be read")
         trained.append(configs[0].ppo.ratio)

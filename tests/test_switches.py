@@ -21,7 +21,7 @@ from mqe_jax.acting.seats import Seats
 from mqe_jax.core import threefry  # noqa: F401
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
-from mqe_jax.core.types import Observations
+from mqe_jax.core.types import Cast, Observations
 from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
 from mqe_jax.names import load_policy
 from mqe_jax.selfplay.league.league import League, Roster
@@ -197,7 +197,11 @@ def test_a_training_resumes_with_its_own_generator(tmp_path: Path) -> None:
             return states.append(state)
 
         train_seeds(
-            PROBE, [config], [tmp_path / "half"], on_update=note, stop=lambda: len(states) == 2
+            Cast(PROBE),
+            [config],
+            [tmp_path / "half"],
+            on_update=note,
+            stop=lambda: len(states) == 2,
         )
     refuses(r"jax_default_prng_impl.*rbg", train, PROBE, config, tmp_path / "half", resume=True)
     with jax.default_prng_impl("rbg"):

@@ -15,6 +15,7 @@ from safetensors.numpy import load_file
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import to_mapping
+from mqe_jax.core.types import Cast
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
@@ -23,7 +24,7 @@ from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
-from mqe_jax.train.runner import train
+from mqe_jax.train.runner import train, train_seeds
 from mqe_jax.train.start import check_parameters, check_same
 from tests import training as probes
 from tests.inputs import refuses
@@ -287,14 +288,15 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
 
 def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path: Path) -> None:
     run_dir, trained = straight
-    policy = read_policy(run_dir)
+    cast = Cast(PROBE, start=read_policy(run_dir))
+    start = str(run_dir)
 
     def kill(state: TrainState, row: dict[str, float]) -> None:
         assert float(state.obs_normalizer.obs.samples) > float(trained.obs_normalizer.obs.samples)
         raise Stop
 
     with pytest.raises(Stop):
-        train(PROBE, settings(start=str(run_dir)), tmp_path / "a", on_update=kill, start=policy)
+        train_seeds(cast, [settings(start=start)], [tmp_path / "a"], on_update=kill)
     first = load_file(list_checkpoints(tmp_path / "a")[0])
     last = load_file(list_checkpoints(run_dir)[-1])
     same = [name for name in first if name.startswith(("params/actor/", "params/log_std"))]
@@ -304,11 +306,11 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
     with pytest.raises(
         InputError, match=r"action_scale: 0\.25 differs from that of the policy in .*straight, "
     ):
-        train(PROBE, settings(start=str(run_dir), action_scale=0.25), tmp_path / "b", start=policy)
-    other = settings(start=str(run_dir), network__hidden_sizes=(8,))
+        train_seeds(cast, [settings(start=start, action_scale=0.25)], [tmp_path / "b"])
+    other = settings(start=start, network__hidden_sizes=(8,))
     said = r"start: .*straight.* is not allowed; it must be a policy with this run's network"
-    refuses(said, train, PROBE, other, tmp_path / "b", start=policy)
-    refuses("start: .* argument `start`", train, PROBE, other, tmp_path / "b")
+    refuses(said, train_seeds, cast, [other], [tmp_path / "b"])
+    refuses("start: .* `start` of the training's cast", train, PROBE, other, tmp_path / "b")
 
 
 def test_a_policy_that_is_missing_or_of_another_kind(

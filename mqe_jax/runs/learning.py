@@ -232,12 +232,7 @@ def _train(
 ) -> list[Run]:
     with (
         guard(cast.env, dump_diverged) as env,
-        open_training(
-            configs=configs,
-            run_dirs=folders,
-            resume=resume,
-            **cast._replace(env=env)._asdict(),
-        ) as training,
+        open_training(cast._replace(env=env), configs, folders, resume) as training,
     ):
         if resume and not training.resumed:
             where = ", ".join(map(str, folders))

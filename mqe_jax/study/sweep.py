@@ -317,4 +317,4 @@ def _train(job: Job, environments: MakeEnvironments, stop: Callable[[], bool]) -
         for run_dir in job.folders:
             locks.enter_context(lock(run_dir))
     cast = environments(job.configs[0], len(job.configs))
-    train_seeds(configs=job.configs, run_dirs=job.folders, resume=True, stop=stop, **cast._asdict())
+    train_seeds(cast, job.configs, job.folders, resume=True, stop=stop)

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from mqe_jax.core import interrupts
 from mqe_jax.core.devices import Processes, translate_errors
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import PathText, check, fail, to_mapping
-from mqe_jax.core.types import AnyBatch, Matchmaker, PyTree, VectorEnv, generator, raw_keys
+from mqe_jax.core.types import AnyBatch, Cast, PyTree, VectorEnv, generator, raw_keys
 from mqe_jax.train.checkpoint import checkpoint_step, latest, nonfinite, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import common_checkpoints, open_folders, write_config
@@ -44,36 +43,27 @@ def train(
     resume: bool = False,
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
-    league: Matchmaker | None = None,
-    teacher: Any = None,
-    start: TrainedPolicy | None = None,
 ) -> TrainState:
     """Trains until `config.total_steps` and returns the last state; without a `run_dir`, nothing is
     written.
 
     `resume` continues the run in the folder from its newest checkpoint; in an empty folder a new
     run starts. `on_update` gets the state and the row of metrics.csv of every update. `eval_env`
-    has an environment for each of `config.evaluation.episodes`. `teacher` and `start` are the
-    policies that `config.imitation` and `config.start` name.
+    has an environment for each of `config.evaluation.episodes`.
 
     InputError, before anything is changed, for a folder that cannot be written, is in use, or holds
     a run that cannot be resumed. NonFiniteError after the first update with a loss or weight that
     is not finite; what is on disk is from before that update.
     """
-    others = (eval_env, league, teacher, start)
-    return train_seeds(env, [config], [run_dir], resume, on_update, *others)[0]
+    return train_seeds(Cast(env, eval_env), [config], [run_dir], resume, on_update)[0]
 
 
 def train_seeds(
-    env: VectorEnv,
+    cast: Cast,
     configs: Sequence[TrainConfig],
     run_dirs: Sequence[str | Path | None],
     resume: bool = False,
     on_update: OnUpdate | None = None,
-    eval_env: VectorEnv | None = None,
-    league: Matchmaker | None = None,
-    teacher: Any = None,
-    start: TrainedPolicy | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[TrainState]:
     """Trains several seeds in one program, equivalently to separate runs, each with its own run
@@ -82,24 +72,19 @@ def train_seeds(
     `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to
     all. If `stop()` is true before an update, they are saved and end.
     """
-    others = (eval_env, league, teacher, start)
-    with open_training(env, configs, run_dirs, resume, *others) as training:
+    with open_training(cast, configs, run_dirs, resume) as training:
         return training.run(on_update, stop)
 
 
 @contextlib.contextmanager
 def open_training(
-    env: VectorEnv,
+    cast: Cast,
     configs: Sequence[TrainConfig],
     run_dirs: Sequence[str | Path | None],
     resume: bool = False,
-    eval_env: VectorEnv | None = None,
-    league: Matchmaker | None = None,
-    teacher: Any = None,
-    start: TrainedPolicy | None = None,
 ) -> Iterator["Training"]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
-    check("env", env, AnyBatch)
+    check("env", cast.env, AnyBatch)
     for config, _ in zip(configs, run_dirs, strict=True):
         check("config", config, TrainConfig)
     run_dirs = [check("run_dir", run_dir, PathText | None) for run_dir in run_dirs]
@@ -107,19 +92,19 @@ def open_training(
         raise InputError(
             "seeds: the settings of seeds trained together may differ only in the seed"
         )
-    if configs[0].evaluation.every is not None and eval_env is None:
+    if configs[0].evaluation.every is not None and cast.eval_env is None:
         fail(
             "evaluation.every", configs[0].evaluation.every, "none without evaluation environments"
         )
-    check_parameters(env, configs[0], configs[0].training_env)
-    if eval_env is not None:
-        check_parameters(eval_env, configs[0], configs[0].env)
+    check_parameters(cast.env, configs[0], configs[0].training_env)
+    if cast.eval_env is not None:
+        check_parameters(cast.eval_env, configs[0], configs[0].env)
     folders = [Path(run_dir) for run_dir in run_dirs if run_dir is not None]
     if folders:
         check_loggers(configs[0].loggers)
     elif resume:
         fail("resume", True, "false without a run_dir")
-    learner, processes = own_learner(env, configs[0], league, teacher)
+    learner, processes = own_learner(cast, configs[0])
     with (
         translate_errors(),
         open_folders(folders, resume) if processes.leads else contextlib.nullcontext(),
@@ -128,19 +113,9 @@ def open_training(
         checkpoints = common_checkpoints(folders) or [None] * len(configs)
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
         total = configs[0].num_updates * configs[0].steps_per_update
-        with ProgressLog(configs[0].task or env.name, total, shown=processes.leads) as progress:
-            yield Training(
-                env,
-                learner,
-                processes,
-                configs,
-                folders,
-                checkpoints,
-                eval_env,
-                league,
-                start,
-                progress,
-            )
+        title = configs[0].task or cast.env.name
+        with ProgressLog(title, total, shown=processes.leads) as progress:
+            yield Training(cast, learner, processes, configs, folders, checkpoints, progress)
 
 
 class Training:
@@ -150,27 +125,23 @@ class Training:
 
     def __init__(
         self,
-        env: VectorEnv,
+        cast: Cast,
         learner: Learner,
         processes: Processes,
         configs: Sequence[TrainConfig],
         folders: Sequence[Path],
         checkpoints: Sequence[Path | None],
-        eval_env: VectorEnv | None,
-        league: Matchmaker | None,
-        start: TrainedPolicy | None,
         progress: ProgressLog,
     ) -> None:
-        self._env = env
+        self._env = cast.env
         self._configs = configs
         self._folders = folders
         self._config = configs[0]
         self._processes = processes
         self._progress = progress
         self._seeds = seeds = SeedBatch(learner.init, len(configs))
-        others = (seeds.shared, league, start, progress.doing)
         first = [
-            first_state(env, learner, processes, own, path, *others)
+            first_state(cast, learner, processes, own, path, seeds.shared, progress.doing)
             for own, path in zip(configs, checkpoints, strict=True)
         ]
         self._stacked = processes.stack(seeds.shared)
@@ -182,8 +153,8 @@ class Training:
         self._saved = self.env_steps if self.resumed else -1
         self._start_time = time.perf_counter() - first[0][1]
         self._monitor = None
-        if self._config.evaluation.every is not None and eval_env is not None and processes.leads:
-            self._monitor = Monitor(eval_env, self._config)
+        if self._config.evaluation.every is not None and processes.leads:
+            self._monitor = Monitor(cast.eval_env, self._config)
         # of metrics.csv, added by `run`
         self.rows: list[list[dict[str, float]]] = [[] for _ in configs]
         self.evaluations: list[EvaluationLog] = []  # of each seed; empty without evaluation

@@ -16,7 +16,7 @@ from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import fail, is_settings, leaves, override, to_mapping
-from mqe_jax.core.types import Matchmaker, Params, PyTree, VectorEnv, generator
+from mqe_jax.core.types import Cast, Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, read_file
 from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.folder import CONFIG_FILE
@@ -41,45 +41,39 @@ def initial_key(config: TrainConfig) -> jax.Array:
     return jax.random.PRNGKey(config.seed)
 
 
-def own_learner(
-    env: VectorEnv,
-    config: TrainConfig,
-    league: Matchmaker | None = None,
-    teacher: Any = None,
-) -> tuple[Learner, Processes]:
+def own_learner(cast: Cast, config: TrainConfig) -> tuple[Learner, Processes]:
     """Returns the learner of this process, which has its share of the environments, and all
     processes.
     """
     count = jax.process_count()
-    whole = own = make_learner(env, config, league=league, teacher=teacher)
+    others = {"league": cast.league, "teacher": cast.teacher}
+    whole = own = make_learner(cast.env, config, **others)
     if count > 1:
-        share: Any = getattr(env, "share", None)
+        share: Any = getattr(cast.env, "share", None)
         if share is None:
             raise InputError(
-                f"env: {env.name} cannot be split over {count} processes: it has no `share`"
+                f"env: {cast.env.name} cannot be split over {count} processes: it has no `share`"
             )
-        own = make_learner(share(count), config, league=league, teacher=teacher, processes=count)
+        own = make_learner(share(count), config, processes=count, **others)
     return own, Processes(
         *(jax.eval_shape(learner.init, initial_key(config)) for learner in (own, whole))
     )
 
 
 def first_state(
-    env: VectorEnv,
+    cast: Cast,
     learner: Learner,
     processes: Processes,
     config: TrainConfig,
     checkpoint: Path | None,
     shared: PyTree,
-    league: Matchmaker | None = None,
-    start: TrainedPolicy | None = None,
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> tuple[TrainState, float]:
     """Returns this process's initial or restored state and the seconds already spent; `shared` as
     in `SeedBatch`.
-
-    `start` is the policy of the settings' `start`.
     """
+    env = cast.env
+    league = cast.league
     begin = processes.compile(learner.init, start=True)
 
     def init(key: jax.Array) -> TrainState:
@@ -87,12 +81,12 @@ def first_state(
             return processes.own(begin(key))
 
     if checkpoint is None:
-        if (config.start is None) != (start is None):
-            fail("start", config.start, "a policy, which is the training's argument `start`")
-        if start is not None:
-            start = policy_to_start(start, env, processes.whole.params, config)
-        state = init(initial_key(config))
-        return (state if start is None else start_from(start, state, league)), 0.0
+        if (config.start is None) != (cast.start is None):
+            fail("start", config.start, "a policy, which is `start` of the training's cast")
+        if cast.start is None:
+            return init(initial_key(config)), 0.0
+        policy = policy_to_start(cast.start, env, processes.whole.params, config)
+        return start_from(policy, init(initial_key(config)), league), 0.0
     stored = read_file(checkpoint, kind="checkpoint")
     metadata = stored.metadata
     run = checkpoint.parent.parent
