@@ -30,8 +30,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, check, load_yaml, override
 from mqe_jax.envs import TASKS, QuadrupedEnv, VectorEnv, make, register_task
 from mqe_jax.envs.registry import register_scripted
-from mqe_jax.envs.replay import Recording, load_recording, replay, save_recording
-from mqe_jax.export.scene import scene_xml
+from mqe_jax.envs.replay import Recording, load_recording
 from mqe_jax.names import versus
 from mqe_jax.physics import robots
 from mqe_jax.selfplay.league import games, tournament
@@ -46,7 +45,7 @@ from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import register_network
 from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy, save_policy
 from mqe_jax.train.runner import train
-from mqe_jax.viz import clips, curves, recording, render
+from mqe_jax.viz import recording, render
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import fake_env, inputs
 from tests.inputs import refuses
@@ -119,7 +118,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     ("num_envs: ", lambda x, v: make("go1gate", num_envs=v), (NAN, 1.5, 0, True, 10**9, None, [])),
     ("skill_weights: ", lambda x, v: make("go1gate", skill_weights=v), ("a\0b", "", "x" * 300)),
-    ("commands", lambda x, v: make("go1gate", commands=3), (None,)),
     ("num_envs: ", lambda x, v: VectorEnv(x["task"], v), (0, NAN, 1.5, 10**9, "x")),
     ("copies: ", lambda x, v: VectorEnv(x["task"], 2, v), (0, NAN, -1)),
     ("num_envs: ", lambda x, v: VectorEnv(x["task"], 2**17, 2), (None,)),
@@ -140,11 +138,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         "policy: ",
         lambda x, v: _evaluate(x, env=x["matches"], act=mqe_jax.load_policy(v, x["match"])),
         ("idle",),
-    ),
-    (
-        "memory: ",
-        lambda x, v: _evaluate(x, act=mqe_jax.load_policy("forward", x["fake"]), memory=v),
-        (np.zeros(2),),
     ),
     ("env: ", lambda x, v: _evaluate(x, env=v), (None, "go1gate", 3)),
     ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),
@@ -192,12 +185,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("parts: ", lambda x, v: x["matches"].share(v), (0, -1, True, NAN, np.zeros(3))),
     ("num_envs: ", lambda x, v: x["task"].with_num_envs(v), (0, None, True, "x")),
     ("name: ", lambda x, v: x["match"].object_pose(None, v), ("cyl", None, [])),
-    (
-        "obs: ",
-        lambda x, v: load_policy("scripted", x["walks"]).act(v, (), KEY),
-        (None, "x", np.zeros((2, 1, 9)), 3),
-    ),
-    ("data: ", lambda x, v: x["match"].object_pose(v, "cylinder"), (None, 3, KEY)),
     ("num_envs: ", lambda x, v: x["idle"].initial_memory(v), (0, NAN, "x")),
     (
         "key: ",
@@ -241,7 +228,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     (
         "policy: ",
         lambda x, v: mqe_jax.evaluate(x["match"], load_policy("idle", x[v])),
-        ("task", "fake"),
+        ("task",),
     ),
     (
         "opponent: ",
@@ -302,21 +289,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("skill: ", lambda x, v: mqe_jax.train_skill(v, "runs/a"), (None, 3, "walc")),
     ("scenario", lambda x, v: mqe_jax.evaluate_skill("walk", scenarios=v), (3, ["flatt"], [3])),
     ("cells", lambda x, v: mqe_jax.sweep("a.yaml", "runs/a", cells=v), (None, 3, [3])),
-    ("match: ", lambda x, v: TeamEnv(x.get(v, v), "idle"), (None, 3, "matches")),
     ("key: ", lambda x, v: TeamEnv(x["match"], "idle").reset(v), (None, 3)),
-    ("assistance: ", lambda x, v: TeamEnv(x["match"], "idle").reset(KEY, v), LEVELS),
-    (
-        "state: ",
-        lambda x, v: TeamEnv(x["match"], "idle").step(x.get(v, v), jnp.zeros((1, 12))),
-        (None, "state"),
-    ),
-    (
-        "env: ",
-        lambda x, v: recording.record_episodes(x.get(v, v), x["act"], KEY),
-        (None, 3, "matches"),
-    ),
-    ("episode: ", lambda x, v: _render(x, episode=v), (None, 3, [])),
-    ("env: ", lambda x, v: scene_xml(x.get(v, v)), (None, "go1gate", "matches")),
     ("robot: ", lambda x, v: robots.register(v), (None, "go1")),
     ("path: ", lambda x, v: read_curve(v), (None, 3, "", "a\0b")),
     (
@@ -326,10 +299,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     ("env: ", lambda x, v: versus(v, ["idle"]), (None, "go1tug")),
     ("env: ", lambda x, v: Mirror(v), (None, 3)),
-    ("episodes: ", lambda x, v: _record(x, episodes=v), (0, NAN, 1.5, 10**8)),
-    ("seconds: ", lambda x, v: _record(x, seconds=v), (0, NAN, math.inf, -1, 1e-9, "x")),
     ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
-    ("key: ", lambda x, v: _record(x, v), (None, 7)),
     (
         "policy: ",
         lambda x, v: _record(x, act=lambda obs, memory, key: (v, memory)),
@@ -347,9 +317,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     ("size", lambda x, v: _render(x, size=v), ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))),
     ("fps: ", lambda x, v: _render(x, fps=v), (-1, 0, NAN, math.inf, "x")),
-    ("speed: ", lambda x, v: _render(x, speed=v), (0, -1, NAN)),
     ("at: ", lambda x, v: _render(x, path=Path("a.png"), at=v), (NAN, -1)),
-    ("path: ", lambda x, v: _render(x, path=v), (None, 3, "")),
     ("backend: ", lambda x, v: _render(x, backend="x"), (None,)),
     ("view: ", lambda x, v: _render(x, view=v, backend=None), ("x", "")),
     ("episode: ", lambda x, v: _render(x, episode=x["episode"].cut(slice(0, 0))), (None,)),
@@ -409,8 +377,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0"))),
     ),
     ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),
-    ("env: ", lambda x, v: save_recording("a.npz", v, x["states"], KEY), (None, "go1gate")),
-    ("recording: ", lambda x, v: replay(v), (None, "a.npz")),
     (
         "policy: ",
         lambda x, v: tournament.play(x["matches"], v, [], KEY),
@@ -428,23 +394,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     ("results: ", lambda x, v: games.analyse(v), (None, GAMES)),
     ("reference: ", lambda x, v: tournament.rate(GAMES, v), (None, -1, 1, "a")),
-    ("episodes", lambda x, v: recording.best(v), (None, [], [3])),
-    ("episodes", lambda x, v: recording.typical(v), (None, [], [3])),
-    ("episode: ", lambda x, v: render.render_frames(x["fake"], v), (None, 3)),
-    (
-        "frames: ",
-        lambda x, v: clips.write_clip("a.gif", v, 25.0),
-        (None, 3, [], ["x"], [WALLS], [FRAME, FRAME[:8]]),
-    ),
-    ("output", lambda x, v: clips.write_clip(v, [FRAME], 25.0), ("a.txt", "a")),
-    ("Episode: ", lambda x, v: recording.Episode(v, v, v, 0.1), (None, WALLS)),
-    (
-        "dt: ",
-        lambda x, v: recording.Episode(WALLS[:, 0], WALLS[:, :0], np.zeros((3, 0, 4)), v),
-        (None, -1.0, 0),
-    ),
-    ("tables", lambda x, v: curves.plot_curves(v, "a"), (None, [], [3])),
-    ("name: ", lambda x, v: robots.get(v), (None, 3, {}, [])),
     ("not a regular file", lambda x, v: v[0](v[1]), FILES),
 ]
 

@@ -5,7 +5,7 @@ training settings.
 import dataclasses
 import pickle
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +20,7 @@ from mqe_jax.core.settings import (
     PositiveInt,
     Range,
     build,
+    checked,
     fail,
     load_yaml,
     merge,
@@ -254,3 +255,19 @@ def test_parameters_in_training_change_those_that_they_name() -> None:
         {"env": {"rewards.success": 9}},
     ):
         assert override(config, changes).env == {"rewards": {"collision": -5, "success": 9}}
+
+
+def test_arguments_are_checked_by_their_annotations() -> None:
+    """Objects and arrays are not, nor a union with one."""
+
+    @checked
+    def call(
+        count: PositiveInt, path: str | Path = "a", names: Sequence[str] = (), other: Any = None
+    ) -> Any:
+        return count, path, names, other
+
+    number: Any = "3"
+    assert call(number, other=Mapping) == (3, "a", (), Mapping)
+    refuses(r"^count: 0 is not allowed; it must be greater than 0$", call, 0)
+    refuses("^path: ", call, 1, "")
+    refuses(r"^names\.1: ", call, 1, names=["a", 3])

@@ -18,7 +18,7 @@ from mqe_jax.acting.seats import Policy
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
-from mqe_jax.core.settings import check
+from mqe_jax.core.settings import checked
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.registry import task_id
 
@@ -29,11 +29,12 @@ def missing(library: str, error: ImportError) -> InputError:
     return InputError(f"mqe_jax.adapters.{library}: needs the package {library} ({error}); {hint}")
 
 
+@checked
 def task_env(
     task: str | QuadrupedEnv,
     *,
     opponent: str | Path | Policy | None = None,
-    max_steps: int | None = None,
+    max_steps: PositiveInt | None = None,
     limit: str = "max_steps",
     **overrides: Any,
 ) -> Any:
@@ -61,12 +62,11 @@ def task_env(
             raise InputError(f"task: overrides ({given}) need the id of a task, not an environment")
         env = task
     else:
-        steps = check(limit, max_steps, PositiveInt | None)
-        if steps is not None and "episode_length" in overrides:
+        if max_steps is not None and "episode_length" in overrides:
             raise InputError(f"episode_length: give either this or {limit}, not both")
         env = envs.make(name, **names.parameters_of(name, [rival]) | overrides)
-        if steps is not None:
-            env = env.changed({"episode_length": steps * env.dt})
+        if max_steps is not None:
+            env = env.changed({"episode_length": max_steps * env.dt})
     if opponent is None:
         return env
     return TeamEnv(env, names.fit(rival, env, field="opponent", name=str(opponent)))

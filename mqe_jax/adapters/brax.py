@@ -23,7 +23,7 @@ from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments
+from mqe_jax.core.settings import checked
 from mqe_jax.core.types import RandomKeys
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
@@ -78,7 +78,6 @@ class Env(BraxEnv):
     @single
     def step(self, state: State, action: jax.Array) -> State:
         """Advances by one environment step; raises an InputError for an action of another size."""
-        check("state", state, State)
         if jnp.shape(action) != (self.action_size,):
             raise InputError(
                 f"action: shape {jnp.shape(action)}; expected ({self.action_size},), agents * "
@@ -119,14 +118,14 @@ class AutoReset(Wrapper):
     """
 
     @single
-    @check_arguments(rng=RandomKeys)
-    def reset(self, rng: jax.Array) -> State:
+    @checked
+    def reset(self, rng: RandomKeys) -> State:
         return self.env.reset(rng)
 
     @single
     def step(self, state: State, action: jax.Array) -> State:
         """Steps the batch, then resets the environments whose episodes ended."""
-        shape = (*jnp.shape(check("state", state, State).done), self.action_size)
+        shape = (*jnp.shape(state.done), self.action_size)
         if jnp.shape(action) != shape:
             raise InputError(
                 f"action: shape {jnp.shape(action)}; expected {shape}, environments and all actions"
@@ -147,11 +146,11 @@ class AutoReset(Wrapper):
         return after.replace(pipeline_state=own, obs=obs)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@check_arguments(episode_length=PositiveInt, action_repeat=PositiveInt)
+@checked
 def wrap(
     env: BraxEnv,
-    episode_length: int = 1000,
-    action_repeat: int = 1,
+    episode_length: PositiveInt = 1000,
+    action_repeat: PositiveInt = 1,
     randomization_fn: Callable[..., Any] | None = None,
 ) -> Wrapper:
     """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, new episodes."""

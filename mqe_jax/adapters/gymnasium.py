@@ -9,7 +9,7 @@ metrics of the step and, as `info["agent_rewards"]`, the rewards of all agents (
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -21,8 +21,8 @@ from mqe_jax import envs
 from mqe_jax.adapters import task_env, team_reward
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import Environments, Seed
-from mqe_jax.core.settings import check, check_arguments, fail
+from mqe_jax.core.limits import Environments, Pixels, PositiveInt, Seed
+from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.envs import QuadrupedEnv
 
 
@@ -47,12 +47,13 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         task: str | QuadrupedEnv,
         *,
-        render_mode: str | None = None,
-        render_size: tuple[int, int] = RENDER_SIZE,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_size: tuple[Pixels, Pixels] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
         """Creates the environment of a task's id, or adapts a given one.
@@ -66,9 +67,9 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = self.env.observation_space
         self._host = HostEnvs(self.env, 1, render_mode, render_size)
 
-    @check_arguments(seed=Seed | None, options=Mapping | None)
+    @checked
     def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+        self, *, seed: Seed | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode; without a seed the PRNG stream continues."""
         super().reset(seed=seed)
@@ -95,15 +96,16 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     automatic resets too.
     """
 
+    @checked
     def __init__(
         self,
         task: str | QuadrupedEnv,
-        num_envs: int = 1,
+        num_envs: Environments = 1,
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        render_size: tuple[int, int] = RENDER_SIZE,
+        max_episode_steps: PositiveInt | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_size: tuple[Pixels, Pixels] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
         """Creates N environments; other arguments as those of `SingleEnv`.
@@ -118,7 +120,6 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             allowed = ", ".join(mode.value for mode in AutoresetMode)
             fail("autoreset_mode", autoreset_mode, f"one of {allowed}")
         self.render_mode = render_mode
-        num_envs = check("num_envs", num_envs, Environments)
         if not isinstance(task, QuadrupedEnv):
             overrides = {"num_envs": num_envs, **overrides}
         self.env = task_env(
@@ -133,11 +134,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._host = HostEnvs(self.env, num_envs, render_mode, render_size)
         self._ended = np.zeros(num_envs, bool)  # environments that the next step resets
 
-    @check_arguments(options=Mapping | None)
+    @checked
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: int | Sequence[int | None] | np.ndarray | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts episodes, of the environments that `options["reset_mask"]` (N,) bool selects.

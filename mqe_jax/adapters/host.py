@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from mqe_jax.acting.seats import Seats
 from mqe_jax.adapters import select
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import Environments, Pixels, Seed
+from mqe_jax.core.limits import Seed
 from mqe_jax.core.settings import check, fail
 from mqe_jax.envs import State
 from mqe_jax.viz.cameras import default_camera
@@ -67,14 +67,11 @@ class HostEnvs:
         render_mode: str | None = None,
         render_size: tuple[int, int] = RENDER_SIZE,
     ) -> None:
-        num_envs = check("num_envs", num_envs, Environments)
-        width, height = check("render_size", render_size, tuple[Pixels, Pixels])
-        check("render_mode", render_mode, Literal["rgb_array"] | None)
         self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.state: State | None = None
         self._mode = render_mode
-        self._size = (width, height)
+        self._size = render_size
         self._camera: Camera | None = None
         self._task = self.env.match if isinstance(self.env, TeamEnv) else self.env
         self._seats = self.env.seats if isinstance(self.env, TeamEnv) else None

@@ -20,7 +20,7 @@ from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError, short_repr
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments, fail
+from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
@@ -67,7 +67,7 @@ class Env(MultiAgentEnv):
     and the metrics. Dones are true on termination and on truncation.
     """
 
-    @check_arguments(discrete=bool)
+    @checked
     def __init__(
         self, task: str | QuadrupedEnv, *, discrete: bool = False, **overrides: Any
     ) -> None:
@@ -96,19 +96,19 @@ class Env(MultiAgentEnv):
     def name(self) -> str:
         return self.env.name
 
-    @check_arguments(key=RandomKey)
+    @checked
     @functools.partial(jax.jit, static_argnums=0)
     @single
     def reset(  # pyright: ignore[reportIncompatibleVariableOverride]
-        self, key: jax.Array
+        self, key: RandomKey
     ) -> tuple[Arrays, State]:
         state = self.env.reset(key)
         return self.get_obs(state), state
 
-    @check_arguments(key=RandomKey, actions=Mapping)
+    @checked
     def step(  # pyright: ignore[reportIncompatibleVariableOverride]
         self,
-        key: jax.Array,
+        key: RandomKey,
         state: State,
         actions: Mapping[str, jax.Array],
         reset_state: State | None = None,
@@ -118,9 +118,6 @@ class Env(MultiAgentEnv):
         It becomes `reset_state` if that is passed. The base class selects between whole states, but
         on Warp all environments share contact buffers.
         """
-        for one in (state, reset_state):
-            if one is not None:
-                self.env.check_state(one)
         return self._step(key, state, self._checked(actions), reset_state)
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -141,9 +138,9 @@ class Env(MultiAgentEnv):
         return self.get_obs(after), after, rewards, dones, infos
 
     @single
-    @check_arguments(key=RandomKey, state=State, actions=Mapping)
+    @checked
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, key: jax.Array, state: State, actions: Mapping[str, jax.Array]
+        self, key: RandomKey, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
         """Advances by one environment step without a reset; the key replaces the state's key."""
         action = jnp.stack([self._continuous(action) for action in self._checked(actions).values()])
@@ -157,10 +154,8 @@ class Env(MultiAgentEnv):
 
     def get_obs(self, state: State) -> Arrays:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Returns the agents' observations (O,)."""
-        self.env.check_state(state)
         return {agent: state.obs[i] for i, agent in enumerate(self.agents)}
 
-    @check_arguments(state=State)
     @functools.partial(jax.jit, static_argnums=0)
     def get_avail_actions(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, state: State
@@ -171,7 +166,6 @@ class Env(MultiAgentEnv):
 
     def get_world_state(self, state: State) -> jax.Array:
         """Returns the privileged observation (P,), for centralised critics."""
-        self.env.check_state(state)
         return state.privileged_obs
 
     def world_state_size(self) -> int:

@@ -18,8 +18,8 @@ from mqe_jax import names
 from mqe_jax.acting.seats import Policy, Seat, Seats, actor_of
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments
-from mqe_jax.core.types import AnySingle, Level, Memory, Observations, RandomKey
+from mqe_jax.core.settings import check, checked
+from mqe_jax.core.types import Level, Memory, Observations, RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.match import team_view
 from mqe_jax.envs.observation import box
@@ -45,7 +45,6 @@ class TeamEnv:
     else the match's.
     """
 
-    @check_arguments(match=AnySingle)
     def __init__(self, match: QuadrupedEnv, opponent: str | Path | Policy) -> None:
         """Creates the environment; `opponent` is a policy, or what `load_policy` accepts.
 
@@ -103,8 +102,8 @@ class TeamEnv:
         return other
 
     @single
-    @check_arguments(key=RandomKey, assistance=Level)
-    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamEnvState:
+    @checked
+    def reset(self, key: RandomKey, assistance: Level = 0.0) -> TeamEnvState:
         """Returns a randomised initial state; see `QuadrupedEnv.reset`."""
         return with_final(self.with_observations(self.begin(key, assistance)))
 

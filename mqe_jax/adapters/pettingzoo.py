@@ -16,7 +16,8 @@ from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.core.errors import InputError, short_repr
-from mqe_jax.core.settings import check, check_arguments
+from mqe_jax.core.limits import Pixels, PositiveInt, Seed
+from mqe_jax.core.settings import check, checked
 from mqe_jax.envs import QuadrupedEnv
 
 try:
@@ -67,13 +68,14 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         "is_parallelizable": True,
     }
 
+    @checked
     def __init__(
         self,
         task: str | QuadrupedEnv = "go1gate",
         *,
-        max_cycles: int | None = None,
-        render_mode: str | None = None,
-        render_size: tuple[int, int] = RENDER_SIZE,
+        max_cycles: PositiveInt | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_size: tuple[Pixels, Pixels] = RENDER_SIZE,
         **overrides: Any,
     ) -> None:
         """Creates the environment of a task's id, or adapts a given one.
@@ -114,9 +116,9 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         """Returns the space of an agent's action (action_size,), in [-1, 1]."""
         return self._action_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
-    @check_arguments(options=Mapping | None)
+    @checked
     def reset(
-        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+        self, seed: Seed | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Starts an episode; without a seed the PRNG stream continues."""
         obs = self._host.reset([seed], self._generator)[0]

@@ -24,8 +24,6 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import PositiveInt
-from mqe_jax.core.settings import check
 from mqe_jax.core.types import PyTree
 
 AXIS = "processes"
@@ -140,7 +138,7 @@ def share(name: str, count: int, parts: int) -> int:
 
     InputError, naming the setting, for a fraction.
     """
-    if count % check("parts", parts, PositiveInt):
+    if count % parts:
         raise InputError(
             f"{name}: {count} is not allowed; it must be a multiple of the number of processes, "
             f"{parts}"

@@ -15,6 +15,7 @@ a plain `float` or `int`. Numpy scalars are numbers, and so are strings such as 
 does not read as a number. Booleans and bytes are not. For an optional field, "none" means None.
 """
 
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -150,7 +151,7 @@ def _expand_home(value: Any) -> Any:
     return type(value)(expanded)
 
 
-PathText = Annotated[Any, pydantic.AfterValidator(_path)]
+PathText = Annotated[str | Path, pydantic.PlainValidator(_path)]
 """A path, or a text that is one."""
 FileName = Annotated[str, pydantic.AfterValidator(_path)]
 """A text that is a path."""
@@ -165,6 +166,59 @@ def is_text(value: str) -> bool:
     return len(value) <= limits.TEXT and not any(
         ord(x) < 32 or 0xD800 <= ord(x) < 0xE000 for x in value
     )
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Makes a public function check its arguments against their annotations, as settings are.
+
+    Checked are texts, numbers, booleans, paths, functions, sequences and mappings of these,
+    settings classes, and what has a validator. Arrays and other objects are not.
+    """
+    signature = inspect.signature(function)
+
+    @functools.cache  # when the function is called, whatever its annotations name is defined
+    def kinds() -> dict[str, Any]:
+        return _kinds_of(function)
+
+    @functools.wraps(function)
+    def call(*given: P.args, **named: P.kwargs) -> R:
+        bound = signature.bind(*given, **named)
+        for name, kind in kinds().items():
+            if name in bound.arguments:
+                bound.arguments[name] = check(name, bound.arguments[name], kind)
+        return function(*bound.args, **bound.kwargs)
+
+    return call
+
+
+def _kinds_of(function: Callable[..., Any]) -> dict[str, Any]:
+    """Returns the kinds of the arguments that `checked` checks."""
+    kinds = {}
+    scope = inspect.unwrap(function).__globals__  # pyright: ignore[reportAttributeAccessIssue]
+    for name, parameter in inspect.signature(function).parameters.items():
+        hint = parameter.annotation
+        if isinstance(hint, str):
+            with contextlib.suppress(NameError):  # of a class that type checkers alone import
+                hint = eval(hint, scope)
+        parts = typing.get_args(hint) or (hint,)
+        if Path in parts and {*parts} <= {str, Path, types.NoneType}:
+            hint = PathText if types.NoneType not in parts else typing.Optional[PathText]  # noqa: UP045
+        if _is_data(hint) and parameter.kind is not inspect.Parameter.VAR_KEYWORD:
+            kinds[name] = hint
+    return kinds
+
+
+def _is_data(hint: Any) -> bool:
+    """Returns whether an annotation is one of data, which the kinds of settings describe."""
+    origin = typing.get_origin(hint)
+    parts = typing.get_args(hint)
+    if origin in (Annotated, Literal, Callable):
+        return True
+    if origin is Mapping and parts[1] is Any:
+        return _is_data(parts[0])
+    if origin in (typing.Union, types.UnionType, tuple, list, Sequence, Mapping):
+        return Path not in parts and all(map(_is_data, parts))
+    return hint in (str, int, float, bool, types.NoneType, Ellipsis) or is_settings(hint)
 
 
 def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -83,9 +83,9 @@ def _having(names: str, allowed: str, *, lacks: str = "", callables: bool = Fals
 _ENV = "name num_agents action_size reset step"
 _POLICY = "a policy, such as that of mqe_jax.load_policy"
 _ACT = f"{_POLICY}, or a function act(obs, memory, key)"
-RandomKey = Annotated[Any, pydantic.AfterValidator(_key)]
-RandomKeys = Annotated[Any, pydantic.AfterValidator(_keys)]  # one for each environment of a batch
-Level = Annotated[Any, pydantic.AfterValidator(_level)]  # of a curriculum, in [0, 1]
+RandomKey = Annotated[jax.Array, pydantic.PlainValidator(_key)]
+RandomKeys = Annotated[jax.Array, pydantic.PlainValidator(_keys)]  # of each environment of a batch
+Level = Annotated[jax.Array | float, pydantic.PlainValidator(_level)]  # of a curriculum, in [0, 1]
 AnyEnvironment = Annotated[Any, _having(_ENV, "an environment, such as that of mqe_jax.make")]
 AnySingle = Annotated[
     Any, _having(_ENV, "one environment, such as that of mqe_jax.make", lacks="num_envs")

@@ -4,7 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mqe_jax.core.limits import Environments
-from mqe_jax.core.settings import check_arguments, override
+from mqe_jax.core.settings import checked, override
 from mqe_jax.envs.registry import ALIASES, SCRIPTED, TASKS, register_task, task_id
 
 if TYPE_CHECKING:
@@ -41,13 +41,13 @@ def tasks() -> tuple[str, ...]:
     return tuple(TASKS)
 
 
-@check_arguments(task=str, impl=str, control=str, num_envs=Environments)
+@checked
 def make(
     task: str,
     *,
     impl: str = "auto",
     control: str = "command",
-    num_envs: int = 4096,
+    num_envs: Environments = 4096,
     **overrides: Any,
 ) -> "QuadrupedEnv":
     """Creates the environment of a task.

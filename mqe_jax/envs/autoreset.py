@@ -14,7 +14,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, PositiveInt
 from mqe_jax.core.memory import bytes_of, check_memory
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check_arguments, fail
+from mqe_jax.core.settings import checked, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import FINAL, State, with_final
@@ -117,9 +117,14 @@ class VectorEnv(EnvBatch):
     groups: tuple[str, ...] = ("policy",)
     """Groups that are observed, `policy` among them."""
 
-    @check_arguments(num_envs=Environments, copies=PositiveInt)
+    @checked
     def __init__(
-        self, env: QuadrupedEnv, num_envs: int, copies: int = 1, *, final: Sequence[str] = FINAL
+        self,
+        env: QuadrupedEnv,
+        num_envs: Environments,
+        copies: PositiveInt = 1,
+        *,
+        final: Sequence[str] = FINAL,
     ) -> None:
         """Creates the batch.
 
@@ -162,14 +167,15 @@ class VectorEnv(EnvBatch):
         other.groups = tuple(name for name in self.group_sizes if name in wanted)
         return other
 
-    @check_arguments(key=RandomKey)
-    def reset(self, key: jax.Array) -> State:
+    @checked
+    def reset(self, key: RandomKey) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
         return jax.vmap(self._reset)(
             devices.rows(lambda n: jax.random.split(key, n), self.num_envs)
         )
 
-    def share(self, parts: int) -> Self:
+    @checked
+    def share(self, parts: PositiveInt) -> Self:
         """Returns the batch of one of several processes; InputError if the environments do not
         divide evenly.
         """

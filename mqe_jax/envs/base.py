@@ -23,14 +23,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, results, weights_of
-from mqe_jax.core.settings import (
-    Parameters,
-    check,
-    check_arguments,
-    differences,
-    fail,
-    override,
-)
+from mqe_jax.core.settings import Parameters, check, checked, differences, fail, override
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.assembly import make_controller, make_scene
 from mqe_jax.envs.observation import ObservationLayout, finite
@@ -84,13 +77,14 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
     _later: tuple[str, ...] = ()  # attributes that were set after it
 
     @single
+    @checked
     def __init__(
         self,
         params: P | None = None,
         *,
         impl: str = "auto",
         control: str = "command",
-        num_envs: int = 4096,
+        num_envs: Environments = 4096,
     ) -> None:
         self.params = self.Params() if params is None else params
         self.weights = weights_of(self.params)
@@ -102,7 +96,6 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
                 offset,
                 "0 with control torque, which has no joint targets",
             )
-        num_envs = check("num_envs", num_envs, Environments)
         self.num_agents = self.params.num_agents
         self.robot = robots.get(self.params.robot)
         check_sizes(self)
@@ -201,8 +194,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         """
         return self.changed({}, num_envs)
 
-    @check_arguments(params=Parameters, num_envs=Environments)
-    def changed(self, params: Mapping[str, Any], num_envs: int = 1) -> QuadrupedEnv[S, P]:
+    @checked
+    def changed(self, params: Parameters, num_envs: Environments = 1) -> QuadrupedEnv[S, P]:
         """Returns an environment with other parameters, whose engine holds `num_envs` environments.
 
         It is this one if nothing differs. Another one is made with the arguments of this one's
@@ -260,8 +253,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         return type(self)(**arguments)
 
     @single
-    @check_arguments(key=RandomKey, assistance=Level)
-    def reset(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
+    @checked
+    def reset(self, key: RandomKey, assistance: Level = 0.0) -> State[S]:
         """Returns a randomised initial state; the task is unmodified at `assistance` 0, a
         curriculum level up to 1.
         """
@@ -480,9 +473,6 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         InputError if unknown.
         """
         check("name", name, Literal[tuple(self.objects)])
-        qpos: Any = getattr(data, "qpos", None)
-        if np.shape(qpos)[-1:] != (self.compiled.model.nq,):
-            fail("data", data, "the data of a state of this task")
         return jnp.concatenate(
             poses(self.compiled.model, data, [self.objects[name].body]), axis=-1
         )[0]

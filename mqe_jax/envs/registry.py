@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from mqe_jax.core.errors import InputError, known_name
-from mqe_jax.core.settings import check_arguments, fail
+from mqe_jax.core.settings import checked, fail
 
 if TYPE_CHECKING:
     import jax
 
     from mqe_jax.envs.base import QuadrupedEnv
 
-ScriptedPolicy: TypeAlias = "Callable[[dict[str, jax.Array]], jax.Array]"
+ScriptedPolicy: TypeAlias = Callable[[dict[str, "jax.Array"]], "jax.Array"]
 """Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the
 `command` mode."""
 
@@ -162,7 +162,7 @@ NAMED_SCRIPTED: dict[str, dict[str, ScriptedPolicy | str]] = {
 as in `SCRIPTED`."""
 
 
-@check_arguments(task=str, name=str, policy=Callable)
+@checked
 def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
     """Registers a further scripted policy of a task under a name that no other one has.
 
@@ -181,7 +181,7 @@ def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
         raise InputError(f"policy: the name {name!r} is already registered for {task}")
 
 
-@check_arguments(scripted=Callable | None)
+@checked
 def register_task(
     task: type[QuadrupedEnv], scripted: ScriptedPolicy | None = None
 ) -> type[QuadrupedEnv]:

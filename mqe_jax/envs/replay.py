@@ -13,8 +13,7 @@ import numpy as np
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import archive, parse_json, write_atomically
-from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, fail, to_mapping
-from mqe_jax.core.types import AnySingle
+from mqe_jax.core.settings import Parameters, check, checked, fail, to_mapping
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.physics.engines import STATE_FIELDS
@@ -57,7 +56,6 @@ class Recording:
         return make(self.task, impl=impl, control=self.control, num_envs=1, **self.params)
 
 
-@check_arguments(file=PathText, env=AnySingle)
 def save_recording(
     file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array
 ) -> None:
@@ -81,7 +79,7 @@ def save_recording(
     write_atomically(pathlib.Path(file), buffer.getvalue())
 
 
-@check_arguments(file=PathText)
+@checked
 def load_recording(file: str | pathlib.Path) -> Recording:
     """Reads a recording; InputError if the file is missing, damaged or not a recording."""
     path = pathlib.Path(file)
@@ -101,7 +99,6 @@ def load_recording(file: str | pathlib.Path) -> Recording:
             raise ValueError(error) from None
 
 
-@check_arguments(recording=Recording, env=AnySingle | None)
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
     """Replays a recording, by default on the recorded engine; returns the states after each action
     (T, ...).

@@ -28,8 +28,6 @@ import onnx
 import mqe_jax
 from mqe_jax import skills
 from mqe_jax.acting.seats import check_policy
-from mqe_jax.core.settings import check_arguments
-from mqe_jax.core.types import AnyTrained
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
@@ -41,7 +39,6 @@ SENSED = ("gravity", "joint_position", "joint_velocity")
 """Inputs of a skill that are its robot's `Proprioception`, in this order."""
 
 
-@check_arguments(policy=AnyTrained, env=QuadrupedEnv)
 def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of a policy with its mean actions.
 

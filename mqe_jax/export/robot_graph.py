@@ -18,8 +18,8 @@ import onnx
 
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import check_arguments, fail, to_mapping
-from mqe_jax.core.types import AnyTrained, observations
+from mqe_jax.core.settings import fail, to_mapping
+from mqe_jax.core.types import observations
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors
 from mqe_jax.export.policy import properties
@@ -28,7 +28,6 @@ from mqe_jax.export.translate import translate
 from mqe_jax.train.policy import TrainedPolicy
 
 
-@check_arguments(policy=AnyTrained, env=QuadrupedEnv)
 def robot_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of any robot of a policy's team.
 

@@ -19,7 +19,7 @@ import numpy as np
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_file, parse_json, parsing
-from mqe_jax.core.settings import PathText, build, check_arguments, fail
+from mqe_jax.core.settings import build, checked, fail
 from mqe_jax.core.types import Memory, Observations
 from mqe_jax.export.robot import Robot, read_frame, write_frame
 from mqe_jax.train.config import TrainConfig
@@ -158,8 +158,8 @@ class _Process:
 
 
 @contextlib.contextmanager
-@check_arguments(file=PathText, seed=limits.Seed)
-def open_team(file: str | Path, seed: int = 0) -> Iterator[RobotTeam]:
+@checked
+def open_team(file: str | Path, seed: limits.Seed = 0) -> Iterator[RobotTeam]:
     """Starts the processes of a team of robots that share one file, and yields its policy.
 
     `mqe export` writes such a file with `--per-robot`.

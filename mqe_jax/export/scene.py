@@ -4,14 +4,12 @@ from typing import Any
 
 import mujoco
 
-from mqe_jax.core.settings import check_arguments
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import ROBOT_COLORS
 from mqe_jax.physics.robots import motors
 from mqe_jax.physics.scene import build_spec
 
 
-@check_arguments(env=QuadrupedEnv)
 def scene_xml(env: QuadrupedEnv) -> str:
     """Returns the MJCF of the task's rendering model, with six significant digits.
 
@@ -29,7 +27,6 @@ def scene_xml(env: QuadrupedEnv) -> str:
     return spec.to_xml()
 
 
-@check_arguments(env=QuadrupedEnv)
 def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     """Returns plain numbers, lists and mappings, in m, rad, s and N.
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError, known_name, nearest
-from mqe_jax.core.settings import check_arguments, fail
+from mqe_jax.core.settings import fail
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
 
@@ -253,7 +253,6 @@ def register(skill: type[S]) -> type[S]:
     return skill
 
 
-@check_arguments(name=str | Sequence[str], robot=Robot)
 def make(name: str | Sequence[str], robot: Robot) -> Skill:
     """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with
     the nearest one.

@@ -21,7 +21,6 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_locks, linear_layers, read_tensors, write_atomically
-from mqe_jax.core.settings import PathText, check
 from mqe_jax.physics.robots.robot import Robot
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
@@ -95,7 +94,7 @@ class Networks:
             InputError: if the file is missing, damaged, or holds other names or shapes.
         """
         shipped = ASSETS / f"{self.skill}_{robot.walk.weights}.safetensors"
-        file = pathlib.Path(check("weights", path, PathText)) if path is not None else shipped
+        file = shipped if path is None else pathlib.Path(path)
         train = f"train it with 'mqe skill train {self.skill} --robot {robot.name}'"
         if not file.is_file() and path is None:
             raise InputError(

@@ -13,8 +13,7 @@ from PIL import Image
 from mqe_jax.core import files
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import replacing
-from mqe_jax.core.limits import Positive
-from mqe_jax.core.settings import PathText, check_arguments, fail
+from mqe_jax.core.settings import fail
 
 SUFFIXES = (".mp4", ".webp", ".gif", ".png")
 
@@ -44,34 +43,15 @@ def check_output(
     return path
 
 
-@check_arguments(path=PathText, frames=Iterable, fps=Positive)
-def write_clip(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:
+def write_clip(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Writes frames (H, W, 3) uint8 as .mp4, .webp, .gif or .png (the last frame), atomically."""
-    file = check_output(Path(path))
-    checked = _check_frames(frames)
+    file = check_output(path)
     suffix = file.suffix.lower()
     with replacing(file) as temporary:
         if suffix == ".mp4":
-            _write_mp4(temporary, checked, fps)
+            _write_mp4(temporary, iter(frames), fps)
         else:
-            _write_images(temporary, [Image.fromarray(frame) for frame in checked], suffix, fps)
-
-
-def _check_frames(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yields at least one frame, each (H, W, 3) uint8, as the first."""
-    first = None
-    for index, frame in enumerate(frames):
-        shape = getattr(frame, "shape", ())
-        dtype = getattr(frame, "dtype", type(frame).__name__)
-        first = first or shape
-        if dtype != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape or shape != first:
-            expected = "(H, W, 3)" if shape == first else str(first)
-            raise InputError(
-                f"frames: frame {index} is {dtype} {shape}; it must be uint8 {expected}"
-            )
-        yield np.asarray(frame)
-    if first is None:
-        raise InputError("frames: there are none")
+            _write_images(temporary, [Image.fromarray(frame) for frame in frames], suffix, fps)
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:

@@ -4,16 +4,14 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-from annotated_types import MinLen
 from numpy.typing import ArrayLike
 
 from mqe_jax.core.files import replacing
 from mqe_jax.core.literal import to_label
-from mqe_jax.core.settings import check_arguments
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.viz.geometry import (
     box_corners,
@@ -43,7 +41,6 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
     return [float(window.mean()) if window.size else math.nan for window in finite]
 
 
-@check_arguments(tables=Annotated[Sequence[Mapping[str, Any]], MinLen(1)], title=str)
 def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> "Figure":
     """Returns a figure of average step reward (else return) and success over environment steps.
 

@@ -2,19 +2,17 @@
 
 import dataclasses
 import functools
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from annotated_types import MinLen
 
 from mqe_jax.acting.seats import Act, Policy, Seats
-from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import CLIP_BYTES, Candidates, ClipLength, Positive
+from mqe_jax.core.limits import CLIP_BYTES
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments, fail
-from mqe_jax.core.types import AnySingle, PolicyOrAct, RandomKey, observations
+from mqe_jax.core.settings import fail
+from mqe_jax.core.types import observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.suite import ONBOARD
@@ -43,17 +41,6 @@ class Episode:
     marks: tuple[Marks, ...] = ()
     """What the agents sense, if it is recorded; arrays (T, A, ...)."""
 
-    def __post_init__(self) -> None:
-        shapes = [getattr(x, "shape", ()) for x in (self.qpos, self.mocap_pos, self.mocap_quat)]
-        bodies = (*shapes[0][:1], *shapes[1][1:2])
-        if len(shapes[0]) != 2 or shapes[1:] != [(*bodies, 3), (*bodies, 4)]:
-            allowed = "(T, nq), (T, M, 3) and (T, M, 4)"
-            raise InputError(
-                f"Episode: qpos, mocap_pos and mocap_quat have the shapes {shapes}; expected "
-                f"{allowed}"
-            )
-        check("dt", self.dt, Positive)
-
     def __len__(self) -> int:
         return len(self.qpos)
 
@@ -68,14 +55,6 @@ class Episode:
 
 
 @single
-@check_arguments(
-    "sensors",
-    env=AnySingle,
-    policy=PolicyOrAct,
-    key=RandomKey,
-    episodes=Candidates,
-    seconds=ClipLength,
-)
 def record_episodes(
     env: QuadrupedEnv,
     policy: Seats | Policy | Act,
@@ -175,13 +154,11 @@ def record_episodes(
     return recorded
 
 
-@check_arguments(episodes=Annotated[list[Episode], MinLen(1)])
 def best(episodes: list[Episode]) -> Episode:
     """Returns the best episode: by success, then by average step reward."""
     return max(episodes, key=lambda episode: (episode.success, episode.reward))
 
 
-@check_arguments(episodes=Annotated[list[Episode], MinLen(1)])
 def typical(episodes: list[Episode]) -> Episode:
     """Returns the median of the successful episodes, else of all.
 

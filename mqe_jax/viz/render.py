@@ -19,8 +19,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
-from mqe_jax.core.settings import PathText, check_arguments
-from mqe_jax.core.types import AnySingle
+from mqe_jax.core.settings import checked
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GROUND_GROUP
 from mqe_jax.physics.appearance.grounds import GROUND_MATERIAL
@@ -159,11 +158,6 @@ def _draw_gl(
             yield renderer.render()
 
 
-_SIZE = tuple[Pixels, Pixels]
-_BACKEND = Literal["auto", "egl", "osmesa"] | None
-
-
-@check_arguments(env=AnySingle, episode=Episode, size=_SIZE, backend=_BACKEND)
 def render_frames(
     env: QuadrupedEnv,
     episode: Episode,
@@ -176,7 +170,6 @@ def render_frames(
     `views` holds a camera for each frame, by default those of the view `scene`. `backend` is `auto`
     (from `gl_backend`), `egl`, `osmesa`, or None for matplotlib's top view.
     """
-    _check_fits(env, episode)
     model = rendering_model(env.mj_model, episode)
     backend = gl_backend() if backend == "auto" else backend
     if backend is None:
@@ -200,9 +193,7 @@ def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
         raise InputError("episode: its coordinates hold NaN or infinite numbers")
 
 
-@check_arguments(
-    "episode", "view", "size", "fps", "speed", "at", env=AnySingle, path=PathText, backend=_BACKEND
-)
+@checked
 def render_episode(
     env: QuadrupedEnv,
     episode: Episode,
@@ -213,7 +204,7 @@ def render_episode(
     fps: FrameRate | None = None,
     speed: Speed = 1.0,
     at: Time | None = None,
-    backend: str | None = "auto",
+    backend: Literal["auto", "egl", "osmesa"] | None = "auto",
 ) -> str:
     """Renders an episode to a file, in the format of its suffix, and returns the renderer's name.
 
@@ -241,8 +232,8 @@ def render_episode(
     suffix = path.suffix.lower()
     size = size or {".mp4": (960, 540), ".png": (1280, 720)}.get(suffix, (480, 270))
     fps = fps or (25.0 if suffix == ".mp4" else 12.5)
-    backend = gl_backend() if backend == "auto" else backend
-    if backend is None:
+    chosen = gl_backend() if backend == "auto" else backend
+    if chosen is None:
         text = "mqe: no GL library, rendered from above instead; for 3-D images install"
         print(text, GL_PACKAGES, file=sys.stderr)
     shown = slice(None)
@@ -262,9 +253,9 @@ def render_episode(
         view = "scene" if suffix == ".png" else "follow"
     model = rendering_model(env.mj_model, episode)
     views = cameras(model, episode, view, size[0] / size[1])
-    if backend is None:
+    if chosen is None:
         frames = draw_top(model, episode, size, shown)
     else:
-        frames = _draw_gl(model, episode.cut(shown), views[shown], size, backend)
+        frames = _draw_gl(model, episode.cut(shown), views[shown], size, chosen)
     write_clip(path, map(legend(env, size, episode.marks), frames), fps)
-    return backend or "matplotlib"
+    return chosen or "matplotlib"

@@ -15,7 +15,7 @@ from mqe_jax import walk_policy
 from mqe_jax.core.errors import known_name
 from mqe_jax.core.limits import Environments, Seed
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, check_arguments
+from mqe_jax.core.settings import checked
 from mqe_jax.physics import robots
 from mqe_jax.physics.robots.index import Proprioception, foot_positions
 from mqe_jax.physics.robots.robot import Robot
@@ -266,17 +266,15 @@ def _frequency(height: np.ndarray) -> float:
     return float(np.median(frequency[usable][np.argmax(spectrum[usable], axis=0)]))
 
 
-@check_arguments(
-    "skill", "robot", "impl", "scenarios", weights=PathText | None, episodes=Environments, seed=Seed
-)
+@checked
 def evaluate_skill(
     skill: str,
     weights: str | Path | None = None,
     *,
     robot: str = "go1",
     impl: str = "auto",
-    episodes: int = 1000,
-    seed: int = 0,
+    episodes: Environments = 1000,
+    seed: Seed = 0,
     scenarios: Sequence[str] | None = None,
     report: Callable[[str, dict[str, float]], None] | None = None,
 ) -> dict[str, Any]:

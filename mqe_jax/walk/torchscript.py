@@ -9,7 +9,6 @@ becomes a plain object that keeps its attributes.
 
 import io
 import math
-import os
 import pickle
 import re
 import zipfile
@@ -20,7 +19,7 @@ import numpy as np
 
 from mqe_jax.core import limits
 from mqe_jax.core.files import archive
-from mqe_jax.core.settings import PathText, check_arguments
+from mqe_jax.core.settings import checked
 from mqe_jax.walk_policy import NETWORKS, Params
 
 _DTYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2"}
@@ -102,8 +101,8 @@ class _Unpickler(_PurePython):
         return tensor
 
 
-@check_arguments(path=PathText)
-def read_torchscript(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+@checked
+def read_torchscript(path: str | Path) -> dict[str, np.ndarray]:
     """Returns the float32 tensors of a scripted or traced `Sequential` by names such as 0.weight.
 
     InputError for another file or one beyond the limits. The layers must be linear, with an ELU
@@ -152,7 +151,7 @@ def _parts(name: str, module: Any, kind: str) -> dict[str, Any]:
     return {key: value for key, value in vars(module).items() if key not in own}
 
 
-def convert(adaptation: str | os.PathLike[str], body: str | os.PathLike[str]) -> Params:
+def convert(adaptation: str | Path, body: str | Path) -> Params:
     """Reads the official pair of TorchScript checkpoints into this package's weights."""
     flat = {f"adaptation.{name}": value for name, value in read_torchscript(adaptation).items()}
     flat |= {f"body.{name}": value for name, value in read_torchscript(body).items()}

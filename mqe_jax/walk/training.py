@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from mqe_jax.core.settings import PathText, check_arguments, fail, override, to_mapping
+from mqe_jax.core.settings import checked, fail, override, to_mapping
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.physics import robots
 from mqe_jax.train.config import (
@@ -81,9 +81,7 @@ SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {
 """Settings and task of each skill that can be trained."""
 
 
-@check_arguments(
-    "skill", "config", "task", "robot", "impl", "resume", run_dir=PathText, weights=PathText | None
-)
+@checked
 def train_skill(
     skill: str,
     run_dir: str | Path,

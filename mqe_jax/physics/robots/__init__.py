@@ -1,7 +1,7 @@
 """Robots: their type, data, body tree, index tables and kinematics, and their registry by name."""
 
 from mqe_jax.core.errors import InputError, known_name
-from mqe_jax.core.settings import check_arguments
+from mqe_jax.core.settings import fail
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.go2 import GO2
 from mqe_jax.physics.robots.robot import Robot
@@ -9,15 +9,15 @@ from mqe_jax.physics.robots.robot import Robot
 ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
 
 
-@check_arguments(name=str)
 def get(name: str) -> Robot:
     """Returns a robot by name; InputError for an unknown name, with the nearest known one."""
     return ROBOTS[known_name("robot: unknown name", name, ROBOTS)]
 
 
-@check_arguments(robot=Robot)
 def register(robot: Robot) -> Robot:
     """Registers a robot under its name, for `mqe_jax.make(task, robot=name)`, and returns it."""
+    if not isinstance(robot, Robot):
+        fail("robot", robot, "a Robot")
     if ROBOTS.setdefault(robot.name, robot) is not robot:
         raise InputError(f"robot: the name {robot.name!r} is already registered")
     return robot
