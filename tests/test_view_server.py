@@ -43,7 +43,7 @@ from mqe_jax.viz.recording import Episode
 def shown() -> Iterator[SimpleNamespace]:
     server = open_server("127.0.0.1", free_port(), "test")
     run = session(Driven())
-    panel = Panel(server, run, ("robot 1", "robot 2"), lambda: None)
+    panel = Panel(server, run, ("robot 1", "robot 2"), lambda: None, ("robot 1", "robot 2"))
     yield SimpleNamespace(port=server.get_port(), session=run, panel=panel, server=server)
     server.stop()
 
@@ -347,20 +347,29 @@ def test_environments_stand_side_by_side_and_every_moving_body_is_drawn(stage: A
     scene = stage.stage
     frame = stage.frame
     model = stage.env.mj_model
-    drawn = sorted(int(body) for batch in scene._batches for body in batch.bodies)
+    drawn = sorted(int(body) for _, bodies in scene._batches for body in bodies)
     with_shape = {int(model.geom_bodyid[g]) for g in range(model.ngeom) if model.geom_group[g] != 3}
     robots = [b for b in with_shape if model.body_mocapid[b] < 0 and b != 0]
     assert drawn == sorted(robots)
     trunk = model.body("robot0/trunk").id
-    batch = next(batch for batch in scene._batches if trunk in batch.bodies)
-    place = batch.handle.batched_positions.reshape(3, len(batch.bodies), 3)[
-        :, list(batch.bodies).index(trunk)
-    ]
+    handle, bodies = next(batch for batch in scene._batches if trunk in batch[1])
+    place = handle.batched_positions.reshape(3, len(bodies), 3)[:, bodies.index(trunk)]
     away = place - frame.qpos[:, stage.env.index.base_qpos[0, :3]]
     np.testing.assert_allclose(away[:, [0, 2]], 0.0, atol=1e-5)
     apart = np.diff(away[:, 1])
     assert np.all(apart > 3.1)  # wider than the track with its walls
     np.testing.assert_allclose(away[1, 1], 0.0, atol=1e-6)
+
+
+def test_collision_shapes_stand_where_their_bodies_are(stage: Any) -> None:
+    overlay = Overlay(stage.server, stage.env.mj_model, stage.stage)
+    overlay.draw_shapes(stage.frame, True)
+    trunk = stage.env.mj_model.body("robot0/trunk").id
+    places = {body: handle.batched_positions for handle, (body,) in overlay._shapes}
+    base = stage.frame.qpos[:, stage.env.index.base_qpos[0, :3]]
+    np.testing.assert_allclose(places[trunk], base + stage.stage.offset, atol=1e-5)
+    overlay.draw_shapes(stage.frame, False)
+    assert overlay._shapes == []
 
 
 def test_what_a_robot_senses_is_drawn_in_its_environment(stage: Any) -> None:
@@ -378,7 +387,7 @@ def test_what_a_robot_senses_is_drawn_in_its_environment(stage: Any) -> None:
     )
     view = marks("in view", (0.0, 1.0, 0.0), jnp.full(2, 0.3), area=area)
     every = jax.tree.map(lambda x: np.stack([x] * 3), (mark, view))
-    overlay = Overlay(stage.server, stage.env.mj_model, stage.stage.offset)
+    overlay = Overlay(stage.server, stage.env.mj_model, stage.stage)
     overlay.draw_marks(every, 2, 1)
     lines, points, shape = overlay._sensed
     offset = stage.stage.offset[2]
@@ -436,10 +445,10 @@ def test_a_choice_replaces_the_session_and_a_wrong_one_keeps_it() -> None:
     assert viewer._panel is not panel and viewer._panel.take_choice() is None
     viewer._panel.shapes = viewer._panel.contacts = True
     viewer._draw()
-    assert viewer._shapes and viewer._overlay._arrows is not None
+    assert viewer._overlay._arrows is not None
     viewer._panel.shapes = viewer._panel.contacts = False
     viewer._draw()
-    assert not viewer._shapes and viewer._overlay._arrows is None
+    assert viewer._overlay._arrows is None
     viewer.server.stop()
 
 

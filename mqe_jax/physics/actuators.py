@@ -34,8 +34,7 @@ def load_actuator_network(path: str | os.PathLike[str]) -> ActuatorParams:
         raise InputError(f"actuator_network: no file {file}")
     flat = read_tensors(file, "actuator_network")
     sizes = {"0": (6, 32), "2": (32, 32), "4": (32, 1)}
-    layers = linear_layers(f"actuator_network {file}", flat, sizes)
-    return jax.tree.map(jnp.asarray, layers)
+    return jax.tree.map(jnp.asarray, linear_layers(f"actuator_network {file}", flat, sizes))
 
 
 def actuator_torque(params: ActuatorParams, error: jax.Array, velocity: jax.Array) -> jax.Array:

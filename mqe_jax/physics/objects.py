@@ -188,11 +188,24 @@ class Cylinder(Object):
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         body = add_body(spec, name, (self.x, 0.0, 0.0), self.mass, (1.0, 1.0, 1.0))
-        limits = {"limited": True, "range": (-self.reach, self.reach)}
-        loss = self.friction * self.mass * GRAVITY
-        _add_joint(body, "y", _JOINT.mjJNT_SLIDE, axis=_AXES["y"], frictionloss=loss, **limits)
-        shape = {"size": (self.radius, 0, 0), "fromto": (0, 0, 0, 0, 0, self.height)}
-        add_solid(body, _GEOM.mjGEOM_CAPSULE, WOOD, group=HIDDEN_GROUP, **shape, **_HELD)
+        _add_joint(
+            body,
+            "y",
+            _JOINT.mjJNT_SLIDE,
+            axis=_AXES["y"],
+            frictionloss=self.friction * self.mass * GRAVITY,
+            limited=True,
+            range=(-self.reach, self.reach),
+        )
+        add_solid(
+            body,
+            _GEOM.mjGEOM_CAPSULE,
+            WOOD,
+            group=HIDDEN_GROUP,
+            size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height),
+            **_HELD,
+        )
         if visual:
             bodies.drum(body, self.radius, self.height)
 
@@ -224,8 +237,14 @@ class Door(Object):
         body = add_body(spec, name, place, self.mass, (1.0, 0.5, self.inertia))
         _add_joint(body, "turn", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["z"])
         half = np.array(self.size) / 2
-        group = HIDDEN_GROUP if visual else 1
-        add_solid(body, _GEOM.mjGEOM_BOX, WOOD, group=group, size=half, **_HELD)
+        add_solid(
+            body,
+            _GEOM.mjGEOM_BOX,
+            WOOD,
+            group=HIDDEN_GROUP if visual else 1,
+            size=half,
+            **_HELD,
+        )
         if visual:
             bodies.door(body, half)
 
@@ -256,8 +275,15 @@ class Seesaw(Object):
 
     def add(self, spec: mujoco.MjSpec, name: str, visual: bool) -> None:
         body = add_body(spec, name, self.hinge, self.mass, (self.inertia,) * 3)
-        limits = {"limited": True, "range": (-self.limit, self.limit)}
-        _add_joint(body, "pitch", _JOINT.mjJNT_HINGE, self.damping, axis=_AXES["y"], **limits)
+        _add_joint(
+            body,
+            "pitch",
+            _JOINT.mjJNT_HINGE,
+            self.damping,
+            axis=_AXES["y"],
+            limited=True,
+            range=(-self.limit, self.limit),
+        )
         half = np.array(self.size) / 2
         add_solid(body, _GEOM.mjGEOM_BOX, WOOD, size=half, pos=(-self.behind, 0, 0), **_FLOOR)
         if visual:
@@ -344,9 +370,14 @@ class Sheep(Object):
         # The capsule's lower end is below the ground, so it is cylindrical at ground level.
         body = add_body(spec, name, (0, 0, 0), self.mass, (0.1, 0.1, 0.1))
         add_slides(body, "xy")
-        top = self.height - self.radius
-        shape = {"size": (self.radius, 0, 0), "fromto": (0, 0, 0, 0, 0, top)}
-        group = HIDDEN_GROUP if visual else 1
-        add_solid(body, _GEOM.mjGEOM_CAPSULE, STONE, group=group, **shape, **_HELD)
+        add_solid(
+            body,
+            _GEOM.mjGEOM_CAPSULE,
+            STONE,
+            group=HIDDEN_GROUP if visual else 1,
+            size=(self.radius, 0, 0),
+            fromto=(0, 0, 0, 0, 0, self.height - self.radius),
+            **_HELD,
+        )
         if visual:
             bodies.sheep(body, self.radius, self.height)

@@ -1,7 +1,7 @@
 """Scenes of a track, N robots and objects, compiled to a MuJoCo model with its index tables."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -116,8 +116,7 @@ class CompiledScene:
         """Places the moving walls (W, 3) around anchors (G, 2), m: values for `mocap_pos`."""
         if not len(self.mocap_anchor):
             return jnp.zeros((0, 3))
-        on_ground = jnp.pad(anchors, ((0, 0), (0, 1)))
-        return on_ground[self.mocap_anchor] + self.mocap_offset
+        return jnp.pad(anchors, ((0, 0), (0, 1)))[self.mocap_anchor] + self.mocap_offset
 
 
 def build_model(scene: Scene, *, visual: bool) -> tuple[mujoco.MjModel, Layout]:
@@ -227,15 +226,11 @@ def compile_scene(scene: Scene) -> CompiledScene:
         model=model,
         index=index,
         motors=Motors.of(robot, index, scene.timestep),
-        objects=_index_objects(model, scene.objects),
+        objects={name: _index_object(model, f"object/{name}") for name in scene.objects},
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),
         mocap_anchor=np.array([wall.anchor for wall in moving], np.int32),
     )
-
-
-def _index_objects(model: mujoco.MjModel, names: Iterable[str]) -> Mapping[str, ObjectIndex]:
-    return {name: _index_object(model, f"object/{name}") for name in names}
 
 
 def _index_object(model: mujoco.MjModel, name: str) -> ObjectIndex:

@@ -8,6 +8,7 @@ import numpy as np
 from mjviser.conversions import merge_geoms
 
 from mqe_jax.sensors.marks import Marks
+from mqe_jax.view.stage import Batch, Stage
 from mqe_jax.viz.geometry import COLLISION_GROUP, pose
 from mqe_jax.viz.recording import Episode
 
@@ -22,57 +23,55 @@ _AREA = 0.3  # opacity of an area
 class Overlay:
     """Contacts and a robot's marks of one environment, and collision shapes of all.
 
-    They are below the movable root frame of a `Stage`.
+    They are below the movable root frame of a stage.
     """
 
-    def __init__(self, server: Any, model: mujoco.MjModel, offset: np.ndarray) -> None:
-        """Draws nothing yet; `offset` (N, 3) is the place of each environment, m."""
+    def __init__(self, server: Any, model: mujoco.MjModel, stage: Stage) -> None:
+        """Draws nothing yet."""
         self._server = server
         self._model = model
         self._data = mujoco.MjData(model)
-        self._offset = offset
-        self.contacts = False  # whether they are drawn
+        self._stage = stage
+        self._offset = stage.offset
         self._arrows: Any = None
         self._sensed: list[Any] = []
-        self._shapes: list[tuple[int, Any]] = []
+        self._shapes: list[Batch] = []
 
-    def show_shapes(self, shown: bool) -> None:
-        """Adds or removes the collision shapes of robots and objects, as wire frames."""
-        for _, handle in self._shapes:
+    def draw_shapes(self, frame: Episode, shown: bool) -> None:
+        """Draws the collision shapes of robots and objects, as wire frames, or removes them."""
+        if shown and not self._shapes:
+            self._shapes = [
+                (self._add(body, geoms), [body]) for body, geoms in self._bodies().items()
+            ]
+        if shown:
+            self._stage.place(self._shapes, *self._stage.poses(frame))
+            return
+        for handle, _ in self._shapes:
             handle.remove()
         self._shapes = []
-        if shown:
-            self._shapes = [
-                (body, self._add(body, geoms)) for body, geoms in self._bodies().items()
-            ]
 
-    def draw(self, frame: Episode, index: int, qvel: np.ndarray, ctrl: np.ndarray) -> None:
-        """Places the shapes of all environments, and draws the contacts of environment `index`."""
-        if self._shapes:
-            positions = []
-            turns = []
-            for i in range(len(frame)):
-                pose(self._model, self._data, frame, i)
-                positions.append(self._data.xpos + self._offset[i])
-                turns.append(self._data.xquat.copy())
-            for body, handle in self._shapes:
-                handle.batched_positions = np.stack([x[body] for x in positions]).astype(np.float32)
-                handle.batched_wxyzs = np.stack([x[body] for x in turns]).astype(np.float32)
+    def draw_contacts(
+        self, frame: Episode, index: int, qvel: np.ndarray, ctrl: np.ndarray, shown: bool
+    ) -> None:
+        """Draws the contacts of environment `index` in place of the last ones, if they are
+        `shown`.
+        """
         if self._arrows is not None:
             self._arrows.remove()
             self._arrows = None
-        if self.contacts:
-            selected = frame.cut(slice(index, index + 1))
-            arrows = contact_arrows(self._model, self._data, selected, qvel, ctrl)
-            if len(arrows):
-                self._arrows = self._server.scene.add_arrows(
-                    "/world/contacts",
-                    (arrows + self._offset[index]).astype(np.float32),
-                    _FORCE,
-                    shaft_radius=0.012,
-                    head_radius=0.03,
-                    head_length=0.05,
-                )
+        if not shown:
+            return
+        selected = frame.cut(slice(index, index + 1))
+        arrows = contact_arrows(self._model, self._data, selected, qvel, ctrl)
+        if len(arrows):
+            self._arrows = self._server.scene.add_arrows(
+                "/world/contacts",
+                (arrows + self._offset[index]).astype(np.float32),
+                _FORCE,
+                shaft_radius=0.012,
+                head_radius=0.03,
+                head_length=0.05,
+            )
 
     def draw_marks(self, marks: Sequence[Marks], index: int, agent: int) -> None:
         """Draws the marks of an agent of environment `index`, in place of the last ones."""

@@ -44,7 +44,7 @@ class Panel:
         session: Session,
         bodies: Sequence[str],
         on_camera: Callable[[], None],
-        robots: Sequence[str] = (),
+        robots: Sequence[str],
         menu: Menu | None = None,
     ) -> None:
         """Adds the controls to a page.
@@ -56,8 +56,7 @@ class Panel:
         self._session = session
         self._gui = server.gui
         self._on_camera = on_camera
-        numbered = [f"robot {i + 1}" for i in range(session.env.num_agents)]
-        self._robots = tuple(robots or numbered)
+        self._robots = tuple(robots)
         self._wanted_steps = 0
         self._wants_reset = False
         self._wanted: Entry | None = None

@@ -86,9 +86,8 @@ class Session:
         """Creates the environments, in which `seats` act, with a history of that length, s."""
         self.env = env
         self.num_envs = vector_env.num_envs
-        # a real-time factor
         self.paused = False
-        self.speed = 1.0
+        self.speed = 1.0  # a real-time factor
         self.drive = Drive(np.zeros(3), np.zeros(3))
         self._vector_env = vector_env
         self._seats = seats
@@ -187,10 +186,7 @@ class Session:
         state = self._vector_env.step(state, action)
         done = state.terminated | state.truncated
         memory = self._seats.restart(memory, done)
-        names = [name for name in state.metrics if name.startswith("reward/")]
-        rewards = jnp.stack(
-            [state.metrics[name] for name in (*names, "average_step_reward")], axis=-1
-        )
+        rewards = jnp.stack([state.metrics[name] for name in self.terms], axis=-1)
         ended = jnp.stack(
             [getattr(state.outcome, name)[:, 0] > 0 for name in self.outcomes], axis=-1
         )

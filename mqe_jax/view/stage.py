@@ -1,6 +1,5 @@
 """The 3-D scene in the browser: environments side by side, one batch of instances per mesh."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -22,12 +21,8 @@ _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """Bodies that share one mesh, in all environments: N x len(bodies) instances."""
-
-    handle: Any
-    bodies: np.ndarray
+Batch = tuple[Any, list[int]]
+"""Handle of N x bodies instances of one mesh, and the bodies that share it."""
 
 
 class Stage:
@@ -57,11 +52,11 @@ class Stage:
         self._add_floor(low, high)
         fixed, moving, self._walls = _sort_geoms(self._model)
         still = [self._add_batch(f"fixed/{body}", geoms, [body]) for body, geoms in fixed.items()]
-        self._place(still, *self._poses(frame))
-        self._batches = []
-        for bodies in self._group(moving):
-            first = bodies[0]
-            self._batches.append(self._add_batch(f"moving/{first}", moving[first], bodies))
+        self.place(still, *self.poses(frame))
+        self._batches = [
+            self._add_batch(f"moving/{bodies[0]}", moving[bodies[0]], bodies)
+            for bodies in self._group(moving)
+        ]
         self._wall_handles = [self._add_wall(geom) for geom in self._walls]
         self.draw(frame)
 
@@ -71,7 +66,7 @@ class Stage:
         `followed` are an environment and bodies of it. Robots that take no part in the episode are
         not followed.
         """
-        positions, turns = self._poses(frame)
+        positions, turns = self.poses(frame)
         with self._server.atomic():
             places = positions[followed] if followed else np.zeros((0, 3))
             places = places[places[:, 2] < HIGH]
@@ -79,10 +74,10 @@ class Stage:
                 self.span = float(np.linalg.norm(np.ptp(places, axis=0)))
                 x, y, _ = (places.min(axis=0) + places.max(axis=0)) / 2
                 self._root.position = (-x, -y, 0.0)
-            self._place(self._batches, positions, turns)
+            self.place(self._batches, positions, turns)
             self._draw_walls(frame)
 
-    def _poses(self, frame: Episode) -> tuple[np.ndarray, np.ndarray]:
+    def poses(self, frame: Episode) -> tuple[np.ndarray, np.ndarray]:
         """Returns positions (N, bodies, 3) and quaternions (N, bodies, 4) of all bodies."""
         positions = np.zeros((self._count, self._model.nbody, 3))
         turns = np.zeros((self._count, self._model.nbody, 4))
@@ -92,11 +87,11 @@ class Stage:
             turns[i] = self._data.xquat
         return positions, turns
 
-    def _place(self, batches: list[_Batch], positions: np.ndarray, turns: np.ndarray) -> None:
-        for batch in batches:
-            places = positions[:, batch.bodies].reshape(-1, 3)
-            batch.handle.batched_positions = places.astype(np.float32)
-            batch.handle.batched_wxyzs = turns[:, batch.bodies].reshape(-1, 4).astype(np.float32)
+    def place(self, batches: list[Batch], positions: np.ndarray, turns: np.ndarray) -> None:
+        """Moves batches to the poses of their bodies, as `poses` returns them."""
+        for handle, bodies in batches:
+            handle.batched_positions = positions[:, bodies].reshape(-1, 3).astype(np.float32)
+            handle.batched_wxyzs = turns[:, bodies].reshape(-1, 4).astype(np.float32)
 
     def overview(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns camera position and look-at point (3,), m, for the whole scene."""
@@ -116,9 +111,8 @@ class Stage:
         frames = [frame.cut(slice(i, i + 1)) for i in range(self._count)]
         boxes = [_wall_boxes(self._model, one, self._walls) for one in frames]
         centres, turns, sizes = (np.stack(part, 1) for part in zip(*boxes, strict=True))
-        centres = centres + self.offset
         for index, handle in enumerate(self._wall_handles):
-            handle.batched_positions = centres[index].astype(np.float32)
+            handle.batched_positions = (centres[index] + self.offset).astype(np.float32)
             handle.batched_wxyzs = turns[index].astype(np.float32)
             handle.batched_scales = sizes[index].astype(np.float32)
 
@@ -157,7 +151,7 @@ class Stage:
             groups.setdefault(look, []).append(body)
         return list(groups.values())
 
-    def _add_batch(self, name: str, geoms: list[int], bodies: list[int]) -> _Batch:
+    def _add_batch(self, name: str, geoms: list[int], bodies: list[int]) -> Batch:
         count = self._count * len(bodies)
         handle = self._server.scene.add_batched_meshes_trimesh(
             f"/world/{name}",
@@ -166,7 +160,7 @@ class Stage:
             batched_positions=np.zeros((count, 3)),
             lod="off",
         )
-        return _Batch(handle, np.array(bodies))
+        return handle, bodies
 
     def _add_wall(self, geom: int) -> Any:
         box = trimesh.creation.box((2.0, 2.0, 2.0))

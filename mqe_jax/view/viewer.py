@@ -71,8 +71,7 @@ class Viewer:
         else:
             self._build(model, session.moment().frame)
         self._announced = False
-        self._overlay = Overlay(self.server, model, self._stage.offset)
-        self._shapes = False
+        self._overlay = Overlay(self.server, model, self._stage)
         robots = robot_labels(model)
         named = {f"robot {i + 1}": label for i, label in enumerate(robots)}
         self._bodies = {named.get(label, label): body for label, body in self._stage.bodies.items()}
@@ -148,11 +147,14 @@ class Viewer:
         moment = self.session.moment(self._panel.back)
         panel = self._panel
         self._stage.draw(moment.frame, self._target())
-        if panel.shapes != self._shapes:
-            self._shapes = panel.shapes
-            self._overlay.show_shapes(self._shapes)
-        self._overlay.contacts = panel.contacts
-        self._overlay.draw(moment.frame, panel.env, moment.qvel[panel.env], moment.ctrl[panel.env])
+        self._overlay.draw_shapes(moment.frame, panel.shapes)
+        self._overlay.draw_contacts(
+            moment.frame,
+            panel.env,
+            moment.qvel[panel.env],
+            moment.ctrl[panel.env],
+            panel.contacts,
+        )
         marks = moment.marks if panel.sensors else ()
         self._overlay.draw_marks(marks, panel.env, self.session.drive.robot or 0)
 

@@ -4,63 +4,26 @@ Only rendering models have these geoms. Lengths are in metres.
 """
 
 import colorsys
-import itertools
-
-import numpy as np
 
 from mqe_jax.physics.collision import MAX_ROBOTS
 
 Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
 
 
-def _perceived(colors: np.ndarray) -> np.ndarray:
-    """Returns sRGB colours (N, 3) in Oklab (N, 3), whose distances are about those that people see.
-
-    Lightness counts half, for it changes with the light on a robot. Source:
-    bottosson.github.io/posts/oklab.
-    """
-    linear = np.where(colors > 0.04045, ((colors + 0.055) / 1.055) ** 2.4, colors / 12.92)
-    to_cones = np.array(
-        [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]
-    )
-    to_lab = np.array(
-        [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]
-    )
-    return np.cbrt(linear @ to_cones.T) @ to_lab.T * (0.5, 1.0, 1.0)
-
-
-def _palette(first: tuple[Color, ...], count: int) -> tuple[Color, ...]:
-    """Returns `count` colours: the first ones, then vivid ones.
-
-    Each further one is the vivid colour that differs most from all before it.
-    """
-    levels = itertools.product(np.arange(30) / 30, ((0.85, 0.95), (0.9, 0.6), (0.45, 1.0)))
-    vivid = np.array([colorsys.hsv_to_rgb(hue, *level) for hue, level in levels])
-    candidates = _perceived(vivid)
-    colors = list(first)
-    differences = candidates[:, None] - _perceived(np.array(first)[:, :3])
-    apart = np.linalg.norm(differences, axis=-1).min(axis=1)
-    while len(colors) < count:
-        best = int(apart.argmax())
-        red, green, blue = vivid[best].round(3).tolist()
-        colors.append((red, green, blue, 1.0))
-        apart = np.minimum(apart, np.linalg.norm(candidates - candidates[best], axis=-1))
-    return tuple(colors)
-
-
 # Robots by agent. In matches of one or two a side team 0 is blue and green, team 1 red and orange;
-# see `team_colors`.
-ROBOT_COLOR_NAMES = ("blue", "green", "red", "orange")
-ROBOT_COLORS: tuple[Color, ...] = _palette(
-    (
-        (0.10, 0.47, 0.95, 1.0),
-        (0.22, 0.72, 0.25, 1.0),
-        (0.90, 0.20, 0.17, 1.0),
-        (1.00, 0.58, 0.08, 1.0),
-    ),
-    MAX_ROBOTS,
-)
+# see `team_colors`. The hues of the others, which bear numbers, are apart by the golden ratio.
 UNNUMBERED = 4  # robots of a scene, at most, that differ by colour and bear no numbers
+ROBOT_COLOR_NAMES = ("blue", "green", "red", "orange")
+ROBOT_COLORS: tuple[Color, ...] = (
+    (0.10, 0.47, 0.95, 1.0),
+    (0.22, 0.72, 0.25, 1.0),
+    (0.90, 0.20, 0.17, 1.0),
+    (1.00, 0.58, 0.08, 1.0),
+    *(
+        (*colorsys.hsv_to_rgb(0.75 + 0.618034 * number, 0.75, 0.9), 1.0)
+        for number in range(MAX_ROBOTS - UNNUMBERED)
+    ),
+)
 
 
 def team_colors(size: int) -> tuple[int, ...]:

@@ -18,14 +18,13 @@ def crate(body: Any, half: np.ndarray) -> None:
     thick = 0.09 * half.min()
     for axis in range(3):
         other, third = (i for i in range(3) if i != axis)
-        for a in (-1, 1):
-            for b in (-1, 1):
-                size = np.full(3, thick)
-                place = np.zeros(3)
-                size[axis] = half[axis] + _PROUD
-                place[other] = a * (half[other] - thick + _PROUD)
-                place[third] = b * (half[third] - thick + _PROUD)
-                add_box(body, DARK_WOOD, size, place)
+        size = np.full(3, thick)
+        size[axis] = half[axis] + _PROUD
+        for a, b in itertools.product((-1, 1), repeat=2):
+            place = np.zeros(3)
+            place[other] = a * (half[other] - thick + _PROUD)
+            place[third] = b * (half[third] - thick + _PROUD)
+            add_box(body, DARK_WOOD, size, place)
     for axis, sign in ((0, 1), (1, -1)):  # diagonal braces
         size = np.full(3, 0.8 * thick)
         size[axis] = half[axis] + _PROUD / 2
@@ -39,12 +38,10 @@ def crate(body: Any, half: np.ndarray) -> None:
 def football(body: Any, radius: float) -> None:
     """Adds the twelve dark patches of a football."""
     golden = (1 + np.sqrt(5)) / 2
-    for i in range(3):
-        for a in (-1.0, 1.0):
-            for b in (-golden, golden):
-                point = np.roll([0.0, a, b], i)
-                place = 0.66 * radius * point / np.linalg.norm(point)
-                add_visual(body, Kind.mjGEOM_SPHERE, INK, size=(0.38 * radius, 0, 0), pos=place)
+    for i, a, b in itertools.product(range(3), (-1.0, 1.0), (-golden, golden)):
+        point = np.roll([0.0, a, b], i)
+        place = 0.66 * radius * point / np.linalg.norm(point)
+        add_visual(body, Kind.mjGEOM_SPHERE, INK, size=(0.38 * radius, 0, 0), pos=place)
 
 
 def drum(body: Any, radius: float, height: float) -> None:
@@ -91,10 +88,9 @@ def trestle(world: Any, hinge: tuple[float, float, float], half_width: float) ->
     x, y, z = hinge
     end = half_width + 0.09
     add_rod(world, STEEL, 0.04, (x, y - end, z), (x, y + end, z))
-    for side in (-1, 1):
+    for side, lean in itertools.product((-1, 1), (-0.3, 0.3)):
         post = y + side * (end - 0.03)
-        for lean in (-0.3, 0.3):
-            add_rod(world, DARK_WOOD, 0.035, (x + lean, post, 0), (x, post, z))
+        add_rod(world, DARK_WOOD, 0.035, (x + lean, post, 0), (x, post, z))
 
 
 def column(world: Any, radius: float, top: tuple[float, float, float]) -> None:
@@ -148,15 +144,11 @@ def back_number(trunk: Any, number: int, top: float) -> None:
     thick = 0.014  # of a segment
     pitch = 2 * half[1] + 3 * thick
     add_box(trunk, WHITE, (0.13, 0.02 + pitch * len(digits) / 2, 0.003), (0, 0, top))
-    lower = -half[0] / 2
-    upper = half[0] / 2
+    middles = (half[0] / 2, -half[0] / 2)  # of the segments along x
     for place, digit in enumerate(digits):
         middle = ((len(digits) - 1) / 2 - place) * pitch
         across = [(x, 0.0, (thick, half[1] + thick)) for x in (half[0], 0.0, -half[0])]
-        along = [
-            (x, y, (upper + thick, thick)) for y in (half[1], -half[1]) for x in (upper, lower)
-        ]
-        segments = zip(_DIGITS[int(digit)], across + along, strict=True)
-        for inked, (x, y, (length, width)) in segments:
+        along = [(x, y, (middles[0] + thick, thick)) for y in (half[1], -half[1]) for x in middles]
+        for inked, (x, y, (length, width)) in zip(_DIGITS[int(digit)], across + along, strict=True):
             if inked == "1":
                 add_box(trunk, INK, (length, width, 0.003), (x, middle + y, top + 0.002))

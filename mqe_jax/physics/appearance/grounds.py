@@ -75,11 +75,6 @@ def track(
     return Ground(shapes=(rectangle(x, (-width / 2, width / 2), color), *lines, *shapes))
 
 
-def hall(x: Point, y: Point, color: Color, shapes: Sequence[Shape] = ()) -> Ground:
-    """Returns an indoor floor of one colour."""
-    return Ground(_HALL, (rectangle(x, y, color), *shapes))
-
-
 def halves(x: Point, y: Point) -> Ground:
     """Returns a floor with a line between the halves of the first and of the second team."""
     blue = mix(ROBOT_COLORS[0], STONE, 0.74)
@@ -94,9 +89,10 @@ def warehouse(x: Point, width: float, goal_x: float) -> Ground:
     The zone beyond the gate at `goal_x` is painted.
     """
     half = width / 2 - 0.25
+    floor = rectangle(x, (-width / 2, width / 2), (0.70, 0.69, 0.66, 1.0))
     zone = rectangle((goal_x, x[1]), (-width / 2, width / 2), (0.55, 0.72, 0.58, 1.0), 2)
     start = outline((x[0] + 0.25, goal_x - 0.4), (-half, half), YELLOW, 0.07)
-    return hall(x, (-width / 2, width / 2), (0.70, 0.69, 0.66, 1.0), (zone, *start))
+    return Ground(_HALL, (floor, zone, *start))
 
 
 def meadow(x_range: Point, width: float, goal_x: float) -> Ground:
@@ -149,8 +145,8 @@ def pitch(x: Point, width: float, goal: tuple[float, float, float]) -> Ground:
     shapes += [
         line((middle, 0.1 - half), (middle, half - 0.1), width=0.07),
         mark((middle, 0.0, 0.0), (0.12,), level=3),
+        *circle((middle, 0.0), 1.3, width=0.07),
     ]
-    shapes += circle((middle, 0.0), 1.3, width=0.07)
     points = []
     for goal_x, away, color in ((x[0], -1, ROBOT_COLORS[0]), (x[1], 1, ROBOT_COLORS[2])):
         box = (goal_x - away * 1.7, goal_x)
@@ -164,10 +160,11 @@ def _goal(x: float, depth: float, half: float, height: float, color: Color) -> l
     """Returns the frame and the net of a goal, whose back is at `x + depth`."""
     inner = half - _POST
     back = x + 0.96 * depth
-    posts = [
-        rod((x, side * inner, 0.0), (x, side * inner, height), _POST, color) for side in (-1, 1)
+    frame: list[Shape] = [
+        rod((x, -inner, 0.0), (x, -inner, height), _POST, color),
+        rod((x, inner, 0.0), (x, inner, height), _POST, color),
+        rod((x, -inner, height), (x, inner, height), _POST, color),
     ]
-    frame: list[Shape] = [*posts, rod((x, -inner, height), (x, inner, height), _POST, color)]
     thread = 0.008
     net = (0.93, 0.93, 0.93, 1.0)
     for y in np.linspace(-inner, inner, 10).tolist():
@@ -178,8 +175,10 @@ def _goal(x: float, depth: float, half: float, height: float, color: Color) -> l
     for part in (0.25, 0.5, 0.75, 1.0):
         z = part * height
         along = x + part * (back - x)
-        frame += [rod((back, -inner, z), (back, inner, z), thread, net)]
-        frame += [rod((along, -inner, height), (along, inner, height), thread, net)]
+        frame += [
+            rod((back, -inner, z), (back, inner, z), thread, net),
+            rod((along, -inner, height), (along, inner, height), thread, net),
+        ]
     return frame
 
 
@@ -219,9 +218,12 @@ def dohyo(
     sides += [(x, y - width / 2, length + 0.04, 0.02), (x, y + width / 2, length + 0.04, 0.02)]
     shapes += [slab((a, b, z / 2), (along, across, z), edge) for a, b, along, across in sides]
     for side, color in ((-1, ROBOT_COLORS[0]), (1, ROBOT_COLORS[2])):
-        shapes += [line((x - 0.4, y + side * 0.45), (x + 0.4, y + side * 0.45), width=0.07, z=z)]
-        at = y + side * (width / 2 - 0.2)
-        shapes += [line((x - 0.9, at), (x + 0.9, at), mix(color, WHITE, 0.15), 0.14, z=z)]
+        start = y + side * 0.45
+        end = y + side * (width / 2 - 0.2)
+        shapes += [
+            line((x - 0.4, start), (x + 0.4, start), width=0.07, z=z),
+            line((x - 0.9, end), (x + 0.9, end), mix(color, WHITE, 0.15), 0.14, z=z),
+        ]
     points = tuple(
         (x + a * radius, y + b * radius, z) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))
     )
@@ -244,18 +246,16 @@ def river(platforms: Point, ends: Point, widths: tuple[float, float, float], top
         wave = (random.uniform(0.04, 0.06), random.uniform(0.3, 0.8))
         shapes.append(mark((x, y, 0.0), wave, foam, 2))
     length, width, bridge = widths
-    planks = np.linspace(*ends, 24).tolist()
-    for i, (a, b) in enumerate(itertools.pairwise(planks)):
-        tone = (WOOD, mix(WOOD, WHITE, 0.18))[i % 2]
-        shapes.append(rectangle((a, b), (-bridge / 2, bridge / 2), tone, 1, top))
+    tones = (WOOD, mix(WOOD, WHITE, 0.18))
+    for i, plank in enumerate(itertools.pairwise(np.linspace(*ends, 24).tolist())):
+        shapes.append(rectangle(plank, (-bridge / 2, bridge / 2), tones[i % 2], 1, top))
     points = []
+    y_range = (-width / 2, width / 2)
     for x, color in zip(platforms, (0, 2), strict=True):
         x_range = (x - length / 2, x + length / 2)
-        y_range = (-width / 2, width / 2)
         shapes.append(rectangle(x_range, y_range, mix(ROBOT_COLORS[color], STONE, 0.55), 1, top))
         inner_x = (x_range[0] + 0.06, x_range[1] - 0.06)
-        inner_y = (y_range[0] + 0.06, y_range[1] - 0.06)
-        shapes += outline(inner_x, inner_y, z=top)
+        shapes += outline(inner_x, (y_range[0] + 0.06, y_range[1] - 0.06), z=top)
         points += [(x, y, top) for y in y_range]
     return Ground(shapes=tuple(shapes), goals=tuple(points))
 
@@ -279,12 +279,10 @@ def add_light(spec: mujoco.MjSpec, middle: tuple[float, float, float]) -> None:
     visual.global_.offwidth = 1920
     visual.global_.offheight = 1080
     visual.rgba.haze = (*_HORIZON, 1.0)
-    texture = mujoco.mjtTexture
-    builtin = mujoco.mjtBuiltin
     spec.add_texture(
         name="sky",
-        type=texture.mjTEXTURE_SKYBOX,
-        builtin=builtin.mjBUILTIN_GRADIENT,
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=_ZENITH,
         rgb2=_HORIZON,
         width=128,
@@ -292,8 +290,8 @@ def add_light(spec: mujoco.MjSpec, middle: tuple[float, float, float]) -> None:
     )
     spec.add_texture(
         name=GROUND_MATERIAL,
-        type=texture.mjTEXTURE_2D,
-        builtin=builtin.mjBUILTIN_FLAT,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
         mark=mujoco.mjtMark.mjMARK_RANDOM,
         random=0.2,
         rgb1=(1.0, 1.0, 1.0),

@@ -88,8 +88,12 @@ def mark(
 
 def rod(start: Place, end: Place, radius: float, color: Color) -> Shape:
     """Returns a cylinder between two points, m, such as a goal post."""
-    options = {"size": (radius, 0, 0), "fromto": (*start, *end)}
-    return Shape(Kind.mjGEOM_CYLINDER, color, VISUAL_GROUP, options)
+    return Shape(
+        Kind.mjGEOM_CYLINDER,
+        color,
+        VISUAL_GROUP,
+        {"size": (radius, 0, 0), "fromto": (*start, *end)},
+    )
 
 
 def tuft(center: Place, half: Place, color: Color) -> Shape:
@@ -182,8 +186,7 @@ def side_wall(
     quat = about_z(yaw)
 
     def box(color: Color, size: tuple[float, float, float], along: float, height: float) -> None:
-        turned = np.array([-np.sin(yaw), np.cos(yaw)]) * along
-        place = (center[0] + turned[0], center[1] + turned[1], height)
+        place = (center[0] - along * np.sin(yaw), center[1] + along * np.cos(yaw), height)
         add_box(world, color, size, place, quat=quat, group=WALL_GROUP)
 
     count = max(2, round(2 * y / 1.25) + 1)
@@ -219,7 +222,7 @@ def gate_wall(body: Any, style: Style, half: np.ndarray, inner: float) -> None:
     if x > _THICK:
         return
     wide = 0.05
+    height = z / 5
     for number, color in enumerate((YELLOW, INK, YELLOW, INK, YELLOW)):
-        height = z / 5
         place = (0, inner * (y - wide + 0.004), -z + (2 * number + 1) * height)
         add_box(body, color, (1.1 * x, wide, height + 0.002), place, group=WALL_GROUP)

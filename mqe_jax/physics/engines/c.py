@@ -183,10 +183,8 @@ class _Stepper:
         """Returns motors, gain (count, J) and bias (count, J, 3), a row for each environment."""
         if self._motors is None:
             return None
-        gain = self._model.actuator_gainprm[:, 0]
-        bias = self._model.actuator_biasprm[:, :3]
-        gain = np.tile(gain.astype(np.float32), (count, 1))
-        bias = _columns(np.tile(bias, (count, 1, 1)))
+        gain = np.tile(self._model.actuator_gainprm[:, 0].astype(np.float32), (count, 1))
+        bias = _columns(np.tile(self._model.actuator_biasprm[:, :3], (count, 1, 1)))
         return self._motors.repeat(count), gain, bias
 
 
@@ -206,23 +204,21 @@ def _drive(
     from `start` with the limits evaluated in every physics step. The result is that of doing so in
     all environments, to the last bit.
     """
-    angles = motors.joint_qpos
-    speeds = motors.joint_qvel
     every, gain, bias = rows
     if "actuator_gainprm" in names:
         gain = batch.expand("actuator_gainprm")[..., 0].astype(np.float32)
     if "actuator_biasprm" in names:
         bias = _columns(batch.expand("actuator_biasprm")[..., :3])
     asked = start["ctrl"]
-    position = start["qpos"][:, angles]
-    velocity = start["qvel"][:, speeds]
+    position = start["qpos"][:, motors.joint_qpos]
+    velocity = start["qvel"][:, motors.joint_qvel]
     idle = every.idle(asked, position, velocity, gain, bias)
     if np.count_nonzero(idle) > SHARE * len(idle):
         ids = np.flatnonzero(idle)
         path = batch.rollout(substeps, record=("qpos", "qvel"), ids=ids)
         for step in range(substeps - 1):
-            position[ids] = path["qpos"][:, step][:, angles]
-            velocity[ids] = path["qvel"][:, step][:, speeds]
+            position[ids] = path["qpos"][:, step][:, motors.joint_qpos]
+            velocity[ids] = path["qvel"][:, step][:, motors.joint_qvel]
             idle &= every.idle(asked, position, velocity, gain, bias)
         # Unlike steps, a rollout ends where the engine warns.
         idle &= batch.bind("time") > (substeps - 0.5) * motors.timestep

@@ -115,8 +115,7 @@ def host_call(
         call = jax.ffi.ffi_call(TARGET, result, **batching)
         out = call(*arguments, number=np.int64(number))
     else:
-        call = functools.partial(_call, number)
-        out = jax.pure_callback(call, result, *arguments, **batching)
+        out = jax.pure_callback(functools.partial(_call, number), result, *arguments, **batching)
     assert isinstance(out, jax.Array)
     return out
 

@@ -123,9 +123,10 @@ class MjxEngine(Engine):
         if motors is None:
             return data
         position, velocity = self._joints(data, motors)
-        qpos = scatter(data.qpos, motors.joint_qpos, position)
-        qvel = scatter(data.qvel, motors.joint_qvel, velocity)
-        return data.replace(qpos=qpos, qvel=qvel)
+        return data.replace(
+            qpos=scatter(data.qpos, motors.joint_qpos, position),
+            qvel=scatter(data.qvel, motors.joint_qvel, velocity),
+        )
 
     def _joints(self, data: mjx.Data, motors: Motors) -> tuple[jax.Array, jax.Array]:
         """Returns clamped joint angles and velocities (J,)."""
@@ -207,9 +208,13 @@ class WarpEngine(MjxEngine):
         return num_envs <= self.num_envs
 
     def blank(self) -> mjx.Data:
-        naconmax = self.num_envs * self.contacts_per_env
-        sizes = {"naconmax": naconmax, "njmax": self.max_constraints_per_env}
-        return self._mjx.make_data(self._model, jax.local_devices()[0], impl="warp", **sizes)
+        return self._mjx.make_data(
+            self._model,
+            jax.local_devices()[0],
+            impl="warp",
+            naconmax=self.num_envs * self.contacts_per_env,
+            njmax=self.max_constraints_per_env,
+        )
 
     def unused_terms(self, fields: Collection[str]) -> int:
         """Returns the disable flags of terms that are zero, also with any values of `fields`."""

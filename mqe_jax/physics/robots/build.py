@@ -100,8 +100,7 @@ def build_robot(
                 )
         for visual_shape in robot.visuals if visual else ():
             if visual_shape.link == link:
-                sides = (left, -left) if visual_shape.both else (left,)
-                for side in sides:
+                for side in (left, -left) if visual_shape.both else (left,):
                     _add_geom(
                         body,
                         visual_shape.primitive,
@@ -128,9 +127,8 @@ def build_robot(
         _add_inertial(thigh, robot.thigh.reflect(1, left))
         calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -robot.thigh_length))
         _add_inertial(calf, robot.calf.reflect(1, left))
-        links = (hip, thigh, calf)
         axes = ((1, 0, 0), (0, 1, 0), (0, 1, 0))
-        for body, joint, axis in zip(links, JOINTS, axes, strict=True):
+        for body, joint, axis in zip((hip, thigh, calf), JOINTS, axes, strict=True):
             index = JOINT_NAMES.index(f"{leg}_{joint}")
             hinge = body.add_joint(
                 name=f"{leg}_{joint}",

@@ -75,8 +75,6 @@ def add_sensors(spec: mujoco.MjSpec, robots: Sequence[Robot], *, feet: bool = Fa
 
     All engines support them.
     """
-    force_bits = 1 << 1
-    strongest = 2
     for number, robot in enumerate(robots):
         names = _geom_names(robot, "trunk")
         if feet:
@@ -87,7 +85,7 @@ def add_sensors(spec: mujoco.MjSpec, robots: Sequence[Robot], *, feet: bool = Fa
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
                 objtype=mujoco.mjtObj.mjOBJ_GEOM,
                 objname=prefix(number) + name,
-                intprm=(force_bits, strongest, 1),
+                intprm=(1 << 1, 2, 1),  # the force, of the strongest contact, one of them
             )
 
 
@@ -101,9 +99,7 @@ def index_robots(
 ) -> RobotIndex:
     """Builds the index tables of a compiled model's robots by looking up names."""
     numbers = range(num_robots)
-    body_names = ["trunk", *robot.joint_names]
     geom_names = [name for shape in robot.shapes(contacts) for name in shape.geom_names]
-    foot_names = _geom_names(robot, "foot")
     bases = [model.joint(prefix(i) + "base") for i in numbers]
 
     def table(lookup: Callable[[str], Any], names: Sequence[str]) -> np.ndarray:
@@ -119,10 +115,12 @@ def index_robots(
         joint_qvel=table(lambda name: model.joint(name).dofadr[0], robot.joint_names),
         actuator=table(lambda name: model.actuator(name).id, robot.joint_names),
         trunk_body=table(lambda name: model.body(name).id, ["trunk"])[:, 0],
-        bodies=table(lambda name: model.body(name).id, body_names),
+        bodies=table(lambda name: model.body(name).id, ["trunk", *robot.joint_names]),
         geoms=table(lambda name: model.geom(name).id, geom_names),
         trunk_force=force(_geom_names(robot, "trunk")),
-        foot_force=force(foot_names) if feet else np.zeros((0, NUM_LEGS, 3), np.int32),
+        foot_force=(
+            force(_geom_names(robot, "foot")) if feet else np.zeros((0, NUM_LEGS, 3), np.int32)
+        ),
     )
 
 

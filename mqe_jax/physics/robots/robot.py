@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError
+from mqe_jax.physics.appearance import Color, mix
 
 LEGS = ("FL", "FR", "RL", "RR")
 JOINTS = ("hip", "thigh", "calf")
@@ -30,7 +31,6 @@ PARTS = ("trunk", "hip", "thigh", "calf", "foot")
 CONTACTS: dict[str, tuple[str, ...]] = {"full": PARTS, "minimal": ("trunk", "foot")}
 
 Vector = tuple[float, float, float]
-Color = tuple[float, float, float, float]  # red, green, blue, alpha in [0, 1]
 
 
 class Mirror(NamedTuple):
@@ -185,10 +185,7 @@ class VisualShape:
 
     def mix_color(self, agent_color: Color) -> Color:
         """Returns the base colour mixed with the agent's colour."""
-        own = np.asarray(self.color)
-        agent = np.asarray(agent_color)
-        r, g, b, a = ((1.0 - self.tint) * own + self.tint * agent).tolist()
-        return r, g, b, a
+        return mix(self.color, agent_color, self.tint)
 
 
 @dataclasses.dataclass(frozen=True)
