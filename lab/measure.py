@@ -1,8 +1,9 @@
 """Measures policies by evaluations, tournaments and other calls, for every task and variant.
 
 `python -m lab.measure lab/strength.yaml --part matches --impl c` makes the measurements of a part
-that have no results yet, and tabulates their rates in runs/PART/rates.csv. Parts without `measure`
-are trainings, those of `mqe sweep`.
+that have no results yet, and tabulates their rates in runs/PART/rates.csv. A result of other
+arguments, files or another version is made again. Parts without `measure` are trainings, those of
+`mqe sweep`.
 """
 
 import argparse
@@ -18,11 +19,12 @@ from typing import Annotated, Any, NamedTuple
 from annotated_types import MinLen
 
 from mqe_jax.core.errors import InputError, InUseError
-from mqe_jax.core.files import lock, write_atomically
+from mqe_jax.core.files import lock, read_json, write_atomically
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import FrozenMapping, build, fail, settings_class
 from mqe_jax.envs.registry import task_id
 from mqe_jax.names import find
+from mqe_jax.study.provenance import provenance
 from mqe_jax.study.runs import PLAIN, table
 from mqe_jax.study.sweep import for_task, match_names, read_part
 from mqe_jax.train.policy import TrainedPolicy
@@ -80,6 +82,16 @@ class Item(NamedTuple):
     variant: str
     arguments: dict[str, Any]
     file: Path
+    provenance: dict[str, Any]
+
+    def result(self) -> dict[str, Any] | None:
+        """Returns the result in the file, if it comes from the same arguments, files and
+        version.
+        """
+        if not self.file.is_file():
+            return None
+        kept = read_json(self.file)
+        return kept["result"] if self.provenance.items() <= kept.items() else None
 
 
 def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
@@ -104,7 +116,8 @@ def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
                     arguments[name],
                     f"an argument of {part.measure}: {', '.join(known)}",
                 )
-            items.append(Item(task, variant, arguments, place / RESULT))
+            comes_from = provenance(measure=part.measure, arguments=arguments)
+            items.append(Item(task, variant, arguments, place / RESULT, comes_from))
     return items
 
 
@@ -135,7 +148,7 @@ def measure(
     names = {f"{item.task}/{item.variant}": item for item in items}
     chosen = [names[name] for name in match_names(names, cells, "*/plain")]
     for item in chosen:
-        if item.file.is_file():
+        if item.result() is not None:
             continue
         try:
             with lock(item.file.parent):
@@ -143,16 +156,16 @@ def measure(
                     item.task, **_for_robot(item.task, item.arguments)
                 )
                 plain = result if isinstance(result, dict) else result.to_dict()
-                content = {"measure": part.measure, "arguments": item.arguments, "result": plain}
+                content = {**item.provenance, "result": plain}
                 write_atomically(item.file, json.dumps(content, indent=1).encode())
         except InUseError:
             echo(f"lab: skipped, in use by another process: {item.task}/{item.variant}")
             continue
         echo(f"lab: wrote {item.file}")
-    rows = [row for item in items if item.file.is_file() for row in _rates(item)]
+    rows = [row for item in items for row in _rates(item)]
     if rows:
         write_atomically(folder / RATES, table(rows).encode())
-    return [item for item in chosen if not item.file.is_file()]
+    return [item for item in chosen if item.result() is None]
 
 
 def _for_robot(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -173,8 +186,10 @@ def _for_robot(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _rates(item: Item) -> list[dict[str, Any]]:
-    """Returns the rates of an evaluation with their intervals, a row each."""
-    result = json.loads(item.file.read_text("utf-8"))["result"]
+    """Returns the rates of an evaluation with their intervals, a row each; none without a
+    result.
+    """
+    result = item.result() or {}
     about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions")}
     return [
         {

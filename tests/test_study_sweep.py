@@ -223,14 +223,8 @@ def test_every_cell_is_checked_before_the_first_trains(
             lambda study: (study / "report").symlink_to("/proc/none"),
             "folder: .*report cannot be written",
         ),
-        (
-            lambda study: (study / "sweep.yaml").write_text(
-                "tasks: [go1gate]\nsettings: {num_envs: 8}"
-            ),
-            "settings: .* differs",
-        ),
     ],
-    ids=["file", "empty folder", "other files", "report", "other sweep"],
+    ids=["file", "empty folder", "other files", "report"],
 )
 def test_folders_are_checked_before_the_first_cell_trains(
     make: Any, message: Any, tmp_path: Path, capfd: Any
@@ -312,14 +306,6 @@ def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:
         match=r"cells: 'go1gate/mapo' matches no cell \(did you mean 'go1gate/mappo'\?\)",
     ):
         names("*/mappo", "go1gate/mapo")
-
-
-def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
-    sweep = load(tmp_path)
-    sweeps.prepare(sweep, tmp_path / "study")
-    sweeps.prepare(override(sweep, {"tasks": ("go1gate", "go1plane")}), tmp_path / "study")
-    with pytest.raises(InputError, match=r"settings: .* name another folder"):
-        sweeps.prepare(override(sweep, {"settings": {"total_steps": 9}}), tmp_path / "study")
 
 
 def test_the_commands_say_what_is_left_and_report(

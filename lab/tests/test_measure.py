@@ -218,3 +218,25 @@ def test_a_measurement_that_trains_has_a_folder(
         **found,
         "folder": str(place / "runs"),
     }
+
+
+def test_a_measurement_of_another_file_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = tmp_path / "policy"
+    seen = []
+
+    def evaluate(task: str, policy: str, *, impl: str) -> Any:
+        seen.append(Path(policy).read_text())
+        found = {"success_rate": 0.5, "intervals": {"success_rate": [0.4, 0.6]}}
+        return SimpleNamespace(to_dict=lambda: found)
+
+    monkeypatch.setattr(playing, "evaluate", evaluate)
+    part = {"measure": "evaluate", "tasks": ["go1gate"], "arguments": {"policy": str(policy)}}
+    part |= {"variants": {"one": {}, "other": {}}}
+    for text, cells in (("a", []), ("a", []), ("b", ["*/one"])):
+        policy.write_text(text)
+        measuring.measure(build(measuring.Measurement, part), tmp_path / "out", cells=cells)
+    assert seen == ["a", "a", "b"]
+    (row,) = csv.DictReader((tmp_path / "out" / "rates.csv").open())
+    assert row["variant"] == "one", "the other one is of the former file"

@@ -103,7 +103,7 @@ def sweep(
         echo(f"mqe: skipped, in use by other processes: {_names(others)}")
     if stop():
         echo(f"mqe: time limit of {time_limit:g} min; the same command resumes")
-    left = sweeps.plan(settings, folder, config_of, cells, seeds)
+    left = sweeps.remaining(jobs)
     files = reports.report(folder) if not jobs or len(left) < len(jobs) else []
     if files:
         echo(f"mqe: wrote {files[-1]} and {len(files) - 1} more files")

@@ -1,7 +1,7 @@
 """Sweeps: tasks x algorithms x variants x seeds in one folder, resumed after any interruption.
 
 FOLDER/sweep.yaml    settings of the sweep
-FOLDER/runs/...      run folders, complete, with checkpoints
+FOLDER/runs/...      run folders, complete, with checkpoints; PROVENANCE beside those of a cell
 FOLDER/report/...    the report, regenerated when the sweep ends (`mqe_jax.study.report`)
 """
 
@@ -10,7 +10,7 @@ import fnmatch
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -32,13 +32,16 @@ from mqe_jax.core.settings import (
 )
 from mqe_jax.core.types import Cast
 from mqe_jax.presets import Layers
+from mqe_jax.study.provenance import check_provenance, keep_provenance, provenance
 from mqe_jax.study.runs import PLAIN, Cell, is_finished, read_curve
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_folders
+from mqe_jax.train.policy import POLICY_FILE
 from mqe_jax.train.runner import train_seeds
 
 SWEEP_FILE = "sweep.yaml"
+PROVENANCE = "provenance.json"
 
 MakeEnvironments = Callable[[TrainConfig, int], Cast]
 """Factory of the training and evaluation environments for a given number of seeds trained
@@ -107,6 +110,7 @@ class Job:
     configs: tuple[TrainConfig, ...]
     folders: tuple[Path, ...]
     steps_done: int  # environment steps of the slowest seed's newest checkpoint
+    provenance: Mapping[str, Any]  # what its results come from
 
     @property
     def steps_left(self) -> int:
@@ -181,17 +185,20 @@ def plan(
     `seeds` are some of the sweep's, all if empty. `config_of(cell, layers)` returns the settings of
     a cell, with the sweep's changes. `check(config, seeds)` raises an InputError for settings with
     which so many seeds could not start; no cell is trained before. Seeds whose newest checkpoints
-    differ are trained in separate jobs.
+    differ are trained in separate jobs. InputError for a cell whose runs come from other settings,
+    files or another version.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
     jobs = []
     for cell in select(sweep, cells):
         config = config_of(cell, sweep.layers(cell))
+        comes_from = provenance(settings=override(config, {"seed": 0}))
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not is_finished(_run(folder, cell, seed))]
         size = sweep.seeds_together or len(sweep.seeds)
         try:
+            check_cell(folder / "runs" / cell.path, comes_from)
             check(config, min(size, len(wanted)))
             for seed in left:
                 check_folders([_run(folder, cell, seed)], resume=True)
@@ -203,10 +210,23 @@ def plan(
         }
         for name in sorted({*newest.values()}, reverse=True):  # those without a checkpoint last
             group = [seed for seed in left if newest[seed] == name]
-            jobs += [
-                _job(folder, cell, config, group[i : i + size]) for i in range(0, len(group), size)
-            ]
+            for i in range(0, len(group), size):
+                jobs.append(_job(folder, cell, config, group[i : i + size], comes_from))
     return jobs
+
+
+def check_cell(folder: Path, comes_from: Mapping[str, Any]) -> None:
+    """Raises an InputError if the runs in a cell's folder come from something else."""
+    file = folder / PROVENANCE
+    if not file.is_file() and any(folder.glob(f"*/{POLICY_FILE}")):
+        raise InputError(f"{folder}: its runs are of version 0.3 or before; name another folder")
+    check_provenance(file, comes_from)
+
+
+def remaining(jobs: Sequence[Job]) -> list[Job]:
+    """Returns the jobs that are not finished, with the steps that they have done by now."""
+    left = [job for job in jobs if not all(map(is_finished, job.folders))]
+    return [replace(job, steps_done=_steps_done(job.folders)) for job in left]
 
 
 def for_task(values: Any, task: str) -> Any:
@@ -218,11 +238,21 @@ def for_task(values: Any, task: str) -> Any:
     return values.replace("{task}", task) if isinstance(values, str) else values
 
 
-def _job(folder: Path, cell: Cell, config: TrainConfig, seeds: Sequence[int]) -> Job:
+def _job(
+    folder: Path,
+    cell: Cell,
+    config: TrainConfig,
+    seeds: Sequence[int],
+    comes_from: Mapping[str, Any],
+) -> Job:
     folders = tuple(_run(folder, cell, seed) for seed in seeds)
     configs = tuple(override(config, {"seed": seed}) for seed in seeds)
+    return Job(cell, configs, folders, _steps_done(folders), comes_from)
+
+
+def _steps_done(folders: Sequence[Path]) -> int:
     steps = [[checkpoint_step(path) for path in list_checkpoints(run)] for run in folders]
-    return Job(cell, configs, folders, min(max(own, default=0) for own in steps))
+    return min(max(own, default=0) for own in steps)
 
 
 def _run(folder: Path, cell: Cell, seed: int) -> Path:
@@ -251,29 +281,13 @@ def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
 def prepare(sweep: Sweep, folder: Path, *, write: bool = True) -> None:
     """Writes sweep.yaml into a folder, or without `write` only checks that this is possible.
 
-    Tasks, algorithms, variants and seeds may be added later; InputError for a sweep with different
-    settings.
+    Tasks, algorithms, variants and seeds may be added later.
     """
     for place in (folder, folder / "report"):
         check_folder(place, "folder")
-    path = folder / SWEEP_FILE
-    if path.is_file():
-        before = load_sweep(path)
-        for name in ("config", "settings"):
-            old = getattr(before, name)
-            new = getattr(sweep, name)
-            if old != new:
-                raise InputError(
-                    f"{name}: {new!r} differs from {path}, which has {old!r}; name another folder"
-                )
-        for name, values in before.variants.items():
-            if sweep.variants.get(name, values) != values:
-                raise InputError(
-                    f"variants.{name}: differs from {path}, which has {values!r}; name another "
-                    "folder"
-                )
     if write:
-        write_atomically(path, yaml.safe_dump(to_mapping(sweep), sort_keys=False).encode())
+        content = yaml.safe_dump(to_mapping(sweep), sort_keys=False)
+        write_atomically(folder / SWEEP_FILE, content.encode())
 
 
 class Unfinished(NamedTuple):
@@ -316,5 +330,6 @@ def _train(job: Job, environments: MakeEnvironments, stop: Callable[[], bool]) -
     with contextlib.ExitStack() as locks:  # before the environments are made, which takes seconds
         for run_dir in job.folders:
             locks.enter_context(lock(run_dir))
+    keep_provenance(job.folders[0].parent / PROVENANCE, job.provenance)
     cast = environments(job.configs[0], len(job.configs))
     train_seeds(cast, job.configs, job.folders, resume=True, stop=stop)

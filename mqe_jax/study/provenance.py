@@ -1,0 +1,76 @@
+"""What kept results come from: the version, what was passed, and the contents of its files."""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import mqe_jax
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import read_json, write_atomically
+from mqe_jax.core.settings import leaves, to_mapping
+from mqe_jax.envs.registry import TASKS
+from mqe_jax.train.policy import POLICY_FILE
+
+
+def provenance(**passed: Any) -> dict[str, Any]:
+    """Returns what a result comes from, as JSON has it: what was passed, by name, the package's
+    `version`, and `files`, the digests of the files that are named in it.
+    """
+    plain = to_mapping({"version": mqe_jax.__version__, **passed})
+    return {**plain, "files": digests(plain)}
+
+
+def digests(values: Any) -> dict[str, str]:
+    """Returns the SHA-256 of every file, and of the policy of every run folder, that a text in
+    nested values names.
+    """
+    named = {text: digest(text) for text in _texts(values) if text and text not in TASKS}
+    return {text: found for text, found in named.items() if found is not None}
+
+
+def digest(path: str | Path) -> str | None:
+    """Returns the SHA-256 of a file, or of the policy of a run folder; None without one."""
+    # of os.path, which take texts that cannot be paths
+    file = os.path.join(path, POLICY_FILE) if os.path.isdir(path) else path
+    if not os.path.isfile(file):
+        return None
+    with open(file, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def _texts(values: Any) -> Iterator[str]:
+    """Yields the texts in nested mappings and lists, without names of mappings."""
+    if isinstance(values, str):
+        yield values
+    elif isinstance(values, Mapping | list):
+        for value in values.values() if isinstance(values, Mapping) else values:
+            yield from _texts(value)
+
+
+def check_provenance(file: Path, wanted: Mapping[str, Any]) -> None:
+    """Raises an InputError if the results beside a file, which `keep_provenance` wrote, come from
+    something else.
+    """
+    if not file.is_file():
+        return
+    before = read_json(file)
+    if before == wanted:
+        return
+    hint = f"the results in {file.parent}; name another folder"
+    old = {name: value for name, value in leaves(before) if value != {}}
+    new = {name: value for name, value in leaves(wanted) if value != {}}
+    for name in {**new, **old}:
+        if old.get(name) != new.get(name):
+            if name.startswith("files."):
+                raise InputError(f"{name.removeprefix('files.')}: has changed since {hint}")
+            short = name.removeprefix("settings.")
+            raise InputError(f"{short}: {new.get(name)!r} differs from {old.get(name)!r} of {hint}")
+
+
+def keep_provenance(file: Path, wanted: Mapping[str, Any]) -> None:
+    """Writes what the results beside a file come from; errors as `check_provenance`."""
+    check_provenance(file, wanted)
+    write_atomically(file, json.dumps(wanted, indent=1).encode())
