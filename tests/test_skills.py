@@ -398,9 +398,7 @@ def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     env = versus(BothSides(batch), [policies["walk"], policies["agile"]])
     own = names.seat(policies["agile"], match)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    action = jax.jit(own.act)(
-        observations(state).to(own), own.initial_memory(4), jax.random.PRNGKey(1)
-    )[0]
+    action = jax.jit(own.act)(observations(state), own.initial_memory(4), jax.random.PRNGKey(1))[0]
     state = jax.jit(env.step)(state, action)
     np.testing.assert_array_equal(
         state.match.inner.control.skill["acting"], [[1, 0], [1, 1], [0, 1], [1, 1]]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, Protocol, Self
 
 import jax
@@ -16,7 +16,8 @@ from mqe_jax.core.types import (
     AnyPolicy,
     Memory,
     Observations,
-    check_act,
+    is_typed_key,
+    shapes_of,
     teams_of,
     where_rows,
 )
@@ -94,6 +95,11 @@ def actor_of(policy: Policy) -> Any:
     """Returns the `actor` of a trained policy, a pytree of its arrays; of any other a `Fixed`."""
     actor = getattr(policy, "actor", None)
     return Fixed(policy) if actor is None else actor
+
+
+def groups_of(policies: Iterable[Policy]) -> frozenset[str]:
+    """Returns the groups of observations that policies see, which `VectorEnv.with_groups` adds."""
+    return frozenset(name for policy in policies for name in actor_of(policy).groups)
 
 
 @jax.tree_util.register_dataclass
@@ -178,7 +184,7 @@ class Seat:
         rows = self.rows(len(action))
         own = jax.tree.map(lambda x: x[rows, _index(self.sees)], seen)
         shape = (len(own.obs), len(self.sees), action.shape[-1])
-        chosen, memory = check_act("policy", self.policy.act(own, memory, key), shape, memory)
+        chosen, memory = _check_act(self.policy.act(own, memory, key), shape, memory)
         chosen = chosen[:, _index(tuple(self.sees.index(agent) for agent in self.acts))]
         return action.at[rows, _index(self.acts)].set(chosen), memory
 
@@ -187,6 +193,24 @@ def _index(agents: tuple[int, ...]) -> slice | np.ndarray:
     """Returns agents as an index of an array, if possible a slice."""
     whole = slice(agents[0], agents[-1] + 1)
     return whole if agents == tuple(range(whole.start, whole.stop)) else np.array(agents)
+
+
+def _check_act(returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
+    """Returns what a policy's `act` returned: actions, and a recurrent state like its `memory`.
+
+    Actions have the passed shape. InputError for anything else.
+    """
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        found = f"a function that returns {type(returned).__name__}"
+        fail("policy", found, "one that returns (action, memory)")
+    action, after = returned
+    expected = shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32))
+    if shapes_of(action) != expected or is_typed_key(action):
+        given = getattr(action, "shape", type(action).__name__)
+        fail("policy", f"a function that returns actions {given}", f"one that returns {shape}")
+    if shapes_of(after) != shapes_of(memory):
+        fail("policy", "a function that changes its memory's structure", "one that keeps it")
+    return action, after
 
 
 @jax.tree_util.register_dataclass
@@ -202,7 +226,7 @@ class Seats:
         from mqe_jax.acting.evaluate import evaluate_batch
         from mqe_jax.acting.seats import Seats
 
-        batch = mqe_jax.VectorEnv(mqe_jax.make("go1tug", impl="c", skill="agile"), 4)
+        batch = mqe_jax.VectorEnv(mqe_jax.make("go1tug", impl="c", episode_length=1.0), 4)
         teams = [mqe_jax.load_policy(name, batch.env) for name in ("forward", "idle")]
         print(evaluate_batch(batch, Seats.of_teams(batch, *teams), 4, jax.random.PRNGKey(0)).win)
         ```

@@ -13,7 +13,6 @@ import pydantic
 from jax.core import Tracer
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import fail
 
 PyTree = Any
 Params = dict[str, Any]
@@ -203,27 +202,6 @@ def shapes_of(tree: PyTree) -> Any:
     return jax.tree.structure(tree), shapes
 
 
-def check_act(
-    name: str, returned: Any, shape: tuple[int, ...], memory: Memory
-) -> tuple[jax.Array, Memory]:
-    """Returns what a policy's `act` returned: actions, and a recurrent state like its `memory`.
-
-    Actions have the passed shape. InputError, naming the argument that the policy is, for anything
-    else.
-    """
-    if not isinstance(returned, tuple | list) or len(returned) != 2:
-        found = f"a function that returns {type(returned).__name__}"
-        fail(name, found, "one that returns (action, memory)")
-    action, after = returned
-    expected = shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32))
-    if shapes_of(action) != expected or is_typed_key(action):
-        given = getattr(action, "shape", type(action).__name__)
-        fail(name, f"a function that returns actions {given}", f"one that returns {shape}")
-    if shapes_of(after) != shapes_of(memory):
-        fail(name, "a function that changes the structure of its memory", "one that keeps it")
-    return action, after
-
-
 def raw_keys(tree: PyTree) -> PyTree:
     """Returns a pytree with its typed random keys as numbers, which can be saved."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if is_typed_key(x) else x, tree)
@@ -299,15 +277,6 @@ class Observations:
         """Observations of the group `policy` (N, A, O)."""
         return self.group("policy")
 
-    def of(self, agents: slice) -> "Observations":
-        """Returns what some of the agents see."""
-
-        def cut(x: jax.Array) -> jax.Array:
-            return x[..., agents, :]
-
-        active = None if self.active is None else self.active[..., agents]
-        return Observations(jax.tree.map(cut, self.groups), active)
-
     def group(self, name: str) -> jax.Array:
         """Returns the observations of a group (N, A, O_g); InputError if they are missing."""
         if name not in self.groups:
@@ -316,10 +285,6 @@ class Observations:
                 f"{', '.join(self.groups)}"
             )
         return self.groups[name]
-
-    def to(self, policy: Any) -> Any:
-        """Returns the argument of a policy's `act`: these, or an array for one without `groups`."""
-        return self if hasattr(policy, "groups") else self.obs
 
     @classmethod
     def at(cls, seen: Any, group: str = "policy") -> "Observations":

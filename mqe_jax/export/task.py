@@ -27,7 +27,7 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.acting.seats import Policy
+from mqe_jax.acting.seats import Policy, groups_of
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.observation import finite
@@ -36,7 +36,6 @@ from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, sensed_shape
 from mqe_jax.export.translate import Function
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.sensors.suite import ONBOARD
-from mqe_jax.train.policy import groups_of
 
 PHYSICS = ("qpos", "qvel", "sensordata")
 """Arrays of the physics state that tasks read."""
@@ -203,7 +202,7 @@ def policy_function(policy: Policy, functions: TaskFunctions) -> tuple[Function,
 
     The function samples if `policy` does.
     """
-    sensed = groups_of(policy) == {ONBOARD}
+    sensed = groups_of([policy]) == {ONBOARD}
     act, shapes = _act_on_readings(
         policy, functions.env.group_sizes[ONBOARD if sensed else "policy"]
     )

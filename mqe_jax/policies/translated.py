@@ -18,11 +18,33 @@ from mqe_jax.core.types import Memory, Observations
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.skills import SKILLS
 from mqe_jax.skills.control import Commander
-from mqe_jax.train.policy import Composed, TrainedPolicy
+from mqe_jax.train.policy import TrainedPolicy
 
 
 @dataclasses.dataclass(frozen=True)
-class Translated(Composed):
+class _Around:
+    """A policy around another one, of the same task and team."""
+
+    policy: Any
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return self.policy.task
+
+    @property
+    def agents(self) -> int:
+        """Number of agents of the team."""
+        return self.policy.agents
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of observations that the policy sees."""
+        return self.policy.groups
+
+
+@dataclasses.dataclass(frozen=True)
+class Translated(_Around):
     """A trained policy whose actions mean `own`, as a policy of a task whose actions mean
     `here`.
     """
@@ -33,8 +55,6 @@ class Translated(Composed):
     sensed: slice | None = None
     """Place of the last action, as it means here, in the policy's observations; None if they lack
     it."""
-
-    _parts = property(lambda self: (self.policy,))
 
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns the initial recurrent state of the policy; if it sees its last action, with
@@ -62,15 +82,13 @@ class Translated(Composed):
 
 
 @dataclasses.dataclass(frozen=True)
-class Silent(Composed):
+class Silent(_Around):
     """A policy without sensors, as a policy of a task whose robots send messages of `numbers`
     numbers: zeros.
     """
 
     policy: Policy
     numbers: int
-
-    _parts = property(lambda self: (self.policy,))
 
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns the initial recurrent state of the policy."""

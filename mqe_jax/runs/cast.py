@@ -6,7 +6,7 @@ from typing import Any
 import jax
 
 from mqe_jax import names
-from mqe_jax.acting.seats import Policy, Seats
+from mqe_jax.acting.seats import Policy, Seats, groups_of
 from mqe_jax.core.limits import Environments, SeedCount, bounds
 from mqe_jax.core.settings import check_arguments, fail, leaves, override, to_mapping
 from mqe_jax.core.types import Cast
@@ -25,7 +25,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import Learner
 from mqe_jax.train.logs import check_loggers
 from mqe_jax.train.needs import needs_of
-from mqe_jax.train.policy import TrainedPolicy, groups_of
+from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.start import initial_key, policy_to_start, start_from
 
 _MOST = int(bounds(Environments)[1])
@@ -146,7 +146,10 @@ def environments(
     policies = names.seats(roles, trained, read)
     teacher = policies.get(config.imitation.teacher or "")
     demonstrator = policies.get(config.curriculum.demonstrator or "")
-    groups = {config.group, *groups_of(*(policies[name] for name in roster.fixed), teacher)}
+    seeing = [policies[name] for name in roster.fixed]
+    if teacher is not None:
+        seeing.append(teacher)
+    groups = {config.group, *groups_of(seeing)}
     both = match and not config.opponents
     batch = _batch(trained, config, num_envs // 2 if both else num_envs, seeds, demonstrator)
     env: Any = batch.with_groups(groups)

@@ -36,34 +36,6 @@ from mqe_jax.train.normalize import RunningStatistics, running_init, running_nor
 POLICY_FILE = "policy.safetensors"
 
 
-def groups_of(*policies: Any) -> set[str]:
-    """Returns the groups of observations that policies see, which `VectorEnv.with_groups` adds."""
-    return {name for policy in policies for name in getattr(policy, "groups", ())}
-
-
-class Composed:
-    """What policies made of others share: the task and the agents of the first, and the groups of
-    all.
-    """
-
-    _parts: Any  # the policies
-
-    @property
-    def task(self) -> str:
-        """Id of the task."""
-        return self._parts[0].task
-
-    @property
-    def agents(self) -> int:
-        """Number of agents of the team."""
-        return self._parts[0].agents
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """The groups of observations that the policies see."""
-        return tuple(groups_of(*self._parts))
-
-
 class Form(NamedTuple):
     """What trained policies have in common if they can be exchanged within compiled code."""
 
