@@ -76,7 +76,9 @@ def named(name: str, env: QuadrupedEnv, field: str = "policy") -> SimplePolicy:
     else:
         _check_scripted(name, env, field)
         plan = functools.partial(_act_scripted, env, name)
-    identity = (name, type(env), env.params, env.control)
+    identity = None
+    if isinstance(env, QuadrupedEnv):
+        identity = (name, type(env), env.params, env.control)
     return SimplePolicy(env.name, agents, plan, name, identity)
 
 
