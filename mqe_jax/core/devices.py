@@ -41,8 +41,9 @@ _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
 
 
 def platform() -> str:
-    """Returns the platform of JAX; raises an InputError if JAX_PLATFORMS selects an unavailable
-    one.
+    """Returns the platform of JAX.
+
+    InputError if JAX_PLATFORMS selects an unavailable one.
     """
     try:
         return jax.default_backend()

@@ -1,5 +1,6 @@
-"""The web page on which policies play in the reader's browser: its files, and a folder for every
-task.
+"""The web page on which policies play in the reader's browser.
+
+It consists of its own files and a folder for every task.
 
 A task's folder has `scene.xml` (MJCF), `scene.json` (`mqe_jax.export.scene`, and the entries of
 `Entry.settings`), the graphs of `mqe_jax.export.task`, and `starts.bin`: `STARTS` initial states
@@ -54,31 +55,31 @@ _SIZED = re.compile(r"([\w-]+):(\w+=\d{1,9}(?:,\w+=\d{1,9})*)")
 class Entry:
     """A task with its parameters and its policies by name, the first of which plays by default."""
 
-    name: str  # of its folder
+    name: str
+    """Name of the task's folder."""
     env: QuadrupedEnv
-    policies: dict[str, Policy]  # of a team; `idle` is always possible on the page
+    policies: dict[str, Policy]
+    """Policies of a team; `idle` is always possible on the page."""
 
     def write(self, folder: Path) -> None:
-        """Writes the task's files into its folder in a site; InputError for a graph that differs
-        from JAX.
+        """Writes the task's files into its folder in a site.
+
+        InputError for a graph that differs from JAX.
         """
         own = folder / "tasks" / self.name
         env = self.env
         own.mkdir(parents=True, exist_ok=True)
         functions = TaskFunctions(env)
         starts = start_states(env)
-        graphs = {
-            "control": _graph(
-                functions.control, functions.control_inputs, f"{self.name}_control", starts
-            ),
-            "judge": _graph(functions.judge, functions.judge_inputs, f"{self.name}_judge", starts),
-        }
+        control = (functions.control, functions.control_inputs, f"{self.name}_control")
+        judge = (functions.judge, functions.judge_inputs, f"{self.name}_judge")
+        graphs = {"control": _graph(*control, starts), "judge": _graph(*judge, starts)}
         files = {f"{name}.onnx": graph for name, graph in graphs.items()}
         rows = []
-        for name, policy in self.policies.items():
-            graph = _graph(*policy_function(policy, functions), f"{self.name}_policy", starts)
-            files[f"policy-{len(rows)}.onnx"] = graph
-            rows.append({"name": name, "file": f"policy-{len(rows)}.onnx", **shapes(graph)})
+        for number, (name, policy) in enumerate(self.policies.items()):
+            file = f"policy-{number}.onnx"
+            files[file] = _graph(*policy_function(policy, functions), f"{self.name}_policy", starts)
+            rows.append({"name": name, "file": file, **shapes(files[file])})
         for name, graph in files.items():
             write_atomically(own / name, graph.SerializeToString())
         values, layout = pack(starts)
@@ -125,10 +126,8 @@ def write_site(
         entry.write(folder)
     for file in PAGE.iterdir():
         write_atomically(folder / file.name, file.read_bytes())
-    tasks = [
-        {"name": entry.name, "title": title}
-        for entry, title in zip(found, titles(found), strict=True)
-    ]
+    named = zip(found, titles(found), strict=True)
+    tasks = [{"name": entry.name, "title": title} for entry, title in named]
     write_atomically(folder / "site.json", json.dumps({"tasks": tasks}).encode())
     write_atomically(folder / "package.json", b'{"type": "module"}\n')  # for Node
     return found
@@ -144,13 +143,10 @@ def entries(sources: Sequence[str]) -> list[Entry]:
         entry = next((entry for *key, entry in found if key == [task, params]), None)
         if entry is None:
             count = sum(known == task for known, *_ in found)
-            own = {
-                name: value
-                for name, value in params.items()
-                if not name.startswith("randomization")
-            }
+            kept = [name for name in params if not name.startswith("randomization")]
+            own = {name: params[name] for name in kept}
             env = names.environment(task, {**own, "randomization": Randomization()})
-            entry = Entry(task if not count else f"{task}-{count + 1}", env, {})
+            entry = Entry(f"{task}-{count + 1}" if count else task, env, {})
             found.append((task, params, entry))
         for name, policy in policies.items():
             if policy.needs.group not in ("policy", ONBOARD):
@@ -158,7 +154,8 @@ def entries(sources: Sequence[str]) -> list[Entry]:
                     f"{source}: sees the group {policy.needs.group!r}; the page has 'policy' and "
                     f"{ONBOARD!r}"
                 )
-            if images := [block.name for block in policy.needs.dims.blocks if block.image]:
+            images = [block.name for block in policy.needs.dims.blocks if block.image]
+            if images:
                 raise InputError(f"{source}: sees {images[0]}; the page has no images")
             short = name if name == "shipped" else _short(Path(name), entry.policies)
             entry.policies[short] = names.fit(policy, entry.env, name=source)
@@ -169,8 +166,9 @@ def entries(sources: Sequence[str]) -> list[Entry]:
 
 
 def _named(source: str) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
-    """Returns the task, its parameters and the trained policy, by `shipped` or its path, that a
-    source stands for.
+    """Returns the task, its parameters and the trained policy that a source stands for.
+
+    The policy is by `shipped` or its path.
     """
     read: names.Read = {}
     sized = _SIZED.fullmatch(source)
@@ -187,60 +185,48 @@ def _named(source: str) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
 
 
 def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
-    """Returns a task's parameters with the walk policy and the agile skill, one of which policies
-    and keys choose.
+    """Returns a task's parameters with the walk policy and the agile skill.
+
+    Policies and keys choose one of them.
     """
-    plain = override(
-        TASKS[task].Params(), {name: value for name, value in params.items() if name != "control"}
-    )
+    settings = {name: value for name, value in params.items() if name != "control"}
+    plain = override(TASKS[task].Params(), settings)
     known = [command.name for command in AgileSkill.commands]
-    if (
-        plain.skill not in ("walk", "agile")
-        or plain.skill_weights
-        or not {*plain.commands} <= {*known}
-    ):
+    shipped = plain.skill in ("walk", "agile") and not plain.skill_weights
+    if not shipped or not {*plain.commands} <= {*known}:
         return params
-    ranges = dict(
-        zip(known, AgileSkill(robots.get(plain.robot)).trained_ranges(known).tolist(), strict=True)
-    )
-    # any skill's default
+    trained = AgileSkill(robots.get(plain.robot)).trained_ranges(known).tolist()
+    ranges = dict(zip(known, trained, strict=True))
+    # No gait is any skill's default.
     params = {name: value for name, value in params.items() if (name, value) != ("gait", None)}
-    each = [
-        plain.actions("command"),
-        *({"skill": name, "command_ranges": ranges} for name in ("walk", "agile")),
-    ]
-    return {**params, **together(each)}
+    walk = {"skill": "walk", "command_ranges": ranges}
+    agile = {"skill": "agile", "command_ranges": ranges}
+    return {**params, **together([plain.actions("command"), walk, agile])}
 
 
 def _short(path: Path, taken: Iterable[str]) -> str:
-    """Returns the name of a run on the page: the last part of its path, or the last two if that is
-    taken.
-    """
+    """Returns the name of a run on the page: the last part of its path, or two if that is taken."""
     last = path.name if path.is_dir() else path.stem
     names = (last, f"{path.parent.name}/{last}")
-    if free := [name for name in names if name not in {*taken, "shipped", "scripted", "idle"}]:
-        return free[0]
-    fail(
-        "run",
-        str(path),
-        f"a path whose last parts differ from {' and '.join(names)}, which are taken",
-    )
+    for name in names:
+        if name not in {*taken, "shipped", "scripted", "idle"}:
+            return name
+    known = " and ".join(names)
+    fail("run", str(path), f"a path whose last parts differ from {known}, which are taken")
 
 
 def titles(found: Sequence[Entry]) -> list[str]:
     """Returns the titles of tasks, with a number if an earlier one is equal."""
     headings = [entry.env.heading for entry in found]
-    before = [headings[:place].count(heading) for place, heading in enumerate(headings)]
-    return [
-        f"{heading} {count + 1}" if count else heading
-        for heading, count in zip(headings, before, strict=True)
-    ]
+    numbered = []
+    for place, heading in enumerate(headings):
+        count = headings[:place].count(heading)
+        numbered.append(f"{heading} {count + 1}" if count else heading)
+    return numbered
 
 
 def start_states(env: QuadrupedEnv) -> dict[str, np.ndarray]:
-    """Returns `STARTS` initial states by name, leading axis `STARTS`: the state, `mocap_pos` and
-    `obs`.
-    """
+    """Returns initial states by name, leading axis `STARTS`: the state, `mocap_pos` and `obs`."""
 
     def start(key: jax.Array) -> dict[str, jax.Array]:
         state = env.reset(key)
@@ -264,8 +250,9 @@ def pack(states: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
-    """Writes the skill of a task's robots unless it is there; returns its file and the shapes of
-    its graph.
+    """Writes the skill of a task's robots unless it is there.
+
+    Returns its file and the shapes of its graph.
     """
     graph = _graph(*skill_function(env), env.controller.skill.name, {})
     content = graph.SerializeToString()
@@ -278,8 +265,9 @@ def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
 def _graph(
     function: Function, inputs: dict[str, tuple[int, ...]], name: str, states: dict[str, np.ndarray]
 ) -> onnx.ModelProto:
-    """Returns the graph of a function, checked on initial states if they have its inputs, else on
-    random numbers.
+    """Returns the graph of a function, checked on initial states if they have its inputs.
+
+    Otherwise it is checked on random numbers.
     """
     random = np.random.default_rng(0)
     known = {**states, **{f"before_{key}": np.roll(x, 1, axis=0) for key, x in states.items()}}
