@@ -25,6 +25,7 @@ from mqe_jax.viz.recording import Episode
 from tests.fake_env import FakeEnv
 from tests.inputs import refuses
 from tests.states import initial, made, placed
+from tools.clips import typical
 
 env = pytest.fixture(scope="module")(lambda: FakeEnv())
 
@@ -51,8 +52,8 @@ def test_the_typical_episode_is_the_median_of_the_successful_ones(
     episodes = [
         dataclasses.replace(episode, success=success, reward=reward) for success, reward in rated
     ]
-    assert recording.typical(episodes) is episodes[4]  # of 0.5, then 0.1, 0.2 and 0.3
-    assert recording.typical(episodes[1:2]) is episodes[1]
+    assert typical(episodes) is episodes[4]  # of 0.5, then 0.1, 0.2 and 0.3
+    assert typical(episodes[1:2]) is episodes[1]
 
 
 def test_success_is_settled_from_its_last_change_on(env: Any, episode: recording.Episode) -> None:

@@ -20,7 +20,7 @@ from mqe_jax.viz.cameras import cameras
 from mqe_jax.viz.clips import write_clip
 from mqe_jax.viz.framing import legend
 from mqe_jax.viz.geometry import rendering_model
-from mqe_jax.viz.recording import record_episodes, typical
+from mqe_jax.viz.recording import Episode, record_episodes
 from mqe_jax.viz.render import render_frames
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -39,6 +39,16 @@ SIZES: dict[str, tuple[str, dict[str, Any]]] = {
     "football-5vs5": ("go1football-1vs1", {"num_agents": 10}),
 }
 """Tasks with sizes that their scripted policies play, by the names of their clips."""
+
+
+def typical(episodes: list[Episode]) -> Episode:
+    """Returns the median of the successful episodes, else of all.
+
+    They are ranked by success, then by average step reward.
+    """
+    successful = [episode for episode in episodes if episode.success > 0] or episodes
+    ranked = sorted(successful, key=lambda episode: (episode.success, episode.reward))
+    return ranked[len(ranked) // 2]
 
 
 def write(name: str) -> None:

@@ -50,21 +50,20 @@ class Tasks:
         """Lists the tasks with their default parameters, without importing JAX or MuJoCo."""
         from mqe_jax.envs.registry import SHIPPED
 
-        rows = []
-        for name, task in SHIPPED.items():
-            rows.append(
-                {
-                    "task": name,
-                    "title": task.title,
-                    "agents": sum(task.teams),
-                    "teams": len(task.teams),
-                    "observation": task.observation,
-                    "privileged": task.privileged,
-                    "sizes": task.sizes,
-                    "time_limit_s": task.time_limit,
-                    "shipped_policy": (_ZOO / f"{name}.safetensors").is_file(),
-                }
-            )
+        rows = [
+            {
+                "task": name,
+                "title": task.title,
+                "agents": sum(task.teams),
+                "teams": len(task.teams),
+                "observation": task.observation,
+                "privileged": task.privileged,
+                "sizes": task.sizes,
+                "time_limit_s": task.time_limit,
+                "shipped_policy": (_ZOO / f"{name}.safetensors").is_file(),
+            }
+            for name, task in SHIPPED.items()
+        ]
         if self.json:
             return {"tasks": rows}
         columns = {
@@ -137,13 +136,12 @@ def _print_card(task: str, card: Any, plain: dict[str, Any]) -> None:
     for name, share in card.endings.items():
         shown[f"ends by {name}"] = str(Rate.of(share, rated.episodes))
     ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in plain["commands"].items())
-    minutes = "not recorded" if card.gpu_minutes is None else f"{card.gpu_minutes:g}"
     shown |= {
         "skill": f"{plain['skill']}: {', '.join(ranges)}",
         "trained": card.date,
         "command": card.command,
         "note": card.note,
-        "GPU minutes": minutes,
+        "GPU minutes": "not recorded" if card.gpu_minutes is None else f"{card.gpu_minutes:g}",
         "acts": card.mode,
         "task version": plain["version"],
     }

@@ -79,9 +79,6 @@ class SkillConvert:
                 f"output: {str(self.output)!r} is not allowed; it must end in .safetensors"
             )
         check_output(self.output)
-        for path in (self.adaptation, self.body):
-            if not path.is_file():
-                raise InputError(f"{path}: no such file; it must be a TorchScript checkpoint")
         params = convert(self.adaptation, self.body)
         about = {"robot": robots.get(self.robot).name}
         walk_policy.save_params(params, self.output, about, half=self.float16)

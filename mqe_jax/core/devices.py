@@ -155,18 +155,11 @@ class Processes:
     takes about 30 us per array.
     """
 
-    count: int
-    """Number of processes."""
-    leads: bool
-    """Whether this process writes the files."""
-    whole: PyTree
-    """Shapes of the state of all environments."""
-
     def __init__(self, own: PyTree, whole: PyTree) -> None:
         """Takes the shapes of a process's part of the state, and of the whole state."""
-        self.count = jax.process_count()
-        self.leads = jax.process_index() == 0
-        self.whole = whole
+        self.count = jax.process_count()  # of the training
+        self.leads = jax.process_index() == 0  # whether this process writes the files
+        self.whole = whole  # shapes of the state of all environments
         devices = jax.local_device_count()
         if self.count > 1 and devices > 1:
             raise InputError(f"processes: one has {devices} devices; it must have one")

@@ -254,11 +254,12 @@ def linear_layers(
             raise InputError(
                 f"{what}: {name} holds magnitudes to {most:g}; at most {limits.WEIGHT:g} is allowed"
             )
-    layers = {}
-    for layer in sizes:
-        weight = np.asarray(arrays[f"{layer}.weight"], np.float32)
-        layers[layer] = {"weight": weight, "bias": np.asarray(arrays[f"{layer}.bias"], np.float32)}
-    return layers
+    return {
+        layer: {
+            part: np.asarray(arrays[f"{layer}.{part}"], np.float32) for part in ("weight", "bias")
+        }
+        for layer in sizes
+    }
 
 
 @contextlib.contextmanager

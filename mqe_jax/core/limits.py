@@ -81,10 +81,12 @@ def bounds(kind: Any) -> tuple[float, float]:
     """
     step = int(typing.get_args(kind)[0] is int)
     given: Any = kind.__metadata__
-    low = [-math.inf]
-    low += [x.ge for x in given if hasattr(x, "ge")]
-    low += [x.gt + step for x in given if hasattr(x, "gt")]
-    high = [math.inf]
-    high += [x.le for x in given if hasattr(x, "le")]
-    high += [x.lt - step for x in given if hasattr(x, "lt")]
-    return max(low), min(high)
+    low = [
+        *(x.ge for x in given if hasattr(x, "ge")),
+        *(x.gt + step for x in given if hasattr(x, "gt")),
+    ]
+    high = [
+        *(x.le for x in given if hasattr(x, "le")),
+        *(x.lt - step for x in given if hasattr(x, "lt")),
+    ]
+    return max(low, default=-math.inf), min(high, default=math.inf)

@@ -46,8 +46,7 @@ def verify(
     Errors are as those of `verify_policy`.
     """
     model = translate(function, shapes, name)
-    expected = jax.device_get(jax.jit(jax.vmap(function))(inputs))
-    check_errors(model, inputs, expected, name)
+    check_errors(model, inputs, jax.device_get(jax.jit(jax.vmap(function))(inputs)), name)
     return model
 
 

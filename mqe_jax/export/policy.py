@@ -114,11 +114,10 @@ def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
 
 def name_arrays(prefix: str, memory: Any) -> dict[str, Any]:
     """Returns the arrays of a recurrent state by name."""
-    named = {}
-    for path, x in jax.tree_util.tree_flatten_with_path(memory)[0]:
-        keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
-        named["_".join([prefix, *keys])] = x
-    return named
+    return {
+        "_".join([prefix, *(jax.tree_util.keystr((key,), simple=True) for key in path)]): x
+        for path, x in jax.tree_util.tree_leaves_with_path(memory)
+    }
 
 
 def fill_arrays(prefix: str, memory: Any, inputs: Mapping[str, jax.Array]) -> Any:

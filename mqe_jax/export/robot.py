@@ -23,9 +23,6 @@ _HEAD = struct.Struct("<II")
 class Robot:
     """One robot in N episodes; it keeps the recurrent state of its graph."""
 
-    properties: Mapping[str, str]
-    """Metadata of the graph."""
-
     def __init__(self, graph: str | bytes, seed: int = 0) -> None:
         """Loads a graph, a file or its content."""
         import onnxruntime
@@ -38,7 +35,8 @@ class Robot:
         self._outputs = [x.name for x in self._session.get_outputs()]
         self._random = np.random.default_rng(seed)
         self._memory: dict[str, np.ndarray] = {}
-        self.properties = self._session.get_modelmeta().custom_metadata_map
+        # metadata of the graph
+        self.properties: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
 
     def act(self, readings: np.ndarray, starts: np.ndarray) -> np.ndarray:
         """Returns the actions (N, D) for readings (N, O).

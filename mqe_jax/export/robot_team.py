@@ -37,31 +37,15 @@ class RobotTeam:
     state, so that the one of `act` only says whether the episode has started.
     """
 
-    file: Path
-    """The graph of one robot."""
-    needs: Needs
-    """What the team needs of its environment."""
-    config: TrainConfig
-    """Settings of which `unmet` reads the group of observations."""
-    task: str
-    agents: int
-    """Number of robots A."""
-    groups: tuple[str, ...]
-    """The group of observations that the robots see."""
-    deterministic: bool
-    """Whether the robots act with their mean actions."""
-    failure: str
-    """Why a process ended, if one did."""
-
     def __init__(self, file: Path, needs: Needs, deterministic: bool, seed: int) -> None:
-        self.file = file
-        self.needs = needs
-        self.deterministic = deterministic
-        self.failure = ""
-        self.config = build(TrainConfig, {"group": needs.group})
+        self.file = file  # the graph of one robot
+        self.needs = needs  # of the environment
+        self.deterministic = deterministic  # whether the actions are means
+        self.failure = ""  # why a process ended, if one did
+        self.config = build(TrainConfig, {"group": needs.group})  # for `unmet`
         self.task = needs.task
-        self.agents = needs.dims.agents
-        self.groups = (needs.group,)
+        self.agents = needs.dims.agents  # number of robots A
+        self.groups: tuple[str, ...] = (needs.group,)  # of observations that the robots see
         seeds = np.random.SeedSequence(seed).generate_state(self.agents)
         self._processes = [_Process(file, number, int(own)) for number, own in enumerate(seeds)]
 

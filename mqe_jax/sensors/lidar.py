@@ -53,13 +53,16 @@ class Lidar(Sensor):
         distance = readings["lidar"]
         hits = origin + distance[..., None] * self._directions(scene, snapshot)
         lines = jnp.stack([jnp.broadcast_to(origin, hits.shape), hits], axis=2)
-        shown = {
-            "lines": lines,
-            "line_opacity": 1.0,
-            "points": hits,
-            "point_opacity": distance < 0.99 * self.range,
-        }
-        return (marks("lidar", _COLOR, snapshot.height, **shown),)
+        return (
+            marks(
+                "lidar",
+                _COLOR,
+                snapshot.height,
+                lines=lines,
+                points=hits,
+                point_opacity=distance < 0.99 * self.range,
+            ),
+        )
 
     def _directions(self, scene: SensedScene, snapshot: Snapshot) -> jax.Array:
         """Returns the rays' unit vectors (A, rays, 2)."""

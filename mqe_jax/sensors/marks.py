@@ -64,8 +64,13 @@ def marks(
 
     ends = raised(lines, 0, 2)
     spots = raised(points, 0)
-    shown = {
-        "line_opacity": opacity(line_opacity, ends),
-        "point_opacity": opacity(point_opacity, spots),
-    }
-    return Marks(label, color, bold, lines=ends, points=spots, area=raised(area, 0), **shown)
+    return Marks(
+        label,
+        color,
+        bold,
+        lines=ends,
+        line_opacity=opacity(line_opacity, ends),
+        points=spots,
+        point_opacity=opacity(point_opacity, spots),
+        area=raised(area, 0),
+    )

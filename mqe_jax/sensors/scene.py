@@ -136,14 +136,12 @@ class SensedScene:
     def outlines(self) -> dict[int, Circle | Rectangle]:
         """Outlines of entities by their rows of `Snapshot.places`."""
         objects = self.compiled.scene.objects
-        found = {}
-        for row, entity in enumerate(self.entities, start=self.num_robots):
-            if (
-                isinstance(entity.place, str)
-                and (outline := objects[entity.place].outline) is not None
-            ):
-                found[row] = outline
-        return found
+        outlines = {
+            row: objects[entity.place].outline
+            for row, entity in enumerate(self.entities, start=self.num_robots)
+            if isinstance(entity.place, str)
+        }
+        return {row: outline for row, outline in outlines.items() if outline is not None}
 
     @functools.cached_property
     def owners(self) -> np.ndarray:

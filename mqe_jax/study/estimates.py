@@ -186,17 +186,29 @@ def aggregate_tables(cells: Cells) -> dict[str, Rows]:
         scores = score_matrices(cells, variant)
         for name, values in scores.items():
             middle, low, high = map(float, estimate(statistics.interquartile_mean, values))
-            row = {
-                "variant": variant,
-                "algorithm": name,
-                "runs": len(values),
-                "tasks": values.shape[1],
-            }
-            total.append({**row, "iqm": middle, "low": low, "high": high})
+            total.append(
+                {
+                    "variant": variant,
+                    "algorithm": name,
+                    "runs": len(values),
+                    "tasks": values.shape[1],
+                    "iqm": middle,
+                    "low": low,
+                    "high": high,
+                }
+            )
         for x, y in itertools.permutations(scores, 2):
             chance, low, high = map(
                 float, estimate(statistics.probability_of_improvement, scores[x], scores[y])
             )
-            row = {"variant": variant, "first": x, "second": y}
-            pairs.append({**row, "probability": chance, "low": low, "high": high})
+            pairs.append(
+                {
+                    "variant": variant,
+                    "first": x,
+                    "second": y,
+                    "probability": chance,
+                    "low": low,
+                    "high": high,
+                }
+            )
     return {"aggregate": total, "improvement": pairs} if total else {}

@@ -22,7 +22,8 @@ def interquartile_mean(scores: ArrayLike) -> Array:
     """Returns the mean of scores without the lowest and the highest quarter: (..., runs, tasks) ->
     (...).
     """
-    flat = _flat(np.asarray(scores, np.float64))
+    every = np.asarray(scores, np.float64)
+    flat = every.reshape(*every.shape[:-2], -1)
     cut = flat.shape[-1] // 4
     return np.sort(flat, axis=-1)[..., cut : flat.shape[-1] - cut].mean(axis=-1)
 
@@ -68,7 +69,3 @@ def normalize(scores: Mapping[str, Array], low: Array, high: Array) -> dict[str,
     """
     width = np.where(high > low, high - low, 1.0)
     return {name: (values - low) / width for name, values in scores.items()}
-
-
-def _flat(scores: Array) -> Array:
-    return scores.reshape(*scores.shape[:-2], -1)

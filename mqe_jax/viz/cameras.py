@@ -1,7 +1,6 @@
 """Cameras: fixed views of a scene, and views that track robots and objects."""
 
 import itertools
-from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -87,21 +86,18 @@ def _direction(
         episode.qpos[sample], episode.mocap_pos[sample], episode.mocap_quat[sample], dt=episode.dt
     )
     few = [points[i] for i in sample]
-    best = Camera((0.0, 0.0, 0.0), 1.0)
-    least = np.inf
-    for azimuth, elevation in itertools.product(_AZIMUTHS, _ELEVATIONS):
-        camera = replace(best, azimuth=azimuth, elevation=elevation)
+
+    def cost(camera: Camera) -> float:
         views = _following(model, few, goals, camera, aspect, width)
         away = [
             np.linalg.norm(box - view.position, axis=-1).mean()
             for box, view in zip(few, views, strict=True)
         ]
         unseen = hidden(model, part, views).mean(axis=0).max()
-        cost = max(away) + _BEHIND * _alignment(model, part, camera.axes[1]) + _HIDDEN * unseen
-        if cost < least:
-            best = camera
-            least = cost
-    return best
+        return max(away) + _BEHIND * _alignment(model, part, camera.axes[1]) + _HIDDEN * unseen
+
+    angles = itertools.product(_AZIMUTHS, _ELEVATIONS)
+    return min((Camera((0.0, 0.0, 0.0), 1.0, *pair) for pair in angles), key=cost)
 
 
 def _alignment(model: mujoco.MjModel, episode: Episode, right: np.ndarray) -> float:
@@ -140,8 +136,7 @@ def _following(
 
 def _beside(model: mujoco.MjModel, episode: Episode) -> list[Camera]:
     robot = shown_bases(model)[0]
-    views = []
-    for data in pose_frames(model, episode, range(len(episode))):
-        x, y, _ = data.xpos[robot]
-        views.append(Camera((float(x), float(y), 0.22), 1.3, azimuth=90.0, elevation=-8.0))
+    frames = pose_frames(model, episode, range(len(episode)))
+    places = [data.xpos[robot, :2].tolist() for data in frames]
+    views = [Camera((x, y, 0.22), 1.3, azimuth=90.0, elevation=-8.0) for x, y in places]
     return smooth(views, max(1, round(0.3 / episode.dt)))

@@ -106,9 +106,10 @@ def entries(env: QuadrupedEnv) -> list[tuple[str, list[tuple[int, ...]]]]:
     model = env.mj_model
     colors = [_rgb(robot_color(model, body)) for body in trunk_bodies(model)]
     names = ("team",) if len(env.teams) == 1 else ("team 0", "team 1")
-    rows = []
-    for name, team in zip(names, env.teams, strict=True):
-        rows.append((name, list(dict.fromkeys(colors[agent] for agent in team))))
+    rows = [
+        (name, list(dict.fromkeys(colors[agent] for agent in team)))
+        for name, team in zip(names, env.teams, strict=True)
+    ]
     scripted = colors[sum(map(len, env.teams)) :]
     if scripted:
         rows.append(("scripted", scripted))

@@ -37,15 +37,16 @@ def moving_bodies(model: mujoco.MjModel, episode: Episode) -> list[int]:
 
     They are objects and NPCs: free, sliding or mocap.
     """
-    bodies = set()
-    for body in np.flatnonzero(model.body_mocapid >= 0).tolist():
-        if np.ptp(episode.mocap_pos[:, model.body_mocapid[body]], axis=0).max() > 0.05:
-            bodies.add(body)
-    robots = model.body_rootid[trunk_bodies(model)]
+    apart = np.ptp(episode.mocap_pos, axis=0).max(axis=1)
+    moved = [
+        body
+        for body in np.flatnonzero(model.body_mocapid >= 0)
+        if apart[model.body_mocapid[body]] > 0.05
+    ]
     translations = [int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
-    for body in model.jnt_bodyid[np.isin(model.jnt_type, translations)].tolist():
-        if model.body_rootid[body] not in robots:
-            bodies.add(body)
+    sliding = model.jnt_bodyid[np.isin(model.jnt_type, translations)]
+    robots = np.isin(model.body_rootid[sliding], model.body_rootid[trunk_bodies(model)])
+    bodies = {*map(int, moved), *sliding[~robots].tolist()}
     return sorted(body for body in bodies if _drawn(model, body))
 
 

@@ -88,8 +88,7 @@ def record_episodes(
     if sensors:
         groups.add(ONBOARD)
     size = env.mj_model.nq + 7 * env.mj_model.nmocap + (_DRAWN * env.num_agents if sensors else 0)
-    numbers = episodes * round(seconds / env.dt) * size
-    if 4 * numbers > CLIP_BYTES:
+    if 4 * episodes * round(seconds / env.dt) * size > CLIP_BYTES:
         fail(
             "episodes",
             episodes,
@@ -157,13 +156,3 @@ def record_episodes(
 def best(episodes: list[Episode]) -> Episode:
     """Returns the best episode: by success, then by average step reward."""
     return max(episodes, key=lambda episode: (episode.success, episode.reward))
-
-
-def typical(episodes: list[Episode]) -> Episode:
-    """Returns the median of the successful episodes, else of all.
-
-    They are ranked by success, then by average step reward.
-    """
-    successful = [episode for episode in episodes if episode.success > 0] or episodes
-    ranked = sorted(successful, key=lambda episode: (episode.success, episode.reward))
-    return ranked[len(ranked) // 2]

@@ -19,6 +19,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
+from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import checked
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GROUND_GROUP
@@ -65,8 +66,7 @@ def _working_backend() -> str | None:
     for name in sorted(("egl", "osmesa"), key=lambda name: name != chosen):
         if _draws(name):
             if chosen not in ("", name):
-                text = f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead"
-                print(text, file=sys.stderr)
+                echo(f"mqe: MUJOCO_GL: {chosen!r} draws nothing here; used {name} instead")
             return name
     return None
 
@@ -234,8 +234,9 @@ def render_episode(
     fps = fps or (25.0 if suffix == ".mp4" else 12.5)
     chosen = gl_backend() if backend == "auto" else backend
     if chosen is None:
-        text = "mqe: no GL library, rendered from above instead; for 3-D images install"
-        print(text, GL_PACKAGES, file=sys.stderr)
+        echo(
+            f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}"
+        )
     shown = slice(None)
     if suffix == ".png":
         index = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import walk_policy
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import known_name
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Skill, agile
@@ -134,9 +134,4 @@ def make(name: str, robot: Robot) -> Trainee:
 
     InputError for a name that is not in `TRAINEES`.
     """
-    if name not in TRAINEES:
-        raise InputError(
-            f"skill: {name!r} cannot be trained{nearest(name, TRAINEES)}; allowed: "
-            f"{', '.join(TRAINEES)}"
-        )
-    return TRAINEES[name](robot)
+    return TRAINEES[known_name("skill: cannot be trained:", name, TRAINEES)](robot)
