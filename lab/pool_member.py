@@ -14,7 +14,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.selfplay.league import pool
-from mqe_jax.train.checkpoint import latest, load_tree
+from mqe_jax.train.checkpoint import latest, read_file
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 
 
@@ -27,7 +27,7 @@ def member(run: Path, share: float) -> TrainedPolicy:
     if checkpoint is None:
         raise InputError(f"{run}: has no checkpoint")
     template = jax.eval_shape(lambda: pool.new_pool(policy.actor, policy.config.league.members))
-    members = load_tree(checkpoint, template, kind="checkpoint", part="extra/pool/").tree
+    members = read_file(checkpoint, kind="checkpoint").tree(template, part="extra/pool/")
     steps = np.asarray(members.born, np.int64) * policy.config.steps_per_update
     apart = np.abs(steps - share * policy.metadata["env_steps"])
     place = int(np.where(steps < 0, np.inf, apart).argmin())

@@ -75,9 +75,9 @@ Read = dict[str, Found]
 
 
 def find(
-    source: Source, task: str = "", *, field: str = "policy", read: Read | None = None
+    source: Source | None, task: str = "", *, field: str = "policy", read: Read | None = None
 ) -> Found:
-    """Returns the policy of a name, a path or an object; makes no environment.
+    """Returns the policy of a name, a path or an object, None for None; makes no environment.
 
     A name is one of `mqe_jax.policies.simple`, a task with a shipped policy, a member of a
     population, or that of a file or folder with a suffix, or below another folder. `read` has the
@@ -86,6 +86,8 @@ def find(
     Raises:
         InputError: naming `field`, for an unknown name; naming the file, if it cannot be read.
     """
+    if source is None:
+        return None
     named = isinstance(source, str | Path)
     check(field, source, PathText if named else PolicyOrAct)
     if not named:
@@ -121,10 +123,11 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
     parameters with which they can meet.
     """
     found = list(found)
-    needed = [each.needs for each in found if _needs(each, task)]
+    every = [getattr(each, "needs", None) for each in found]
+    needed = [x for x in every if isinstance(x, Needs) and x.task == task and x.control]
     params: dict[str, Any] = {}
     for needs in needed:
-        usual = TASKS[task].Params().actions(needs.control) | {"control": "command"}
+        usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
         own = {name: getattr(needs, name) for name in usual}
         own = {name: value for name, value in own.items() if value != usual[name]}
         if needs.senses:
@@ -135,12 +138,6 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
     if usual and all(needs.control == "command" for needs in needed):
         skills.append(TASKS[task].Params().actions("command"))
     return params | together(skills)
-
-
-def _needs(policy: Any, task: str) -> bool:
-    """Returns whether a policy needs something of a task's parameters."""
-    needs = getattr(policy, "needs", None)
-    return isinstance(needs, Needs) and needs.task == task and needs.control is not None
 
 
 @check_arguments(impl=str)
@@ -184,13 +181,14 @@ def fit(
     Raises:
         InputError: naming `field`, the policy, by default its text, and what does not fit.
     """
-    if isinstance(found, Named):
+    named = isinstance(found, Named)
+    if not named and not hasattr(found, "act"):
+        return simple.from_function(found, env)
+    if named:
         return simple.named(found.name, env, field)
     name = name or repr(found)
     if isinstance(found, TrainedPolicy):
         return translate(found.acting(True) if deterministic else found, env, name, field)
-    if not hasattr(found, "act"):
-        return simple.from_function(found, env)
     if hasattr(found, "task"):
         check_policy(found, env, name, field)
     return found
@@ -235,7 +233,7 @@ def table(
     name, own, run = target(task, read)
     given = dict(env or {})
     params = merge(own, given)
-    first: Any = policy or run
+    first: Any = run if policy is None else policy
     second: Any = opponent
     if first is None:
         first = _usual_policy(name, params)
@@ -358,11 +356,8 @@ def settings(
     changes["env"] = merge(merge(own, asked), env or {})
 
     def needs(made: TrainConfig) -> dict[str, Any]:
-        named = {"imitation.teacher": made.imitation.teacher, "start": made.start}
-        sources = {field: source for field, source in named.items() if source is not None}
-        return parameters_of(
-            name, [find(x, name, field=field, read=read) for field, x in sources.items()]
-        )
+        teacher = find(made.imitation.teacher, name, field="imitation.teacher", read=read)
+        return parameters_of(name, [teacher, find(made.start, name, field="start", read=read)])
 
     made = resolve(
         name if inner is task else "",

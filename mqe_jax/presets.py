@@ -97,7 +97,7 @@ class _Layer(NamedTuple):
 
 def _stack(config: TrainConfig, layers: list[_Layer]) -> TrainConfig:
     for layer in layers:
-        train_env = FrozenMapping(_without(config.train_env, layer.env))
+        train_env = _without(config.train_env, layer.env)
         try:
             config = override(replace(config, train_env=train_env), layer.values)
         except InputError as error:

@@ -23,7 +23,7 @@ from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.names import load_policy, versus
 from mqe_jax.selfplay.demonstrations import Demonstrated
-from mqe_jax.selfplay.league.league import League, Roster
+from mqe_jax.selfplay.league.league import League
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.opponents import Mirror
 from mqe_jax.train.config import PPO, TrainConfig
@@ -194,7 +194,7 @@ def matches() -> VectorEnv:
 
 def league() -> Any:
     values = {"num_envs": 2, "rollout_steps": 2, "total_steps": 8, "opponents": ["newest", "older"]}
-    return copied(League(matches(), Roster(["newest", "older"]), build(TrainConfig, values))).env
+    return copied(League(matches(), build(TrainConfig, values))).env
 
 
 BATCHES: dict[str, Callable[[], Any]] = {

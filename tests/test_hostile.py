@@ -38,7 +38,7 @@ from mqe_jax.selfplay.opponents import Mirror
 from mqe_jax.study.runs import read_curve
 from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.algorithms import register_stages
-from mqe_jax.train.checkpoint import load_tree, save_tree
+from mqe_jax.train.checkpoint import read_file, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.needs import needs_of
@@ -298,7 +298,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         (NAN, "x", 1e300),
     ),
     ("env: ", lambda x, v: versus(v, ["idle"]), (None, "go1tug")),
-    ("env: ", lambda x, v: Mirror(v), (None, 3)),
+    ("matches: ", lambda x, v: Mirror(v), (None, 3)),
     ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
     (
         "policy: ",
@@ -345,7 +345,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         (n, lambda x, v, n=n: save_tree(**{**SAVED, n: {"a": v}}), ("x", [b"a"]))
         for n in ("path", "tree")
     ),
-    ("kind: ", lambda x, v: load_tree("a", {}, kind=v), (None, "x", [])),
+    ("kind: ", lambda x, v: read_file("a", kind=v), (None, "x", [])),
     ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), ("", 3)),
     ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
     ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
@@ -547,7 +547,7 @@ def test_a_damaged_policy_or_checkpoint_is_refused(
     with refusing(file.name):
         read_policy(file)
     with refusing(file.name):
-        read = load_tree(file, TREE, kind=kind).tree
+        read = read_file(file, kind=kind).tree(TREE)
         assert all(bool((read[name] == TREE[name]).all()) for name in TREE), (
             "read with other values"
         )

@@ -22,7 +22,7 @@ from mqe_jax.names import load_policy, versus
 from mqe_jax.presets import resolve
 from mqe_jax.runs import cast, playing
 from mqe_jax.selfplay.league import tournament
-from mqe_jax.selfplay.league.league import League, Roster
+from mqe_jax.selfplay.league.league import League
 from mqe_jax.train.checkpoint import list_checkpoints, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState
@@ -56,7 +56,7 @@ def history() -> list[TrainState]:
     is due every one.
     """
     config = config_of()
-    league = League(matches(num_envs=8), Roster(SOURCES), config, fixed())
+    league = League(matches(num_envs=8), config, fixed())
     return updated(league.env, config, 9, league=league)[0]
 
 
@@ -85,7 +85,7 @@ def test_a_league_begins_with_its_policies(
     config = config_of(**start)
     state = history[9]
     file = None
-    league = League(matches(num_envs=8), Roster(SOURCES), config, fixed())
+    league = League(matches(num_envs=8), config, fixed())
     if resumed:
         metadata = {"task": league.env.name, "config": to_mapping(config), "environments": False}
         file = save_checkpoint(
@@ -163,10 +163,9 @@ def test_a_league_has_more_members_than_blocks_and_environments_of_its_own_proce
         "league.members: 2 .*more than the blocks that play members, 2",
         League,
         matches(num_envs=8),
-        Roster(SOURCES),
         few,
     )
-    env = League(matches(num_envs=8), Roster(SOURCES), config_of(), fixed()).env.share(2)
+    env = League(matches(num_envs=8), config_of(), fixed()).env.share(2)
     assert env.num_envs == env.inner.num_envs == 4
 
 

@@ -24,8 +24,8 @@ from mqe_jax.core.settings import build
 from mqe_jax.core.types import Cast, Observations
 from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
 from mqe_jax.names import load_policy
-from mqe_jax.selfplay.league.league import League, Roster
-from mqe_jax.train.checkpoint import load_tree, save_tree
+from mqe_jax.selfplay.league.league import League
+from mqe_jax.train.checkpoint import read_file, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import read_policy
@@ -122,7 +122,7 @@ def test_networks_and_leagues_train_in_single_precision(learns: str) -> None:
         league = None
         if learns == "league":
             idle = load_policy("idle", matches().env)
-            league = League(matches(), Roster(sources), config, {"idle": idle})
+            league = League(matches(), config, {"idle": idle})
         learner = make_learner(PROBE if league is None else league.env, config, league=league)
         state = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
         assert kinds(jax.eval_shape(learner.update, state)[0]) == kinds(state)
@@ -182,7 +182,8 @@ def test_typed_keys_are_saved(tmp_path: Path) -> None:
         "x": jnp.ones(2),
     }
     save_tree(tmp_path / "file", tree, {}, kind="checkpoint")
-    loaded = load_tree(tmp_path / "file", jax.eval_shape(lambda: tree), kind="checkpoint").tree
+    stored = read_file(tmp_path / "file", kind="checkpoint")
+    loaded = stored.tree(jax.eval_shape(lambda: tree))
     for name, key in tree.items():
         assert loaded[name].dtype == key.dtype and (jnp.asarray(loaded[name] == key)).all()
 

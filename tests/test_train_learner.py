@@ -22,7 +22,7 @@ from mqe_jax.core.types import Batch
 from mqe_jax.policies.simple import SimplePolicy
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
-from mqe_jax.train.checkpoint import latest, load_tree, save_checkpoint, save_tree
+from mqe_jax.train.checkpoint import latest, read_file, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import Network
@@ -356,12 +356,11 @@ TREE = {
 def test_a_checkpoint_keeps_every_leaf(tmp_path: Path) -> None:
     path = tmp_path / "tree.safetensors"
     save_tree(path, TREE, {"note": "ü"}, kind="checkpoint")
-    restored = load_tree(path, jax.eval_shape(lambda: TREE), kind="checkpoint")
-    assert_same(restored.tree, TREE)
-    assert [x.dtype for x in jax.tree.leaves(restored.tree)] == [
-        x.dtype for x in jax.tree.leaves(TREE)
-    ]
-    assert restored.metadata == {"note": "ü"}
+    stored = read_file(path, kind="checkpoint")
+    tree = stored.tree(jax.eval_shape(lambda: TREE))
+    assert_same(tree, TREE)
+    assert [x.dtype for x in jax.tree.leaves(tree)] == [x.dtype for x in jax.tree.leaves(TREE)]
+    assert stored.metadata == {"note": "ü"}
     assert [p.name for p in tmp_path.iterdir()] == ["tree.safetensors"]
 
 
@@ -388,7 +387,7 @@ def test_damage_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
     def error_of(template: Any = TREE) -> str:
         with pytest.raises(ValueError) as error:
-            load_tree(path, template, kind="checkpoint")
+            read_file(path, kind="checkpoint").tree(template)
         text = str(error.value)
         assert str(path) in text and "\n" not in text
         return text

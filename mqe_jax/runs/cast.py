@@ -17,7 +17,7 @@ from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.names import Config, Read
 from mqe_jax.presets import resolve
 from mqe_jax.selfplay.demonstrations import Demonstrated
-from mqe_jax.selfplay.league.league import League, Roster
+from mqe_jax.selfplay.league.league import POOL, League
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.opponents import Mirror, Versus
 from mqe_jax.train import learner
@@ -63,16 +63,19 @@ def prepare(
     if len(set(seeds or ())) < len(seeds or ()):
         fail("seeds", seeds, "a list without repetitions")
     read: Read = {}
-    made = names.settings(task, config, env=env, read=read)
-    if isinstance(task, str | QuadrupedEnv):
-        cast = environments(made, len(seeds or (0,)), task=task, impl=impl, read=read)
-    elif all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
-        made, cast = _around(task, made, env, impl, read)
-    else:
+    named = isinstance(task, str | QuadrupedEnv)
+    if not named and not all(hasattr(task, name) for name in ("num_envs", "reset", "step")):
         allowed = "an environment such as that of mqe_jax.make, or a batch of environments"
         fail("task", task, f"a task's id, {allowed}")
+    made = names.settings(task, config, env=env, read=read)
+    if not named:
+        made = _settings_around(task, made, env, impl)
     configs = [made] if seeds is None else [override(made, {"seed": seed}) for seed in seeds]
-    return configs, cast
+    if named:
+        return configs, environments(made, len(configs), task=task, impl=impl, read=read)
+    batch = Deadline(task) if made.time_limit_ends else task
+    start = names.find(made.start, batch.name, field="start", read=read)
+    return configs, Cast(batch, start=start)
 
 
 @check_arguments(seeds=SeedCount)
@@ -133,23 +136,24 @@ def environments(
     """
     task = task or config.task or ""
     read = {} if read is None else read
-    num_envs = config.num_envs
-    trained = names.environment(task, config.training_env, impl=impl, num_envs=num_envs * seeds)
-    _check_teams(trained, config)
-    match = len(trained.teams) > 1
-    roster = Roster(config.opponents if match else ())
+    fixed = _fixed(config)
     roles = {
-        "opponents": roster.fixed,
+        "opponents": fixed,
         "imitation.teacher": [config.imitation.teacher],
         "curriculum.demonstrator": [config.curriculum.demonstrator],
     }
+    num_envs = config.num_envs
+    trained = names.environment(task, config.training_env, impl=impl, num_envs=num_envs * seeds)
+    start = names.find(config.start, trained.name, field="start", read=read)
     policies = names.seats(roles, trained, read)
+    _check_teams(trained, config)
     teacher = policies.get(config.imitation.teacher or "")
     demonstrator = policies.get(config.curriculum.demonstrator or "")
-    seeing = [policies[name] for name in roster.fixed]
+    seeing = [policies[name] for name in fixed]
     if teacher is not None:
         seeing.append(teacher)
     groups = {config.group, *groups_of(seeing)}
+    match = len(trained.teams) > 1
     both = match and not config.opponents
     batch = _batch(trained, config, num_envs // 2 if both else num_envs, seeds, demonstrator)
     env: Any = batch.with_groups(groups)
@@ -159,15 +163,11 @@ def environments(
     if both:
         env = Mirror(env)
     elif match:
-        league = League(BothSides(env) if config.both_sides else env, roster, config, policies)
+        league = League(BothSides(env) if config.both_sides else env, config, policies)
         env = league.env
     evaluated = _evaluated(trained, task, config, seeds, impl)
-    eval_env = None
-    if config.evaluation.every is not None:
-        eval_env = VectorEnv(evaluated, config.evaluation.episodes, 2 * seeds).with_groups(groups)
-        if match:
-            eval_env = _evaluation_matches(eval_env, config, roster, read)
-    return Cast(env, eval_env, league, teacher, _start(config, trained.name, read))
+    eval_env = _evaluations(evaluated, config, seeds, groups, read)
+    return Cast(env, eval_env, league, teacher, start)
 
 
 def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:
@@ -224,36 +224,38 @@ def _evaluated(
     return env
 
 
-def _evaluation_matches(
-    batch: VectorEnv, config: TrainConfig, roster: Roster, read: Read
-) -> Versus:
-    """Returns matches against the fixed opponents, else the strongest reference, of a training."""
-    against = roster.fixed or reference_opponents(batch.env)[:1]
+def _evaluations(
+    env: QuadrupedEnv, config: TrainConfig, seeds: int, groups: set[str], read: Read
+) -> Any:
+    """Returns the environments of evaluations, None without: in a match against its fixed
+    opponents, else the strongest reference.
+    """
+    if config.evaluation.every is None:
+        return None
     episodes = config.evaluation.episodes
+    batch: Any = VectorEnv(env, episodes, 2 * seeds).with_groups(groups)
+    if len(env.teams) < 2:
+        return batch
+    against = _fixed(config) or reference_opponents(env)[:1]
     if episodes % len(against):
         allowed = f"a multiple of the number of opponents in evaluations, {len(against)}"
         fail("evaluation.episodes", episodes, allowed)
-    policies = names.seats({"opponents": against}, batch.env, read)
+    policies = names.seats({"opponents": against}, env, read)
     sides = BothSides(batch) if config.both_sides else batch
     return Versus(sides, [policies[name] for name in against])
 
 
-def _start(config: TrainConfig, task: str, read: Read) -> TrainedPolicy | None:
-    """Returns the policy to start from, which the learner compares with its settings."""
-    if config.start is None:
-        return None
-    policy = names.find(config.start, task, field="start", read=read)
-    if not isinstance(policy, TrainedPolicy):
-        fail("start", config.start, "a run folder, a policy file, or a shipped policy's task")
-    return policy
+def _fixed(config: TrainConfig) -> list[str]:
+    """Returns the opponents that exist outside of the training too."""
+    return [name for name in config.opponents if name not in POOL]
 
 
-def _around(
-    batch: Any, config: TrainConfig, env: Mapping[str, Any] | None, impl: str, read: Read
-) -> tuple[TrainConfig, Cast]:
-    """Returns the settings and the cast of a training on a batch of environments.
+def _settings_around(
+    batch: Any, config: TrainConfig, env: Mapping[str, Any] | None, impl: str
+) -> TrainConfig:
+    """Returns the settings of a training on a batch of environments, which is used as it is.
 
-    InputError for what has no effect, because the batch is trained on as it is.
+    InputError for what has no effect.
     """
     usual = resolve("")
     defaults = dict(leaves(to_mapping(usual)))
@@ -267,12 +269,9 @@ def _around(
         fail(name, value, "left out for a batch of environments, which has its own")
     if config.num_envs not in (usual.num_envs, batch.num_envs):
         fail("num_envs", config.num_envs, f"{batch.num_envs}, or left out, for this batch")
-    if config.time_limit_ends:
-        if not isinstance(batch, EnvBatch):
-            fail("time_limit_ends", True, f"false for {batch.name}, whose states are its own")
-        batch = Deadline(batch)
-    config = override(config, {"num_envs": batch.num_envs, "evaluation.every": None})
-    return config, Cast(batch, start=_start(config, batch.name, read))
+    if config.time_limit_ends and not isinstance(batch, EnvBatch):
+        fail("time_limit_ends", True, f"false for {batch.name}, whose states are its own")
+    return override(config, {"num_envs": batch.num_envs, "evaluation.every": None})
 
 
 def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:

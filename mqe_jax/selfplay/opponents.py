@@ -14,7 +14,7 @@ from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import NonNegativeInt, Number
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments, fail
+from mqe_jax.core.settings import check_arguments, fail
 from mqe_jax.core.types import (
     AnyBatch,
     AnyPolicy,
@@ -95,7 +95,7 @@ class OneTeam(Outer):
     """What `Versus` and `Mirror` share: M environments of the only team, around matches."""
 
     def __init__(self, matches: VectorEnv | Wrapper, num_envs: int) -> None:
-        if len(check("env", matches, AnyBatch).teams) != 2:
+        if len(matches.teams) != 2:
             raise InputError(f"env: {matches.name} is not a match; it has one team")
         super().__init__(matches)
         self.num_envs = num_envs
@@ -263,8 +263,9 @@ class Mirror(OneTeam):
     those of team 0; `diverged` and `overflow` are counted for the first.
     """
 
+    @check_arguments(matches=AnyBatch)
     def __init__(self, matches: VectorEnv) -> None:
-        super().__init__(matches, 2 * check("env", matches, AnyBatch).num_envs)
+        super().__init__(matches, 2 * matches.num_envs)
         self.privileged_observation_size += 1
 
     @single

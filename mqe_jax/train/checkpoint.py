@@ -47,13 +47,6 @@ Kind = Literal["policy", "checkpoint"]
 """Kinds of files."""
 
 
-class Checkpoint(NamedTuple):
-    """A restored tree and its metadata."""
-
-    tree: Any
-    metadata: dict[str, Any]
-
-
 def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:
     """Returns the leaves by path name, in the tree's order, and the tree's structure."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
@@ -82,7 +75,7 @@ def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind:
         fail("metadata", metadata, "a mapping of names to what JSON has")
     try:
         named, _ = _flatten(jax.device_get(raw_keys(tree)))
-        # ascontiguousarray turns scalars into (1,); load_tree checks the original shape
+        # ascontiguousarray turns scalars into (1,); `Stored.tree` checks the original shape
         arrays = {
             name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in named.items()
         }
@@ -193,13 +186,6 @@ def parse_file(path: Path, content: bytes, kind: str) -> Stored:
         text = str(error)
         raise InputError(text if str(path) in text else f"{path}: {text}") from None
     return Stored(path, arrays, metadata)
-
-
-@check_arguments(path=PathText, kind=Kind, part=str)
-def load_tree(path: str | Path, template: Any, *, kind: str, part: str = "") -> Checkpoint:
-    """Reads a pytree and the metadata of a file; errors as `read_file` and `Stored.tree`."""
-    stored = read_file(path, kind=kind)
-    return Checkpoint(stored.tree(template, part=part), stored.metadata)
 
 
 def _check_range(path: Path, name: str, array: np.ndarray) -> None:

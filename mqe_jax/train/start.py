@@ -147,6 +147,8 @@ def policy_to_start(
     InputError, naming the settings' `start`, unless it fits environment, parameters and settings.
     """
     start = str(config.start)
+    if not isinstance(policy, TrainedPolicy):
+        fail("start", start, "a run folder, a policy file, or a shipped policy's task")
     policy = policy.at_size(env)
     shapes = jax.tree.map(jnp.shape, {name: params.get(name) for name in policy.params})
     check_policy(policy, env, start, "start")

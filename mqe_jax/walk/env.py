@@ -82,13 +82,6 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         super().__init__(params, impl=impl, control="position", num_envs=num_envs)
         self.skill.check_period(self.compiled.scene.timestep, self.physics.num_substeps)
 
-    def with_num_envs(self, num_envs: int) -> "WalkEnv":
-        if self.physics.holds(num_envs):
-            return self
-        return WalkEnv(
-            self.robot, self.task, skill=self.skill.name, impl=self.impl, num_envs=num_envs
-        )
-
     def scene(self) -> Scene:
         return Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1)
 

@@ -46,6 +46,11 @@ class LeagueState(NamedTuple):
     key: jax.Array  # random key
 
 
+POOL = ("newest", "older", "uniform")
+"""Opponents that a training makes itself: the policy, and members of its pool of earlier ones. All
+others are fixed: they exist outside of the training too, and play in its evaluations."""
+
+
 class Roster:
     """What the names in `TrainConfig.opponents` mean, one for each of K blocks of environments."""
 
@@ -62,11 +67,6 @@ class Roster:
         """Blocks that play members of the pool (K,) bool."""
         self.reference = is_one_of("scripted")
         """Blocks whose opponent has the rating 0 (K,) bool."""
-        self.fixed = [
-            name for name, own in zip(names, self.newest | self.members, strict=True) if not own
-        ]
-        """Names of the opponents that exist outside of the training too, and play in its
-        evaluations."""
 
 
 class League:
@@ -76,17 +76,14 @@ class League:
     def __init__(
         self,
         matches: VectorEnv | Wrapper,
-        roster: Roster,
         config: TrainConfig,
         policies: Mapping[str, Policy] = FrozenMapping(),
     ) -> None:
-        """Creates the matches of a training run; `policies` has those of `Roster.fixed`, by
-        name.
-        """
+        """Creates the matches of a training run; `policies` has its fixed opponents by name."""
+        self._roster = Roster(config.opponents)
         needs = needs_of(matches, config)
         self._dims = needs.dims
         self._config = config
-        self._roster = roster
         drawn = int(self._roster.members.sum())
         if drawn and config.league.members <= drawn:
             fail(
@@ -99,7 +96,7 @@ class League:
         first = TrainedPolicy(params, statistics, needs, config, {})
         self._form = first.form
 
-        opponents = [policies[name] if name in roster.fixed else first for name in roster.names]
+        opponents = [first if name in POOL else policies[name] for name in config.opponents]
         self.env = Versus(matches, opponents, config.draw_reward)
         self._members = config.league.members if drawn else 1
 
