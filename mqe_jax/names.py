@@ -21,14 +21,13 @@ from mqe_jax.core.settings import (
     Parameters,
     PathText,
     check,
-    check_arguments,
+    checked,
     differences,
     fail,
     merge,
     nested,
     override,
 )
-from mqe_jax.core.types import AnyBatch, AnyEnvironment, PolicyOrAct
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.registry import SCRIPTED, TASKS, find_task, task_id
 from mqe_jax.envs.wrappers import Wrapper
@@ -88,10 +87,11 @@ def find(
     """
     if source is None:
         return None
-    named = isinstance(source, str | Path)
-    check(field, source, PathText if named else PolicyOrAct)
-    if not named:
+    if not isinstance(source, str | Path):
+        if isinstance(source, type) or not (callable(source) or hasattr(source, "act")):
+            fail(field, source, "a policy, its function act(obs, memory, key), a name or a path")
         return source
+    check(field, source, PathText)
     known = {} if read is None else read
     if str(source) not in known:
         known[str(source)] = _find(str(source), task, field)
@@ -140,7 +140,6 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
     return params | together(skills)
 
 
-@check_arguments(impl=str)
 def environment(
     task: str | QuadrupedEnv,
     params: Params = _NOTHING,
@@ -207,7 +206,6 @@ class Table(NamedTuple):
     """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
 
 
-@check_arguments(env=Parameters | None, deterministic=bool)
 def table(
     task: str | Path | QuadrupedEnv,
     policy: Source | None = None,
@@ -377,7 +375,7 @@ def load_policy(source: str | Path, env: None = None, *, deterministic: bool = F
 def load_policy(
     source: str | Path, env: QuadrupedEnv, *, deterministic: bool = False
 ) -> Policy: ...
-@check_arguments(source=PathText, env=AnyEnvironment | None, deterministic=bool)
+@checked
 def load_policy(
     source: str | Path, env: QuadrupedEnv | None = None, *, deterministic: bool = False
 ) -> Policy:
@@ -416,12 +414,12 @@ def load_policy(
     return found.acting(True) if deterministic else found
 
 
-@check_arguments(env=AnyBatch, draw_reward=Number)
+@checked
 def versus(
     env: VectorEnv | Wrapper,
     opponents: Source | Sequence[Source],
     *,
-    draw_reward: float = 0.0,
+    draw_reward: Number = 0.0,
 ) -> Versus:
     """Returns matches as environments of team 0, against opponents that control team 1.
 

@@ -277,23 +277,7 @@ def test_what_cannot_be_evaluated_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     refuses("run: '/nowhere/none' has no policy", mqe_jax.evaluate, "~/none", "idle")
 
 
-def test_a_run_of_other_parts_is_named(run: mqe_jax.Run) -> None:
-    tables: list[Any] = [
-        {"a": np.zeros((2, 2))},
-        {"a": np.zeros(2), "b": np.zeros(3)},
-        {"a": np.array(["x"])},
-    ]
-    point = {"env_steps": 1, "sampled": {}, "deterministic": {}}
-    points: list[Any] = [{}, {**point, "env_steps": -1}, {**point, "x": np.zeros(2)}]
-    wrong = {
-        "policy": [{}],
-        "metrics": [[], *tables],
-        "absolute": [[], *points],
-        "evaluations": [{}, [3], points[1:]],
-    }
-    for name, values in wrong.items():
-        for value in (*values, 3, "idle"):
-            refuses(f"^{name}.*: ", dataclasses.replace, run, **{name: value})
+def test_a_run_whose_weights_are_not_finite_is_not_saved(run: mqe_jax.Run) -> None:
     weights = jax.tree.map(lambda x: x * np.nan, run.policy.params)
     with pytest.raises(NonFiniteError, match="params"):
         dataclasses.replace(run, policy=dataclasses.replace(run.policy, params=weights)).save(
@@ -326,9 +310,6 @@ def test_intervals_are_wilsons(wins: int, episodes: int, low: float, high: float
 
 def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     result = mqe_jax.evaluate("fake", "forward", episodes=4)
-    wrong: Any = ((None, 4), (-1, 4), (1.5, 4), (0.5, 0), (0.5, 1.5))
-    for value, episodes in wrong:
-        refuses(r"^(value|episodes): ", Rate.of, value, episodes)
     assert result.success == Rate.of(1.0, 4) and result.win is None
     assert "success               100.0   51.0 to 100.0" in str(result).splitlines()
     assert "success_rate                 100.0% (51.0 to 100.0%)" in result.details().splitlines()
@@ -446,7 +427,3 @@ def test_a_clip_shows_itself_and_is_saved(monkeypatch: pytest.MonkeyPatch) -> No
     page = clip._repr_html_()
     assert page.startswith(("<video", "<img")) and ";base64," in page
     refuses(r"clip.avi.*\.mp4, \.webp, \.gif, \.png", clip.save, "clip.avi")
-    for name in ("env", "episodes", "about", "look"):
-        for value in (None, 3, [], [3]):
-            refuses(f"^{name}.*: ", dataclasses.replace, clip, **{name: value})
-    refuses(r"^look", dataclasses.replace, clip, look={"speeds": 1.0})

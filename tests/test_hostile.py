@@ -34,16 +34,12 @@ from mqe_jax.envs.replay import Recording, load_recording
 from mqe_jax.names import versus
 from mqe_jax.physics import robots
 from mqe_jax.selfplay.league import games, tournament
-from mqe_jax.selfplay.opponents import Mirror
-from mqe_jax.study.runs import read_curve
 from mqe_jax.study.sweep import Sweep, load_sweep
 from mqe_jax.train.algorithms import register_stages
 from mqe_jax.train.checkpoint import read_file, save_tree
 from mqe_jax.train.config import TrainConfig, load_config
-from mqe_jax.train.learner import make_learner
-from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import register_network
-from mqe_jax.train.policy import TrainedPolicy, policy_of, read_policy, save_policy
+from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.torchscript import read_torchscript
@@ -54,7 +50,6 @@ KEY = jax.random.PRNGKey(0)
 NAN = math.nan
 LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3))
 WALLS = np.full((3, 2, 3), NAN)
-FRAME = np.zeros((16, 16, 3), np.uint8)
 GAMES = np.ones((1, 1, 3), np.int64)
 RATINGS = games.Estimate(np.zeros(1), np.zeros(1), np.zeros(1))
 
@@ -72,7 +67,6 @@ def made() -> dict[str, Any]:
     team = versus(matches, "idle")
     return {
         "sumo": make("go1wrestling", control="position"),
-        "walks": make("go1tug", num_envs=2),
         "task": task,
         "state": state,
         "match": match,
@@ -107,7 +101,6 @@ def _render(x: Any, **options: Any) -> Any:
     return render.render_episode(x["fake"], **given)
 
 
-SAVED: dict[str, Any] = {"path": "a", "tree": {}, "metadata": {}, "kind": "policy"}
 READERS = (load_yaml, read_torchscript)
 FILES = ((load_policy, "/dev/zero"), *product((*READERS, load_recording), ("/", "/dev/zero")))
 CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
@@ -129,24 +122,16 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: _evaluate(x, act=lambda obs, memory, key: v),
         (None, np.zeros((2, 2, 3)), (1, 2, 3)),
     ),
-    ("episodes: ", lambda x, v: _evaluate(x, v), (0, -1, 1.5, NAN, "many", True, 10**12, b"1")),
-    ("block: ", lambda x, v: _evaluate(x, block=v), (0, NAN, 1.5)),
-    ("max_steps: ", lambda x, v: _evaluate(x, max_steps=v), (0, NAN, -1)),
-    ("key: ", lambda x, v: _evaluate(x, key=v), (3, None, "k")),
-    ("policy: ", lambda x, v: _evaluate(x, act=v), (None, 3, dict)),
     (
         "policy: ",
         lambda x, v: _evaluate(x, env=x["matches"], act=mqe_jax.load_policy(v, x["match"])),
         ("idle",),
     ),
-    ("env: ", lambda x, v: _evaluate(x, env=v), (None, "go1gate", 3)),
-    ("env: ", lambda x, v: _evaluate(x, env=x["fake"]), (None,)),
     (
         "source: ",
         lambda x, v: mqe_jax.load_policy(v),
         (3, None, [], "", "a\0b", "x" * 300, "x" * 9999),
     ),
-    ("env: ", lambda x, v: mqe_jax.load_policy("scripted", v), ("go1gate",)),
     (
         "opponents",
         lambda x, v: versus(x["matches"], v),
@@ -158,9 +143,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: x["team"].step(x.get(v, v), np.zeros((2, 1, 12))),
         (None, 3, "state", "states"),
     ),
-    ("state: ", lambda x, v: x["team"].change(x.get(v, v), 0, v), (None, 3, "state", "states")),
     ("block: ", lambda x, v: x["team"].change(x["teams"], v, None), (None, -1, "x", 1.5)),
-    ("policy: ", lambda x, v: x["team"].change(x["teams"], 0, v), (None, 3, TrainedPolicy)),
     (
         "state: ",
         lambda x, v: x["task"].step(x.get(v, v), np.zeros((2, 12), np.float32)),
@@ -185,37 +168,10 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("parts: ", lambda x, v: x["matches"].share(v), (0, -1, True, NAN, np.zeros(3))),
     ("num_envs: ", lambda x, v: x["task"].with_num_envs(v), (0, None, True, "x")),
     ("name: ", lambda x, v: x["match"].object_pose(None, v), ("cyl", None, [])),
-    ("num_envs: ", lambda x, v: x["idle"].initial_memory(v), (0, NAN, "x")),
     (
         "key: ",
         lambda x, v: load_policy("random", x["match"]).act(jnp.zeros((2, 1, 10)), (), v),
         (None, 3, "x"),
-    ),
-    (
-        "needs: ",
-        lambda x, v: dataclasses.replace(load_policy("go1tug"), needs=v),
-        (None, (1, 2, 3)),
-    ),
-    ("config: ", lambda x, v: dataclasses.replace(load_policy("go1tug"), config=v), (None, {})),
-    (
-        "metadata: ",
-        lambda x, v: dataclasses.replace(load_policy("go1tug"), metadata=v),
-        (None, "x"),
-    ),
-    (
-        "deterministic: ",
-        lambda x, v: dataclasses.replace(load_policy("go1tug"), deterministic=v),
-        (None, 1),
-    ),
-    (
-        "params: ",
-        lambda x, v: dataclasses.replace(load_policy("go1tug"), params=v),
-        (None, {}, np.zeros(3)),
-    ),
-    (
-        "normalizer: ",
-        lambda x, v: dataclasses.replace(load_policy("go1tug"), normalizer=v),
-        (None, 3),
     ),
     ("task: ", lambda x, v: mqe_jax.evaluate(v, "idle"), (None, 3, "x" * 300, [])),
     ("env", lambda x, v: mqe_jax.evaluate("go1tug", "idle", env=v), (3, "x", [], {1: 2})),
@@ -258,7 +214,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: Recording("a", v, "c", "command", {}, np.zeros((2, 1, 1))),
         (None, {"control": "c"}),
     ),
-    ("policy: ", lambda x, v: save_policy("folder", v), (None, 3, TrainedPolicy)),
     (
         "folder: ",
         lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v),
@@ -291,14 +246,11 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("cells", lambda x, v: mqe_jax.sweep("a.yaml", "runs/a", cells=v), (None, 3, [3])),
     ("key: ", lambda x, v: TeamEnv(x["match"], "idle").reset(v), (None, 3)),
     ("robot: ", lambda x, v: robots.register(v), (None, "go1")),
-    ("path: ", lambda x, v: read_curve(v), (None, 3, "", "a\0b")),
     (
         "draw_reward: ",
         lambda x, v: versus(x["matches"], ["idle"], draw_reward=v),
         (NAN, "x", 1e300),
     ),
-    ("env: ", lambda x, v: versus(v, ["idle"]), (None, "go1tug")),
-    ("matches: ", lambda x, v: Mirror(v), (None, 3)),
     ("episodes: 1024", lambda x, v: _record(x, episodes=1024, seconds=600), (None,)),
     (
         "policy: ",
@@ -315,42 +267,16 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: _render(x, episode=dataclasses.replace(x["episode"], **{v: WALLS})),
         ("mocap_pos",),
     ),
-    ("size", lambda x, v: _render(x, size=v), ((0, 0), (1, 1), "ab", (10**6, 10**6), 3, (NAN, 64))),
-    ("fps: ", lambda x, v: _render(x, fps=v), (-1, 0, NAN, math.inf, "x")),
-    ("at: ", lambda x, v: _render(x, path=Path("a.png"), at=v), (NAN, -1)),
-    ("backend: ", lambda x, v: _render(x, backend="x"), (None,)),
     ("view: ", lambda x, v: _render(x, view=v, backend=None), ("x", "")),
     ("episode: ", lambda x, v: _render(x, episode=x["episode"].cut(slice(0, 0))), (None,)),
     ("episode: ", lambda x, v: render.render_episode(x["match"], x["episode"], x["gif"]), (None,)),
     ("output: ", lambda x, v: _render(x, episode=x["long"], size=(4096, 4096), fps=50), (None,)),
-    ("env: ", lambda x, v: needs_of(v, x["config"]), (None, "task")),
-    (
-        "processes: ",
-        lambda x, v: make_learner(x["batch"], x["config"], processes=v),
-        (None, 0, "x"),
-    ),
-    ("key: ", lambda x, v: make_learner(x["batch"], x["config"]).init(v), (None, 3)),
-    ("state: ", lambda x, v: make_learner(x["batch"], x["config"]).update(v), (None, 3)),
-    ("state: ", lambda x, v: policy_of(v, x["batch"], x["config"]), (None, {})),
     ("name: ", lambda x, v: register_network(v), (None, 3)),
     ("network: ", lambda x, v: register_network("x")(v), (None, 3, dict)),
     ("name: ", lambda x, v: register_stages(v), (None, 3)),
     ("stages: ", lambda x, v: register_stages("x")(v), (None, 3, dict)),
     ("skill: ", lambda x, v: skills.register(x.get(v, v)), (None, Path, "task")),
-    *(
-        (n, lambda x, v, n=n: save_tree(**{**SAVED, n: v}), ([], {"a": KEY}))
-        for n in ("metadata", "kind")
-    ),
-    *(
-        (n, lambda x, v, n=n: save_tree(**{**SAVED, n: {"a": v}}), ("x", [b"a"]))
-        for n in ("path", "tree")
-    ),
-    ("kind: ", lambda x, v: read_file("a", kind=v), (None, "x", [])),
-    ("run_dir: ", lambda x, v: train(x["batch"], x["config"], v), ("", 3)),
-    ("config: ", lambda x, v: train(x["batch"], v, "run"), ({"seed": 1}, None)),
-    ("env: ", lambda x, v: train(v, x["config"], "run"), (None, 3)),
     ("TrainConfig: ", lambda x, v: build(TrainConfig, v), (None, [1], "x")),
-    ("run: ", lambda x, v: read_policy(v), (None, 3, "\0")),
     (
         "num_envs: ",
         lambda x, v: gymnasium.VectorEnv("go1plane", v, impl="c"),
@@ -371,29 +297,6 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}),
         ("self", "__dataclass_self__", "init"),
     ),
-    (
-        "path: ",
-        lambda x, v: v[0](v[1]),
-        tuple(product((*READERS, load_config), (None, 3, {}, [], "", "\0"))),
-    ),
-    ("file: ", lambda x, v: load_recording(v), (None, 3, {}, [])),
-    (
-        "policy: ",
-        lambda x, v: tournament.play(x["matches"], v, [], KEY),
-        (None, "idle", TrainedPolicy),
-    ),
-    (
-        "policies",
-        lambda x, v: tournament.round_robin(x["matches"], v, KEY),
-        (None, [], {}, {"a": "idle"}),
-    ),
-    (
-        "results: ",
-        lambda x, v: tournament.scores(v),
-        (None, 3, np.ones(3), np.ones((2, 2)), np.full((2, 2, 3), NAN)),
-    ),
-    ("results: ", lambda x, v: games.analyse(v), (None, GAMES)),
-    ("reference: ", lambda x, v: tournament.rate(GAMES, v), (None, -1, 1, "a")),
     ("not a regular file", lambda x, v: v[0](v[1]), FILES),
 ]
 

@@ -10,6 +10,36 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mqe_jax"
+CHECKING = {
+    "adapters",
+    "adapters.brax",
+    "adapters.gymnasium",
+    "adapters.jaxmarl",
+    "adapters.opponent",
+    "adapters.pettingzoo",
+    "envs",
+    "envs.autoreset",
+    "envs.base",
+    "envs.registry",
+    "export.robot_team",
+    "names",
+    "policies.simple",
+    "runs.cast",
+    "runs.exploiting",
+    "runs.learning",
+    "runs.playing",
+    "runs.sweeping",
+    "runs.throughput",
+    "selfplay.league.crossplay",
+    "selfplay.league.tournament",
+    "selfplay.opponents",
+    "train.algorithms",
+    "train.networks",
+    "train.policy",
+    "walk.evaluation",
+    "walk.training",
+}
+"""Modules that may use `checked`."""
 
 
 def modules() -> dict[str, Path]:
@@ -74,3 +104,13 @@ def test_the_wheel_has_no_experiments_and_the_package_imports_none() -> None:
     for path in PACKAGE.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"^\s*(import|from) (lab|tools|tests)\b", text, re.MULTILINE), path
+
+
+def test_public_modules_alone_check_arguments() -> None:
+    """Input is checked where it comes in: the names of the package, registries, adapters."""
+    users = {
+        name
+        for name, path in modules().items()
+        if re.search(r"^ *@checked$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert users == CHECKING

@@ -12,16 +12,11 @@ import numpy as np
 from mqe_jax.acting.results import Result
 from mqe_jax.acting.seats import Act, Policy, Seats
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import Episodes, Horizon, PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments
 from mqe_jax.core.types import (
     RESULTS,
-    AnyBatch,
     Memory,
     Outcome,
-    PolicyOrAct,
-    RandomKey,
     VectorEnv,
     active_of,
     mean_of_team,
@@ -42,7 +37,6 @@ class _Progress(NamedTuple):
     diverged: jax.Array  # counted episodes that ended because the physics diverged (N,)
 
 
-@check_arguments(env=AnyBatch, policy=PolicyOrAct, episodes=Episodes, key=RandomKey)
 def evaluate_batch(
     env: VectorEnv,
     policy: Seats | Policy | Act,
@@ -69,8 +63,6 @@ class Evaluator:
     """Evaluates B policies in one compiled program; see `evaluate_batch`."""
 
     def __init__(self, env: VectorEnv, *, block: int = 50, max_steps: int = 1_000_000) -> None:
-        block = check("block", block, Horizon)
-        max_steps = check("max_steps", max_steps, PositiveInt)
         self._env = env
         self._block = block
         self._max_steps = max_steps
@@ -106,7 +98,6 @@ class Evaluator:
 
         The arrays of `seats` have a leading axis B. Seats of one form are compiled once.
         """
-        episodes = check("episodes", episodes, Episodes)
         count = self._env.num_envs
         quota = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)
         progress = self._begin(seats, keys)

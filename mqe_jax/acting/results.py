@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from mqe_jax.core.limits import Fraction, PositiveInt
 from mqe_jax.core.literal import line, to_html
-from mqe_jax.core.settings import check_arguments
 
 _NORMAL = 1.959964  # two-sided 95% quantile
 
@@ -38,7 +36,6 @@ class Rate(NamedTuple):
         return repr(self).replace("%", "").replace("100.0", "100")
 
     @classmethod
-    @check_arguments(value=Fraction, episodes=PositiveInt)
     def of(cls, value: float, episodes: int) -> "Rate":
         """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is
         conservative.

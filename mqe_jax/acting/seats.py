@@ -11,9 +11,8 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check_arguments, fail
+from mqe_jax.core.settings import fail
 from mqe_jax.core.types import (
-    AnyPolicy,
     Memory,
     Observations,
     is_typed_key,
@@ -340,7 +339,6 @@ class _Function:
         return self.memory
 
 
-@check_arguments(policy=AnyPolicy)
 def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "policy") -> None:
     """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, and
     what it finds `unmet`, as a trained policy does.

@@ -134,7 +134,6 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._host = HostEnvs(self.env, num_envs, render_mode, render_size)
         self._ended = np.zeros(num_envs, bool)  # environments that the next step resets
 
-    @checked
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         *,

@@ -105,7 +105,6 @@ class Env(MultiAgentEnv):
         state = self.env.reset(key)
         return self.get_obs(state), state
 
-    @checked
     def step(  # pyright: ignore[reportIncompatibleVariableOverride]
         self,
         key: RandomKey,

@@ -16,7 +16,7 @@ from mqe_jax import envs
 from mqe_jax.adapters import agent_names, missing, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.core.errors import InputError, short_repr
-from mqe_jax.core.limits import Pixels, PositiveInt, Seed
+from mqe_jax.core.limits import Pixels, PositiveInt
 from mqe_jax.core.settings import check, checked
 from mqe_jax.envs import QuadrupedEnv
 
@@ -116,9 +116,8 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         """Returns the space of an agent's action (action_size,), in [-1, 1]."""
         return self._action_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
-    @checked
     def reset(
-        self, seed: Seed | None = None, options: Mapping[str, Any] | None = None
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Starts an episode; without a seed the PRNG stream continues."""
         obs = self._host.reset([seed], self._generator)[0]

@@ -2,13 +2,14 @@
 
 Whatever is outside of them raises an `InputError`.
 
-Kinds of numbers are types of settings (`settings_class`) and of arguments (`check_arguments`). A
+Kinds of numbers are types of settings (`settings_class`) and of arguments (`checked`). A
 plain `int` or `float` has the bounds of `Integer` or `Number`. The constants bound files, texts and
 memory.
 """
 
 import math
 import typing
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
@@ -46,6 +47,7 @@ Robots = Annotated[int, Gt(0), Le(64)]  # of a scene
 FlockSize = Annotated[int, Gt(0), Le(128)]  # sheep
 Few = Annotated[int, Gt(0), Le(16)]  # rows of sheep
 SeedCount = Annotated[int, Gt(0), Le(64)]  # trained in one program
+Seeds = Annotated[Sequence[Seed], MinLen(1), MaxLen(64)]  # as many
 Lag = Annotated[int, Ge(0), Le(50)]  # environment steps
 Members = Annotated[int, Gt(0), Le(256)]  # of a league's pool
 Epochs = Annotated[int, Gt(0), Le(1000)]

@@ -221,29 +221,6 @@ def _is_data(hint: Any) -> bool:
     return hint in (str, int, float, bool, types.NoneType, Ellipsis) or is_settings(hint)
 
 
-def check_arguments(*annotated: str, **kinds: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a function check some of its arguments, each against a type, as settings are checked.
-
-    `annotated` are names of arguments that are checked against their annotations.
-    """
-
-    def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        signature = inspect.signature(function)
-        kinds.update({name: signature.parameters[name].annotation for name in annotated})
-
-        @functools.wraps(function)
-        def call(*given: P.args, **named: P.kwargs) -> R:
-            bound = signature.bind(*given, **named)
-            for name, kind in kinds.items():
-                if name in bound.arguments:
-                    bound.arguments[name] = check(name, bound.arguments[name], kind)
-            return function(*bound.args, **bound.kwargs)
-
-        return call
-
-    return decorate
-
-
 def check(name: str, value: Any, kind: Any) -> Any:
     """Returns a value converted to a type; raises the InputError of `fail` if that fails."""
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
@@ -387,7 +364,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
 
     InputError, naming it, if it is no mapping.
     """
-    values = read_yaml(Path(check("path", path, PathText)))
+    values = read_yaml(Path(path))
     if values is None:
         return {}
     if not isinstance(values, dict):

@@ -64,37 +64,10 @@ def _level(value: Any) -> Any:
     return value
 
 
-def _having(names: str, allowed: str, *, lacks: str = "", callables: bool = False) -> Any:
-    """Returns the validator of objects with some attributes, or of functions too."""
-
-    def validate(value: Any) -> Any:
-        whole = all(hasattr(value, name) for name in names.split())
-        if lacks and hasattr(value, lacks):
-            whole = False
-        if isinstance(value, type) or not (whole or (callables and callable(value))):
-            raise ValueError(allowed)
-        return value
-
-    return pydantic.AfterValidator(validate)
-
-
-# Kinds of arguments (`mqe_jax.core.settings.check_arguments`).
-_ENV = "name num_agents action_size reset step"
-_POLICY = "a policy, such as that of mqe_jax.load_policy"
-_ACT = f"{_POLICY}, or a function act(obs, memory, key)"
+# Kinds of arguments (`mqe_jax.core.settings.checked`).
 RandomKey = Annotated[jax.Array, pydantic.PlainValidator(_key)]
 RandomKeys = Annotated[jax.Array, pydantic.PlainValidator(_keys)]  # of each environment of a batch
 Level = Annotated[jax.Array | float, pydantic.PlainValidator(_level)]  # of a curriculum, in [0, 1]
-AnyEnvironment = Annotated[Any, _having(_ENV, "an environment, such as that of mqe_jax.make")]
-AnySingle = Annotated[
-    Any, _having(_ENV, "one environment, such as that of mqe_jax.make", lacks="num_envs")
-]
-AnyBatch = Annotated[
-    Any, _having(f"{_ENV} num_envs", "a batch, such as VectorEnv(mqe_jax.make(task), 64)")
-]
-AnyPolicy = Annotated[Any, _having("task agents act initial_memory", _POLICY)]
-AnyTrained = Annotated[Any, _having("needs config act initial_memory", "a trained policy")]
-PolicyOrAct = Annotated[Any, _having("act initial_memory", _ACT, callables=True)]
 
 Teams = tuple[tuple[int, ...], ...]
 """Agents of each team; every agent belongs to exactly one."""

@@ -13,7 +13,7 @@ import numpy as np
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import archive, parse_json, write_atomically
-from mqe_jax.core.settings import Parameters, check, checked, fail, to_mapping
+from mqe_jax.core.settings import Parameters, check, fail, to_mapping
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.state import State
 from mqe_jax.physics.engines import STATE_FIELDS
@@ -79,7 +79,6 @@ def save_recording(
     write_atomically(pathlib.Path(file), buffer.getvalue())
 
 
-@checked
 def load_recording(file: str | pathlib.Path) -> Recording:
     """Reads a recording; InputError if the file is missing, damaged or not a recording."""
     path = pathlib.Path(file)

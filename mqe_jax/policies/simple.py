@@ -10,9 +10,8 @@ import jax.numpy as jnp
 
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check, check_arguments
+from mqe_jax.core.settings import checked
 from mqe_jax.core.types import Memory, Observations, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
 from mqe_jax.envs.registry import NAMED_SCRIPTED
@@ -43,16 +42,16 @@ class SimplePolicy:
     identity: Hashable = dataclasses.field(default=None, repr=False, compare=False)
     """A value that is equal for policies that act alike; None: there is no other."""
 
-    @check_arguments(num_envs=PositiveInt | None)
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns an empty recurrent state."""
         return ()
 
     @single
-    def act(self, obs: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    @checked
+    def act(self, obs: Any, memory: Memory, key: RandomKey) -> tuple[jax.Array, Memory]:
         """Returns the actions; see `Policy`."""
         obs = check_obs(Observations.at(obs).obs, self.agents)
-        return self.plan(obs, check("key", key, RandomKey)), memory
+        return self.plan(obs, key), memory
 
 
 def names(task: str = "") -> tuple[str, ...]:

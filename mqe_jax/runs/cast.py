@@ -8,7 +8,7 @@ import jax
 from mqe_jax import names
 from mqe_jax.acting.seats import Policy, Seats, groups_of
 from mqe_jax.core.limits import Environments, SeedCount, bounds
-from mqe_jax.core.settings import check_arguments, fail, leaves, override, to_mapping
+from mqe_jax.core.settings import Parameters, checked, fail, leaves, override, to_mapping
 from mqe_jax.core.types import Cast
 from mqe_jax.core.types import VectorEnv as AnyVectorEnv
 from mqe_jax.envs import SCRIPTED, QuadrupedEnv, TaskParams, VectorEnv
@@ -46,7 +46,6 @@ TaskLike = str | QuadrupedEnv | AnyVectorEnv
 """A task's id, its environment, or a batch of environments."""
 
 
-@check_arguments(env=Mapping[str, Any] | None, impl=str)
 def prepare(
     task: TaskLike,
     config: Config = None,
@@ -78,14 +77,14 @@ def prepare(
     return configs, Cast(batch, start=start)
 
 
-@check_arguments(seeds=SeedCount)
+@checked
 def make_learner(
     task: TaskLike,
     config: Config = None,
     *,
-    env: Mapping[str, Any] | None = None,
+    env: Parameters | None = None,
     impl: str = "auto",
-    seeds: int = 1,
+    seeds: SeedCount = 1,
 ) -> Learner:
     """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure
     functions, not compiled.
@@ -115,7 +114,6 @@ def make_learner(
     return Learner(lambda key: start_from(policy, init(key), cast.league), update)
 
 
-@check_arguments(impl=str)
 def environments(
     config: TrainConfig,
     seeds: int = 1,

@@ -14,7 +14,7 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_folder
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, check, fail
+from mqe_jax.core.settings import fail
 from mqe_jax.envs.replay import content, save_recording
 from mqe_jax.envs.wrappers import Outer, WrappedState
 from mqe_jax.selfplay.opponents import TeamState
@@ -36,7 +36,7 @@ def guard(batch: Any, folder: str | Path | None) -> Iterator[Any]:
         return
     if getattr(batch, "env", None) is None:
         fail("dump_diverged", folder, f"none: {batch.name} has no physics of this package")
-    guarded = Guard(batch, Path(check("dump_diverged", folder, PathText)))
+    guarded = Guard(batch, Path(folder))
     try:
         yield guarded
     finally:

@@ -1,20 +1,18 @@
 """A training by one call: `learn`, `learn_seeds`, and the `Run` that they return."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-import pydantic
-from annotated_types import MaxLen, MinLen
 
-from mqe_jax.core import interrupts, limits
+from mqe_jax.core import interrupts
 from mqe_jax.core.files import check_folder
-from mqe_jax.core.limits import Seed, SeedCount
+from mqe_jax.core.limits import Seed, Seeds
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, check, check_arguments, fail
+from mqe_jax.core.settings import Parameters, checked
 from mqe_jax.core.types import Cast
 from mqe_jax.names import Config
 from mqe_jax.runs.cast import TaskLike, prepare
@@ -22,7 +20,7 @@ from mqe_jax.runs.divergence import guard
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import check_run, write_config
 from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
-from mqe_jax.train.monitor import Evaluation, read_evaluations, write_evaluations
+from mqe_jax.train.monitor import read_evaluations, write_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import Training, open_training
 
@@ -53,16 +51,6 @@ class Run:
     """The absolute metric: an evaluation of the best policy over more episodes; None before the end
     of a training."""
 
-    def __post_init__(self) -> None:
-        check("policy", self.policy, TrainedPolicy)
-        columns = check("metrics", self.metrics, Mapping[str, np.ndarray]).values()
-        if len({x.shape for x in columns}) > 1 or any(
-            x.ndim != 1 or x.dtype.kind not in "fiu" for x in columns
-        ):
-            fail("metrics", self.metrics, "columns of numbers, of one length")
-        for name, kind in {"evaluations": list[Evaluation], "absolute": Evaluation | None}.items():
-            check(name, check(name, getattr(self, name), pydantic.JsonValue), kind)
-
     @property
     def config(self) -> TrainConfig:
         """Settings of the training."""
@@ -88,6 +76,7 @@ class Run:
 
         return plot_curves([self.metrics], self.policy.task)
 
+    @checked
     def save(self, folder: str | Path) -> None:
         """Writes a run folder without a checkpoint, for `load_run`, `load_policy` and the command
         line.
@@ -97,7 +86,7 @@ class Run:
         Raises:
             InputError: if the folder cannot be written, or holds another run.
         """
-        path = Path(check("folder", folder, PathText))
+        path = Path(folder)
         check_folder(path, "folder")
         check_run(path)
         save_policy(path, self.policy)  # first: it rejects weights that are not finite
@@ -112,7 +101,7 @@ class Run:
             )
 
 
-@check_arguments(folder=PathText)
+@checked
 def load_run(folder: str | Path) -> Run:
     """Returns the run in a folder that a training or `Run.save` wrote.
 
@@ -132,16 +121,14 @@ def load_run(folder: str | Path) -> Run:
     return Run(policy, metrics, evaluations["evaluations"], evaluations["absolute"])
 
 
-@check_arguments(
-    seed=Seed | None, run_dir=PathText | None, resume=bool, dump_diverged=PathText | None
-)
+@checked
 def learn(
     task: TaskLike,
     config: Config = None,
     *,
-    env: Mapping[str, Any] | None = None,
+    env: Parameters | None = None,
     impl: str = "auto",
-    seed: int | None = None,
+    seed: Seed | None = None,
     run_dir: str | Path | None = None,
     resume: bool = False,
     dump_diverged: str | Path | None = None,
@@ -184,16 +171,14 @@ def learn(
     )[0]
 
 
-@check_arguments(
-    seeds=Sequence[Seed], run_dir=PathText | None, resume=bool, dump_diverged=PathText | None
-)
+@checked
 def learn_seeds(
     task: TaskLike,
     config: Config = None,
     *,
-    env: Mapping[str, Any] | None = None,
+    env: Parameters | None = None,
     impl: str = "auto",
-    seeds: Sequence[int] = range(5),
+    seeds: Seeds = range(5),
     run_dir: str | Path | None = None,
     resume: bool = False,
     dump_diverged: str | Path | None = None,
@@ -212,17 +197,11 @@ def learn_seeds(
         seeds: random seeds.
         run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
     """
-    numbers = check(
-        "seeds",
-        seeds,
-        Annotated[tuple[Seed, ...], MinLen(1), MaxLen(int(limits.bounds(SeedCount)[1]))],
-    )
-    configs, cast = prepare(task, config, env, impl=impl, seeds=numbers)
-    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in numbers]
+    configs, cast = prepare(task, config, env, impl=impl, seeds=seeds)
+    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in seeds]
     return _train(configs, cast, folders, resume, dump_diverged)
 
 
-@check_arguments(resume=bool, dump_diverged=PathText | None)
 def _train(
     configs: Sequence[TrainConfig],
     cast: Cast,

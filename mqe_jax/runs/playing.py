@@ -4,7 +4,7 @@ import base64
 import dataclasses
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,9 +24,9 @@ from mqe_jax.core.limits import (
     ImageWidth,
     Seed,
     Speed,
+    Time,
 )
-from mqe_jax.core.settings import Parameters, PathText, check, check_arguments, fail, merge
-from mqe_jax.core.types import AnySingle
+from mqe_jax.core.settings import Parameters, checked, fail, merge
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.envs.registry import task_id
 from mqe_jax.names import Read, Source, Table
@@ -41,21 +41,19 @@ from mqe_jax.selfplay.league.tournament import Standings
 Camera = Literal["follow", "near", "scene", "side"]
 
 
-@check_arguments(
-    episodes=Episodes, sides=Literal["both", "first"], num_envs=Environments, seed=Seed
-)
+@checked
 def evaluate(
     task: str | Path | QuadrupedEnv,
     policy: Source | None = None,
     opponent: Source | None = None,
     *,
-    env: Mapping[str, Any] | None = None,
+    env: Parameters | None = None,
     impl: str = "auto",
-    episodes: int = 512,
-    sides: str = "first",
-    num_envs: int = 128,
+    episodes: Episodes = 512,
+    sides: Literal["both", "first"] = "first",
+    num_envs: Environments = 128,
     deterministic: bool = False,
-    seed: int = 0,
+    seed: Seed = 0,
     dump_diverged: str | Path | None = None,
 ) -> Result:
     """Evaluates a policy over complete episodes from fresh resets, as `mqe eval`.
@@ -129,22 +127,16 @@ def _measure(
     return dataclasses.replace(result, about=about, labels=playing.env.labels)
 
 
-@check_arguments(
-    policies=Annotated[Sequence[str], MinLen(1)],
-    env=Parameters | None,
-    episodes=Candidates,
-    deterministic=bool,
-    seed=Seed,
-)
+@checked
 def tournament(
     task: str | QuadrupedEnv,
-    policies: Sequence[str],
+    policies: Annotated[Sequence[str], MinLen(1)],
     *,
-    env: Mapping[str, Any] | None = None,
+    env: Parameters | None = None,
     impl: str = "auto",
-    episodes: int = 64,
+    episodes: Candidates = 64,
     deterministic: bool = False,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Standings | CrossPlay:
     """Plays policies of a match against each other and rates them, or mixes teams of them, as `mqe
     tournament`.
@@ -197,28 +189,19 @@ def tournament(
     return Standings(made.name, everyone, results, ratings)
 
 
-@check_arguments(
-    "width",
-    "fps",
-    "speed",
-    "sensors",
-    episodes=Candidates,
-    seconds=ClipLength,
-    seed=Seed,
-    view=Camera | None,
-)
+@checked
 def render(
     task: str | Path | QuadrupedEnv,
     policy: Source | None = None,
     opponent: Source | None = None,
     *,
-    env: Mapping[str, Any] | None = None,
+    env: Parameters | None = None,
     impl: str = "auto",
-    episodes: int = 1,
-    seconds: float = 20.0,
+    episodes: Candidates = 1,
+    seconds: ClipLength = 20.0,
     deterministic: bool = False,
-    seed: int = 0,
-    view: str | None = None,
+    seed: Seed = 0,
+    view: Camera | None = None,
     width: ImageWidth | None = None,
     fps: FrameRate | None = None,
     speed: Speed = 1.0,
@@ -284,17 +267,6 @@ class Clip:
     look: dict[str, Any]
     """Options of `mqe_jax.viz.render.render_episode`: view, size, fps, speed."""
 
-    def __post_init__(self) -> None:
-        from mqe_jax.viz.recording import Episode
-
-        check("env", self.env, AnySingle)
-        if not check("episodes", self.episodes, list[Any]) or not all(
-            isinstance(x, Episode) for x in self.episodes
-        ):
-            fail("episodes", self.episodes, "a list of episodes")
-        check("about", self.about, dict[str, Any])
-        check("look", self.look, dict[Literal["view", "size", "fps", "speed"], Any])
-
     @property
     def best(self) -> int:
         """Index of the best episode."""
@@ -310,8 +282,8 @@ class Clip:
             f"{episode.success:g}>"
         )
 
-    @check_arguments(file=PathText)
-    def save(self, file: str | Path, *, at: float | None = None) -> str:
+    @checked
+    def save(self, file: str | Path, *, at: Time | None = None) -> str:
         """Writes a .mp4, .webp, .gif or .png file; returns the renderer (`egl`, `osmesa` or
         `matplotlib`).
 

@@ -14,7 +14,7 @@ from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.files import write_atomically
 from mqe_jax.core.limits import Positive, Seed
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import PathText, check_arguments, to_mapping
+from mqe_jax.core.settings import checked, to_mapping
 from mqe_jax.envs.registry import task_id
 from mqe_jax.presets import Layers
 from mqe_jax.runs import cast
@@ -25,9 +25,7 @@ from mqe_jax.study.sweep import Job, Sweep
 from mqe_jax.train.config import TrainConfig
 
 
-@check_arguments(
-    "part", "cells", "seeds", "time_limit", "impl", "dry_run", file=PathText, folder=PathText
-)
+@checked
 def sweep(
     file: str | Path,
     folder: str | Path,

@@ -4,7 +4,7 @@ only.
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from statistics import median
 from typing import Any
 
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from mqe_jax import names
 from mqe_jax.core.limits import Environments, Horizon, Seed
-from mqe_jax.core.settings import Parameters, check_arguments
+from mqe_jax.core.settings import Parameters, checked
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.sensors.suite import ONBOARD
 
@@ -62,18 +62,16 @@ def programs(
     )
 
 
-@check_arguments(
-    env=Parameters | None, num_envs=Environments, steps=Horizon, repeats=Horizon, seed=Seed
-)
+@checked
 def bench(
     task: str | QuadrupedEnv,
     *,
-    env: Mapping[str, Any] | None = None,
+    env: Parameters | None = None,
     impl: str = "auto",
-    num_envs: int = 256,
-    steps: int = 50,
-    repeats: int = 10,
-    seed: int = 0,
+    num_envs: Environments = 256,
+    steps: Horizon = 50,
+    repeats: Horizon = 10,
+    seed: Seed = 0,
 ) -> dict[str, str | int | float]:
     """Measures throughput in environment steps per second, as `mqe bench`.
 

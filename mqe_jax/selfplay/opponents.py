@@ -12,12 +12,10 @@ import jax.numpy as jnp
 from mqe_jax.acting.seats import Fixed, Policy, Seat, Seats, actor_of, check_policy
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.limits import NonNegativeInt, Number
+from mqe_jax.core.limits import NonNegativeInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check_arguments, fail
+from mqe_jax.core.settings import checked, fail
 from mqe_jax.core.types import (
-    AnyBatch,
-    AnyPolicy,
     Memory,
     Observations,
     RandomKey,
@@ -118,7 +116,6 @@ class Versus(OneTeam):
     Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
     """
 
-    @check_arguments(matches=AnyBatch, opponents=Sequence[AnyPolicy], draw_reward=Number)
     def __init__(
         self, matches: VectorEnv | Wrapper, opponents: Sequence[Policy], draw_reward: float = 0.0
     ) -> None:
@@ -154,8 +151,8 @@ class Versus(OneTeam):
             fail("opponents", blocks, allowed)
 
     @single
-    @check_arguments(key=RandomKey)
-    def reset(self, key: jax.Array) -> TeamState:
+    @checked
+    def reset(self, key: RandomKey) -> TeamState:
         """Returns the initial states of all environments, against the first opponents."""
         key, match_key = jax.random.split(key)
         match = self.inner.reset(match_key)
@@ -210,9 +207,14 @@ class Versus(OneTeam):
             seats.append(seat if fixed else dataclasses.replace(seat, policy=opponent))
         return Seats(tuple(seats))
 
-    @check_arguments(state=TeamState, block=NonNegativeInt, policy=TrainedPolicy, at_once=bool)
+    @checked
     def change(
-        self, state: TeamState, block: int, policy: TrainedPolicy, *, at_once: bool = False
+        self,
+        state: TeamState,
+        block: NonNegativeInt,
+        policy: TrainedPolicy,
+        *,
+        at_once: bool = False,
     ) -> TeamState:
         """Returns the state with another opponent in a block, a trained policy of the same
         form.
@@ -263,7 +265,6 @@ class Mirror(OneTeam):
     those of team 0; `diverged` and `overflow` are counted for the first.
     """
 
-    @check_arguments(matches=AnyBatch)
     def __init__(self, matches: VectorEnv) -> None:
         super().__init__(matches, 2 * matches.num_envs)
         self.privileged_observation_size += 1

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NoReturn, dataclass_transform
 
 from mqe_jax.core.errors import nearest
-from mqe_jax.core.settings import FrozenMapping, build, check, fail, name_settings
+from mqe_jax.core.settings import FrozenMapping, build, check, checked, fail, name_settings
 
 if TYPE_CHECKING:
     from mqe_jax.train.config import TrainConfig
@@ -65,9 +65,9 @@ STAGES: dict[str, type[StagesSettings]] = {}
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
+@checked
 def register_stages(name: str) -> Callable[[type[Any]], type[Any]]:
     """Makes a class the settings class of an algorithm and registers it."""
-    check("name", name, str)
 
     def register(cls: type[Any]) -> type[Any]:
         if not (isinstance(cls, type) and issubclass(cls, StagesSettings)):

@@ -5,7 +5,7 @@ import re
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ from safetensors.numpy import load, save
 from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, brief
 from mqe_jax.core.files import make_folder, parse_json, parsing, read_bytes, write_atomically
-from mqe_jax.core.settings import PathText, check_arguments, fail
+from mqe_jax.core.settings import fail
 from mqe_jax.core.types import is_typed_key, raw_keys
 
 FORMAT = "mqe_jax.train"
@@ -43,10 +43,6 @@ _ANY = re.compile(r"/env_state/(?!.*(arrays|before)/)(?!.*(obs|qpos|qvel|groups/
 """Names of arrays in which NaN may be meant."""
 
 
-Kind = Literal["policy", "checkpoint"]
-"""Kinds of files."""
-
-
 def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:
     """Returns the leaves by path name, in the tree's order, and the tree's structure."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
@@ -64,7 +60,6 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
     return str(total)
 
 
-@check_arguments(path=PathText, metadata=Mapping[str, Any], kind=Kind)
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
     """Writes a pytree of arrays with JSON metadata as a file of a kind; equal content gives equal
     bytes.
@@ -145,7 +140,6 @@ class Stored(NamedTuple):
         return jax.tree_util.tree_unflatten(structure, leaves)
 
 
-@check_arguments(path=PathText, kind=Kind)
 def read_file(path: str | Path, *, kind: str) -> Stored:
     """Reads a file of a kind, opening it once.
 

@@ -15,16 +15,13 @@ import jax.numpy as jnp
 
 from mqe_jax.acting.seats import Seats
 from mqe_jax.core import devices
-from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import check_arguments, fail
+from mqe_jax.core.settings import fail
 from mqe_jax.core.types import (
-    AnyBatch,
     Batch,
     Matchmaker,
     Params,
     PyTree,
-    RandomKey,
     Transition,
     VectorEnv,
     replace_fields,
@@ -82,7 +79,6 @@ class Learner(NamedTuple):
     update: Callable[[TrainState], tuple[TrainState, Metrics]]
 
 
-@check_arguments(env=AnyBatch, config=TrainConfig, processes=PositiveInt)
 def make_learner(
     env: VectorEnv,
     config: TrainConfig,
@@ -110,7 +106,6 @@ def make_learner(
     moving = getattr(getattr(env, "env", env), "moving", lambda action: action)
 
     @single
-    @check_arguments(key=RandomKey)
     def init(key: jax.Array) -> TrainState:
         params_key, env_key, stagger_key, key = jax.random.split(key, 4)
         env_state = env.reset(env_key)
@@ -145,7 +140,6 @@ def make_learner(
         )
 
     @single
-    @check_arguments(state=TrainState)
     def update(state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, epoch_key = jax.random.split(state.key, 3)
         now = current_values(config, state.updates)

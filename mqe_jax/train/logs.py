@@ -25,7 +25,6 @@ from rich.text import Text
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import append, make_folder, parsing, read_rows, write_atomically
-from mqe_jax.core.settings import PathText, check
 from mqe_jax.train.config import TrainConfig
 
 CSV_FILE = "metrics.csv"
@@ -79,7 +78,7 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """Reads the columns of a metrics.csv (U,) each; InputError naming the file, if it is missing or
     malformed.
     """
-    path = Path(check("path", path, PathText))
+    path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file; a run folder has one after its first update")
     rows = read_rows(path)

@@ -12,12 +12,11 @@ from mqe_jax.core.settings import (
     FrozenMapping,
     Parameters,
     Range,
-    check_arguments,
     fail,
     leaves,
     settings_class,
 )
-from mqe_jax.core.types import AnyEnvironment, group_sizes, teams_of
+from mqe_jax.core.types import group_sizes, teams_of
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 
@@ -109,7 +108,6 @@ def _one(block: Block) -> Block:
     return block if of is None else entities(block.name, of.kind, 1, of.width, masked=of.masked)
 
 
-@check_arguments(env=AnyEnvironment, config=TrainConfig)
 def needs_of(env: Any, config: TrainConfig) -> Needs:
     """Returns what a policy of one team needs of an environment, a task or a batch of it.
 

@@ -13,18 +13,15 @@ from annotated_types import Ge
 
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.files import check_folder, check_locks
-from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, build, check, check_arguments, fail, to_mapping
+from mqe_jax.core.settings import build, check, checked, fail, to_mapping
 from mqe_jax.core.types import (
-    AnyEnvironment,
     Memory,
     Observations,
     Params,
     RandomKey,
     VectorEnv,
     group_sizes,
-    shapes_of,
 )
 from mqe_jax.train.checkpoint import Stored, nonfinite, read_file, save_tree
 from mqe_jax.train.config import TrainConfig, without_retired
@@ -130,16 +127,6 @@ class TrainedPolicy:
     deterministic: bool = False
     """Whether it acts with its mean actions; otherwise they are sampled."""
 
-    def __post_init__(self) -> None:
-        for name, kind in {"needs": Needs, "config": TrainConfig, "metadata": Mapping}.items():
-            if not isinstance(value := getattr(self, name), kind):
-                fail(name, value, f"of the type {kind.__name__}")
-        check("deterministic", self.deterministic, bool)
-        given = {"params": self.params, "normalizer": self.normalizer}
-        for name, expected in _template(self.dims, self.config.network).items():
-            if shapes_of(given[name]) != shapes_of(expected):
-                fail(name, given[name], f"arrays that fit the network and {self.dims}")
-
     def __repr__(self) -> str:
         mode = "mean" if self.deterministic else "sampled"
         return f"<TrainedPolicy of {self.task}: {self.config.network.name}, {mode} actions>"
@@ -197,13 +184,13 @@ class TrainedPolicy:
 
     def initial_memory(self, num_envs: int | None = None) -> Memory:
         """Returns the initial recurrent state: leading axis N, or none for a single environment."""
-        num_envs = check("num_envs", num_envs, PositiveInt | None)
         memory = self.actor.initial_memory(num_envs or 1)
         return jax.tree.map(lambda x: x[0], memory) if num_envs is None else memory
 
     @single
+    @checked
     def act(
-        self, obs: Any, memory: Memory, key: jax.Array | None = None
+        self, obs: Any, memory: Memory, key: RandomKey | None = None
     ) -> tuple[jax.Array, Memory]:
         """Returns actions in [-1, 1] and the next memory: obs (N, A, O) or (A, O) -> (N, A, D) or
         (A, D).
@@ -217,10 +204,6 @@ class TrainedPolicy:
         group = self.needs.group
         seen = Observations.at(obs, group)
         given = check_obs(seen.group(group), self.dims.agents, self.dims.observation)
-        check("key", key, RandomKey | None)
-        expected = jax.tree.structure(self.initial_memory())
-        if jax.tree.structure(memory) != expected:
-            fail("memory", memory, f"the recurrent state of this policy, {expected}")
         return self.actor.act(Observations({group: given}, seen.active), memory, key)
 
 
@@ -253,7 +236,6 @@ def check_obs(obs: Any, agents: int, size: int | None = None) -> jax.Array:
     return obs
 
 
-@check_arguments(state=TrainState, env=AnyEnvironment, config=TrainConfig)
 def policy_of(
     state: TrainState, env: VectorEnv, config: TrainConfig, **metadata: Any
 ) -> TrainedPolicy:
@@ -263,7 +245,6 @@ def policy_of(
     return TrainedPolicy(policy_params, state.obs_normalizer.obs, needs, config, metadata)
 
 
-@check_arguments(run_dir=PathText, policy=TrainedPolicy, name=PathText, half=bool)
 def save_policy(
     run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False
 ) -> Path:
@@ -284,8 +265,6 @@ def save_policy(
         InputError: for a folder that cannot be written.
         NonFiniteError: for weights or statistics that are NaN or infinite.
     """
-    if Path(name).name != name:
-        fail("name", name, "the name of a file, without a folder")
     path = Path(run_dir) / name
     arrays, metadata = _file_content(policy, half)
     if wrong := nonfinite(arrays):
@@ -311,7 +290,6 @@ def _file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], di
 
 
 @single
-@check_arguments(run=PathText)
 def read_policy(run: str | Path) -> TrainedPolicy:
     """Reads the policy of a run folder, or a policy file; parameters stored as float16 become
     float32.

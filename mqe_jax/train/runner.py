@@ -14,8 +14,8 @@ import numpy as np
 from mqe_jax.core import interrupts
 from mqe_jax.core.devices import Processes, translate_errors
 from mqe_jax.core.errors import InputError, NonFiniteError
-from mqe_jax.core.settings import PathText, check, fail, to_mapping
-from mqe_jax.core.types import AnyBatch, Cast, PyTree, VectorEnv, generator, raw_keys
+from mqe_jax.core.settings import fail, to_mapping
+from mqe_jax.core.types import Cast, PyTree, VectorEnv, generator, raw_keys
 from mqe_jax.train.checkpoint import checkpoint_step, latest, nonfinite, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import common_checkpoints, open_folders, write_config
@@ -84,10 +84,6 @@ def open_training(
     resume: bool = False,
 ) -> Iterator["Training"]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
-    check("env", cast.env, AnyBatch)
-    for config, _ in zip(configs, run_dirs, strict=True):
-        check("config", config, TrainConfig)
-    run_dirs = [check("run_dir", run_dir, PathText | None) for run_dir in run_dirs]
     if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
         raise InputError(
             "seeds: the settings of seeds trained together may differ only in the seed"

@@ -20,7 +20,6 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import CLIP_BYTES, FrameRate, Pixels, Speed, Time
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import checked
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.physics.appearance import GROUND_GROUP
 from mqe_jax.physics.appearance.grounds import GROUND_MATERIAL
@@ -193,7 +192,6 @@ def _check_fits(env: QuadrupedEnv, episode: Episode) -> None:
         raise InputError("episode: its coordinates hold NaN or infinite numbers")
 
 
-@checked
 def render_episode(
     env: QuadrupedEnv,
     episode: Episode,

@@ -19,7 +19,6 @@ import numpy as np
 
 from mqe_jax.core import limits
 from mqe_jax.core.files import archive
-from mqe_jax.core.settings import checked
 from mqe_jax.walk_policy import NETWORKS, Params
 
 _DTYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2"}
@@ -101,7 +100,6 @@ class _Unpickler(_PurePython):
         return tensor
 
 
-@checked
 def read_torchscript(path: str | Path) -> dict[str, np.ndarray]:
     """Returns the float32 tensors of a scripted or traced `Sequential` by names such as 0.weight.
 

@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import check_arguments
-from mqe_jax.core.types import AnySingle
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.registry import NAMED_SCRIPTED, SCRIPTED, ScriptedPolicy, load
@@ -36,7 +34,6 @@ def find_scripted(task: str, name: str = "scripted", field: str = "policy") -> S
     return load("mqe_jax.policies.scripted", policy) if isinstance(policy, str) else policy
 
 
-@check_arguments(env=AnySingle, name=str)
 def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
     """Returns the scripted policy of a task, from the observations (A, O) of one team to its
     actions (A, 3).

@@ -9,7 +9,7 @@ from typing import Literal
 from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Episodes, Fraction, NonNegative
-from mqe_jax.core.settings import build, check_arguments, settings_class
+from mqe_jax.core.settings import build, settings_class
 from mqe_jax.train.policy import TrainedPolicy, read_policy
 
 FOLDER = Path(__file__).parent
@@ -64,7 +64,6 @@ def file_of(task: str) -> Path:
     return FOLDER / f"{task}.safetensors"
 
 
-@check_arguments(task=str)
 def load(task: str) -> TrainedPolicy:
     """Returns a task's shipped policy.
 

@@ -4,20 +4,18 @@ import dataclasses
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from mqe_jax.acting.evaluate import Evaluator
 from mqe_jax.acting.results import Rate
 from mqe_jax.acting.seats import Policy, Seat, Seats, check_policy, exchangeable
-from mqe_jax.core.limits import Episodes
-from mqe_jax.core.settings import PathText, check_arguments, fail
-from mqe_jax.core.types import AnyBatch, AnyPolicy, RandomKey, teams_of
+from mqe_jax.core.settings import checked, fail
+from mqe_jax.core.types import teams_of
 from mqe_jax.envs import VectorEnv
 from mqe_jax.selfplay.league.games import Estimate
 from mqe_jax.selfplay.league.tables import draw, grid, shorten, table, write_table
@@ -26,12 +24,6 @@ from mqe_jax.selfplay.league.tournament import CSV, PICTURE
 Array = NDArray[np.float64]
 
 
-@check_arguments(
-    batch=AnyBatch,
-    policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)],
-    episodes=Episodes,
-    key=RandomKey,
-)
 def cross_play(
     batch: VectorEnv, policies: Mapping[str, Policy], episodes: int, key: jax.Array
 ) -> Array:
@@ -163,7 +155,7 @@ class CrossPlay:
             "worst": worst,
         }
 
-    @check_arguments(folder=PathText)
+    @checked
     def save(self, folder: str | Path) -> None:
         """Writes the success of every team, and a picture of it, atomically."""
         folder = Path(folder)

@@ -3,13 +3,10 @@
 Source: Li and Wellman 2024, arXiv 2405.00243 (bootstrap over seeds and episodes).
 """
 
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
-
-from mqe_jax.core.settings import check_arguments, fail
 
 Array = NDArray[np.float64]
 
@@ -38,23 +35,6 @@ class Estimate(NamedTuple):
         return {name: np.asarray(x).tolist() for name, x in self._asdict().items()}
 
 
-def _check_results(value: Any) -> Any:
-    shape = np.shape(value)
-    if (
-        len(shape) < 3
-        or shape[-3:] != (*shape[-2:-1] * 2, 3)
-        or not np.all(np.isfinite(value))
-        or np.min(value) < 0
-    ):
-        raise ValueError("outcomes of policies against policies, as of round_robin")
-    return value
-
-
-Results = Annotated[Any, pydantic.AfterValidator(_check_results)]
-"""Kind of an argument that is a result of `round_robin` (P, P, 3); of some, with leading axes."""
-
-
-@check_arguments(results=Results)
 def payoffs(results: NDArray[Any]) -> Array:
     """Returns wins minus losses of a game, on both sides together, from outcomes (..., P, P, 3):
     (..., P, P).
@@ -101,12 +81,9 @@ class Analysis(NamedTuple):
     """Lowest payoff against one of the others (P,)."""
 
 
-@check_arguments(results=Results)
 def analyse(results: NDArray[Any]) -> Analysis:
     """Returns mean and worst case from results (P, P, 3), with bootstrap intervals."""
     count = len(results)
-    if count < 2:
-        fail("results", np.shape(results), "those of at least two policies")
     random = np.random.default_rng(0)
     matrix = payoffs(results)
     samples = payoffs(resample(games_of(results), random))

@@ -5,31 +5,25 @@ import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from mqe_jax.acting.results import Rate
 from mqe_jax.acting.seats import Policy, Seat, Seats, check_policy, exchangeable
-from mqe_jax.core.limits import NonNegativeInt
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import PathText, check_arguments, fail
+from mqe_jax.core.settings import checked
 from mqe_jax.core.types import (
     RESULTS,
-    AnyBatch,
-    AnyPolicy,
-    RandomKey,
     observations,
 )
 from mqe_jax.envs import VectorEnv
 from mqe_jax.selfplay.league.games import (
     Analysis,
     Estimate,
-    Results,
     analyse,
     estimate,
     games_of,
@@ -47,7 +41,6 @@ _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 40
 
 
-@check_arguments(matches=AnyBatch, policy=AnyPolicy, key=RandomKey)
 def play(
     matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array
 ) -> NDArray[np.int64]:
@@ -57,9 +50,6 @@ def play(
     return _play(matches, [policy], opponents, [key])[0]
 
 
-@check_arguments(
-    matches=AnyBatch, policies=Annotated[Mapping[str, AnyPolicy], MinLen(1)], key=RandomKey
-)
 def round_robin(
     matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array
 ) -> NDArray[np.int64]:
@@ -111,7 +101,6 @@ def _play(
     return outcomes.reshape(len(policies), -1, len(opponents), 3).sum(axis=1)
 
 
-@check_arguments(results=Results)
 def scores(results: NDArray[Any]) -> Array:
     """Returns the points of each policy against each, as both teams together, in games: (..., P, P,
     3) to (..., P, P).
@@ -122,15 +111,12 @@ def scores(results: NDArray[Any]) -> Array:
     return points + (results.sum(axis=-1) - points).swapaxes(-1, -2)
 
 
-@check_arguments(results=Results, reference=NonNegativeInt)
 def rate(results: NDArray[Any], reference: int) -> Estimate:
     """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,); `reference` has 0.
 
     A draw is half a win; every pair has one drawn game more than it played, so that ratings are
     finite. Intervals are of a Bayesian bootstrap of all these games.
     """
-    if reference >= len(results):
-        fail("reference", reference, f"the index of one of the {len(results)} policies")
     games = games_of(results)
     samples = _strengths(scores(resample(games, np.random.default_rng(0))), reference)
     return estimate(_strengths(scores(games), reference), samples)
@@ -206,7 +192,7 @@ class Standings:
         pairs = {"results": self.results.tolist(), "payoff": found.payoff.to_dict()}
         return {"task": self.task, "ratings": policies, "policies": [*self.policies], **pairs}
 
-    @check_arguments(folder=PathText)
+    @checked
     def save(self, folder: str | Path) -> None:
         """Writes the results of every pair, what they say of each policy, and a picture of the
         points, atomically.
