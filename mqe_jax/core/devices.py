@@ -174,10 +174,9 @@ class Processes:
         other = object.__new__(Processes)
         vars(other).update(vars(self))
 
-        def stack(once: bool, spec: PartitionSpec) -> PartitionSpec:
-            return spec if once else PartitionSpec(None, *spec)
-
-        other._specs = jax.tree.map(stack, shared, self._specs)
+        other._specs = jax.tree.map(
+            lambda once, spec: spec if once else PartitionSpec(None, *spec), shared, self._specs
+        )
         return other
 
     def compile(

@@ -303,10 +303,11 @@ def normal_numbers(
         part = 1.0 + jax.lax.erf(normal(key, shape, dtype) / math.sqrt(2.0))
         return minval + (maxval - minval) * 0.5 * part
 
-    def bernoulli(key: jax.Array, p: Any, shape: tuple[int, ...]) -> jax.Array:
-        return uniform(key, shape) < p
-
-    draws = {"normal": normal, "uniform": uniform, "bernoulli": bernoulli}
+    draws = {
+        "normal": normal,
+        "uniform": uniform,
+        "bernoulli": lambda key, p, shape: uniform(key, shape) < p,
+    }
     with jax.disable_jit(), mock.patch.multiple(jax.random, **draws):
         yield
 

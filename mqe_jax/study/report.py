@@ -46,8 +46,7 @@ def write_report(cells: Cells, target: Path) -> list[Path]:
         evaluated = {cell: cells[cell] for cell in with_evaluations}
         files["evaluations.png"] = draw_evaluations(evaluated)
         text += ["![Evaluations during training](evaluations.png)", ""]
-    aggregates = aggregate_tables(cells)
-    for name, rows in aggregates.items():
+    for name, rows in aggregate_tables(cells).items():
         files[f"{name}.csv"] = table(rows).encode()
         text += [f"## {_HEADINGS[name]}", "", markdown(rows), ""]
     files["report.md"] = "\n".join(text).encode()

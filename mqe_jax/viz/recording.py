@@ -115,17 +115,13 @@ def record_episodes(
         return (state, memory), (*now(state), done, reward, success, marks)
 
     @jax.jit
-    def begin(key: jax.Array) -> Any:
-        return jax.vmap(env.reset)(jax.random.split(jax.random.split(key)[0], episodes))
-
-    @jax.jit
     def chunk(
         carry: tuple[Any, Any], key: jax.Array, index: jax.Array
     ) -> tuple[tuple[Any, Any], Any]:
         keys = jax.random.split(jax.random.fold_in(jax.random.split(key)[1], index), length)
         return jax.lax.scan(one_step, carry, keys)
 
-    state = begin(key)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.split(key)[0], episodes))
     first = [np.asarray(x)[None] for x in now(state)]
     rows: list[Any] = []
     steps = max(1, round(seconds / env.dt))

@@ -55,10 +55,7 @@ def desired_contact(phases: jax.Array) -> jax.Array:
 
     Lift-off and touch-down are smoothed.
     """
-
-    def cdf(x: jax.Array) -> jax.Array:
-        return jax.scipy.stats.norm.cdf(x, scale=_BLUR)
-
+    cdf = functools.partial(jax.scipy.stats.norm.cdf, scale=_BLUR)
     return cdf(phases) * (1 - cdf(phases - 0.5)) + cdf(phases - 1) * (1 - cdf(phases - 1.5))
 
 

@@ -219,10 +219,11 @@ class WarpEngine(MjxEngine):
     def unused_terms(self, fields: Collection[str]) -> int:
         """Returns the disable flags of terms that are zero, also with any values of `fields`."""
         model = self.model
-        flags = 0
-        for flag, names in _TERMS.items():
-            if not any(name in fields or np.any(getattr(model, name)) for name in names):
-                flags |= flag
+        flags = sum(
+            flag
+            for flag, names in _TERMS.items()
+            if not any(name in fields or np.any(getattr(model, name)) for name in names)
+        )
         # Flexes and fluids add passive forces; without dampers, implicit integrators ignore the
         # actuators' derivatives.
         fluid = any((model.opt.density, model.opt.viscosity, *model.opt.wind))
