@@ -57,8 +57,9 @@ class Sensor:
 
     @property
     def action_size(self) -> int:
-        """Number of entries that it appends to an agent's action; at most one sensor of a task
-        appends some.
+        """Number of entries that it appends to an agent's action.
+
+        At most one sensor of a task appends some.
         """
         return 0
 
@@ -67,9 +68,7 @@ class Sensor:
         return self.pipeline.get(block.name, self.pipeline.get("all", Pipeline()))
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Adds what the sensor needs, such as sites or cameras, to the scene of the physics before
-        it is compiled.
-        """
+        """Adds what the sensor needs, such as cameras, to the specification of the physics."""
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
         """Returns the blocks of its readings: names, widths, meaning with unit and frame."""
@@ -82,8 +81,9 @@ class Sensor:
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        """Returns the readings of all agents by block (A, width), each in its own frame, and the
-        next memory.
+        """Returns the readings of all agents by block (A, width), and the next memory.
+
+        Each agent's readings are in its own frame.
 
         Args:
             scene: what does not change, such as `num_agents`, `dt`, and `mirror` (A,), by which
@@ -99,8 +99,9 @@ class Sensor:
     def draw(
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
-        """Returns the marks that `--sensors` draws, for the latest readings by block (A, width),
-        unscaled.
+        """Returns the marks that `--sensors` draws.
+
+        `readings` are the latest by block (A, width), unscaled.
         """
         return ()
 
@@ -112,15 +113,15 @@ S = TypeVar("S", bound=type[Sensor])
 
 
 def register(sensor: S) -> S:
-    """Registers a settings class under the default of its field `name`, and returns it; a class
-    decorator.
+    """Registers a settings class under its default `name`, and returns it; a class decorator.
 
     Raises:
         InputError: for anything else, a class without a name, or a name of another class.
     """
     if not (isinstance(sensor, type) and issubclass(sensor, Sensor) and is_settings(sensor)):
         fail("sensor", sensor, "a class derived from Sensor, below @register and @settings_class")
-    if not (name := sensor().name):
+    name = sensor().name
+    if not name:
         raise InputError(f"sensor {sensor.__name__}: the field name has no default")
     if SENSORS.setdefault(name, sensor) is not sensor:
         raise InputError(f"sensor: the name {name!r} is already registered")

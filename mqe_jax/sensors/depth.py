@@ -20,11 +20,10 @@ from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.scene import SensedScene, Snapshot
 
-# turns a camera, which looks along its -z with y up, to a body's x with z up
 _AHEAD = (0.5, 0.5, -0.5, -0.5)
-# of the points that are drawn, and how many, about
-_COLOR = (0.0, 0.7, 0.4)
-_DRAWN = 400
+"""Turns a camera, which looks along its -z with y up, to a body's x with z up."""
+_COLOR = (0.0, 0.7, 0.4)  # of the points that are drawn
+_DRAWN = 400  # number of these points, about
 
 Side = Annotated[int, Gt(0), Le(256)]  # pixels
 Angle = Annotated[float, Gt(0), Lt(180)]  # degrees
@@ -60,24 +59,16 @@ class Depth(Sensor):
                 body.add_camera(name=name, pos=self.mount, quat=_AHEAD, fovy=self.field_of_view)
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
-        return (
-            image(
-                "depth",
-                self.height,
-                self.width,
-                "distance along the camera's axis, part of the range",
-            ),
-        )
+        meaning = "distance along the camera's axis, part of the range"
+        return (image("depth", self.height, self.width, meaning),)
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
         data = snapshot.data
         shape = (scene.num_agents, self.height, self.width)
-        distance = _renderer(scene.compiled.model, *shape)(
-            data.qpos, data.mocap_pos, data.mocap_quat
-        ).reshape(shape)
-        # 0 where there is nothing
+        render = _renderer(scene.compiled.model, *shape)
+        distance = render(data.qpos, data.mocap_pos, data.mocap_quat).reshape(shape)
         part = jnp.where(distance > 0, jnp.minimum(distance / self.range, 1.0), 1.0)
         part = jnp.where(scene.mirror[:, None, None] < 0, part[..., ::-1], part)
         return {"depth": part.reshape(scene.num_agents, -1)}, memory
@@ -92,9 +83,9 @@ class Depth(Sensor):
         rows = np.arange(self.height)[::step] + 0.5
         columns = np.arange(self.width)[::step] + 0.5
         scale = 2 * np.tan(np.deg2rad(self.field_of_view) / 2) / self.height
-        up, left = np.meshgrid(
-            scale * (self.height / 2 - rows), scale * (self.width / 2 - columns), indexing="ij"
-        )
+        upward = scale * (self.height / 2 - rows)
+        leftward = scale * (self.width / 2 - columns)
+        up, left = np.meshgrid(upward, leftward, indexing="ij")
         left = scene.mirror[:, None, None] * left
         rays = np.stack([np.ones_like(left), left, np.broadcast_to(up, left.shape)], axis=-1)
         points = np.array(self.mount) + self.range * part[..., None] * rays.astype(np.float32)
@@ -113,8 +104,9 @@ class Depth(Sensor):
 def _renderer(
     model: mujoco.MjModel, agents: int, height: int, width: int
 ) -> Callable[..., jax.Array]:
-    """Returns a function of qpos, mocap_pos and mocap_quat of an environment to depths (A H W), m;
-    0 is nothing.
+    """Returns a function that renders depths (A H W), m, of an environment; 0 is nothing.
+
+    Its arguments are qpos, mocap_pos and mocap_quat.
 
     Warp renders a fixed number of environments at once, so batches are flattened and each size has
     its own buffers.
@@ -136,44 +128,42 @@ def _renderer(
 
     @cache
     def context(count: int) -> Any:
-        looks = {
-            "cam_res": (width, height),
-            "render_rgb": False,
-            "render_depth": True,
-            "cam_active": cameras,
-        }
         return mjx.create_render_context(
-            model, count, **looks, use_shadows=False, enabled_geom_groups=groups
+            model,
+            count,
+            cam_res=(width, height),
+            render_rgb=False,
+            render_depth=True,
+            cam_active=cameras,
+            use_shadows=False,
+            enabled_geom_groups=groups,
         )
 
     def render(
         buffers: Any, qpos: jax.Array, mocap_pos: jax.Array, mocap_quat: jax.Array
     ) -> jax.Array:
-        data = mjx.kinematics(
-            on_device, blank.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
-        )
+        data = blank.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
+        data = mjx.kinematics(on_device, data)
         rotation = data.xmat[trunks]
         place = data.xpos[trunks] + jnp.einsum("cij,cj->ci", rotation, mount, precision="highest")
-        data = data.replace(
-            cam_xpos=place, cam_xmat=jnp.einsum("cij,cjk->cik", rotation, turn, precision="highest")
-        )
+        turned = jnp.einsum("cij,cjk->cik", rotation, turn, precision="highest")
+        data = data.replace(cam_xpos=place, cam_xmat=turned)
         _, depth, _ = mjx.render(on_device, mjx.refit_bvh(on_device, data, buffers), buffers)
         return depth
 
     @jax.custom_batching.custom_vmap
     def batch(*state: jax.Array) -> jax.Array:
+        buffers = context(len(state[0])).pytree()
         with jax.numpy_dtype_promotion("standard"):
-            return jax.vmap(render, in_axes=(None, 0, 0, 0))(
-                context(len(state[0])).pytree(), *state
-            )
+            return jax.vmap(render, in_axes=(None, 0, 0, 0))(buffers, *state)
 
     @batch.def_vmap
     def _(size: int, batched: Any, *state: jax.Array) -> tuple[jax.Array, bool]:
-        every = (
-            x if has else jnp.broadcast_to(x, (size, *x.shape))
-            for x, has in zip(state, batched, strict=True)
-        )
-        depth = batch(*(x.reshape(-1, *x.shape[2:]) for x in every))
+        flat = []
+        for x, has in zip(state, batched, strict=True):
+            rows = x if has else jnp.broadcast_to(x, (size, *x.shape))
+            flat.append(rows.reshape(-1, *rows.shape[2:]))
+        depth = batch(*flat)
         return depth.reshape(size, -1, *depth.shape[1:]), True
 
     return lambda *state: batch(*(x[None] for x in state))[0]

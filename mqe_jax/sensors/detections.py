@@ -1,6 +1,4 @@
-"""Detections: robots, objects, gates and goals that a camera and a detector on the robot would
-report.
-"""
+"""Detections: what a camera and a detector report of robots, objects, gates and goals."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
@@ -22,16 +20,16 @@ _VIEW = (1.0, 0.85, 0.1)
 _SEEN = {"seen now": (0.4, 0.1, 0.95), "seen before": (0.1, 0.1, 0.1)}
 _ABOVE = 0.3  # height of their lines above the trunk, where sheep do not hide them, m
 _EDGES = 65  # points of the edge of what is in view
-# time after which a line to somebody seen has half its opacity, s; its least opacity
-_FADE = 2.0
-_PALEST = 0.2
+_FADE = 2.0  # time after which a line to somebody seen has half its opacity, s
+_PALEST = 0.2  # least opacity of such a line
 
 
 @register
 @settings_class
 class Detections(Sensor):
-    """Robots and entities at their last sighting, in the robot's yaw frame of that moment, with its
-    age.
+    """Robots and entities at their last sighting, with its age.
+
+    Their poses are in the robot's yaw frame of that moment.
 
     One is sighted if its centre is in the field of view and in range, and no wall, robot or object
     is between.
@@ -53,22 +51,20 @@ class Detections(Sensor):
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
         blocks = []
         for kind, rows in scene.targets.items():
-            meaning = "x, y, m" + (", cosine and sine of yaw" if _turns(scene, rows) else "")
+            pose = "x, y, m, cosine and sine of yaw" if _turns(scene, rows) else "x, y, m"
+            meaning = f"{pose}, when last seen; age of that, s"
             what = "robot" if rows[0, 0] < scene.num_robots else kind
-            width = 5 if _turns(scene, rows) else 3
-            meaning = f"{meaning}, when last seen; age of that, s"
+            width = _width(scene, rows)
             blocks.append(entities(kind, what, rows.shape[1], width, meaning, masked=True))
         return tuple(blocks)
 
     def init_memory(self, scene: SensedScene) -> Any:
         """Returns the entries of each kind's block, and who has been seen in this episode."""
-        return {
-            kind: (
-                jnp.zeros((*rows.shape, 5 if _turns(scene, rows) else 3)),
-                jnp.zeros(rows.shape, bool),
-            )
-            for kind, rows in scene.targets.items()
-        }
+        memory = {}
+        for kind, rows in scene.targets.items():
+            entries = jnp.zeros((*rows.shape, _width(scene, rows)))
+            memory[kind] = entries, jnp.zeros(rows.shape, bool)
+        return memory
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
@@ -97,8 +93,9 @@ class Detections(Sensor):
     def _chances(
         self, scene: SensedScene, key: jax.Array
     ) -> Iterator[tuple[str, np.ndarray, list[Any]]]:
-        """Yields kind and rows of targets with the noise of x, y, m, and of yaw, rad, and who is
-        missed (A, count).
+        """Yields kind and rows of targets, and what chance does to them.
+
+        That is the noise of x, y, m, and of yaw, rad, and who is missed, each (A, count).
 
         One draw for each of them, over all kinds: XLA would compute a common one again in each of
         its uses.
@@ -106,32 +103,37 @@ class Detections(Sensor):
         sizes = [rows.shape[1] for rows in scene.targets.values()]
         shape = (scene.num_agents, sum(sizes))
         keys = jax.random.split(key, 4)
-        deviations = self.position_noise, self.position_noise, np.deg2rad(self.yaw_noise)
-        noise = [
-            x * jax.random.normal(k, shape) if x else jnp.zeros(shape)
-            for x, k in zip(deviations, keys, strict=False)
-        ]
-        missed = (
-            jax.random.uniform(keys[3], shape) < self.misses
-            if self.misses
-            else jnp.zeros(shape, bool)
+
+        def noise(key: jax.Array, deviation: float) -> jax.Array:
+            if not deviation:
+                return jnp.zeros(shape)
+            return deviation * jax.random.normal(key, shape)
+
+        missed = jnp.zeros(shape, bool)
+        if self.misses:
+            missed = jax.random.uniform(keys[3], shape) < self.misses
+        chances = (
+            noise(keys[0], self.position_noise),
+            noise(keys[1], self.position_noise),
+            noise(keys[2], np.deg2rad(self.yaw_noise)),
+            missed,
         )
-        parts = [jnp.split(each, np.cumsum(sizes)[:-1], axis=1) for each in (*noise, missed)]
+        parts = [jnp.split(each, np.cumsum(sizes)[:-1], axis=1) for each in chances]
         for (kind, rows), *part in zip(scene.targets.items(), *parts, strict=True):
             yield kind, rows, part
 
     def draw(
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
-        """Shows what is in view, and lines to whom each agent has seen, the paler the longer
-        ago.
+        """Shows what is in view, and lines to whom each agent has seen.
+
+        A line is the paler the longer ago that was.
         """
         origin = snapshot.places[: scene.num_agents, None, :2]
         yaw = snapshot.places[: scene.num_agents, 2:]
         half = np.deg2rad(self.field_of_view / 2)
-        direction = turn(
-            jnp.array([1.0, 0.0]), yaw + np.linspace(-half, half, _EDGES, dtype=np.float32)
-        )
+        angles = yaw + np.linspace(-half, half, _EDGES, dtype=np.float32)
+        direction = turn(jnp.array([1.0, 0.0]), angles)
         edge = origin + reach(scene, snapshot, direction, self.range)[..., None] * direction
         rows = np.concatenate([*scene.targets.values()], axis=1)
         ends = snapshot.places[rows, :2]
@@ -140,25 +142,24 @@ class Detections(Sensor):
         known = jnp.concatenate([memory[kind][1] for kind in scene.targets], axis=1)
         now = age < scene.dt / 2
         faded = jnp.maximum(jnp.exp2(-age / _FADE), _PALEST)
-        found = {
-            "seen now": (known & now) * 1.0,
-            "seen before": jnp.where(known & ~now, faded, 0.0),
-        }
+        area = jnp.concatenate([origin, edge], axis=1)
+
+        def seen(label: str, opacity: jax.Array) -> Marks:
+            return marks(
+                label,
+                _SEEN[label],
+                snapshot.height + _ABOVE,
+                lines=lines,
+                line_opacity=opacity,
+                points=ends,
+                point_opacity=opacity,
+                bold=True,
+            )
+
         return (
-            marks("in view", _VIEW, snapshot.height, area=jnp.concatenate([origin, edge], axis=1)),
-            *(
-                marks(
-                    label,
-                    _SEEN[label],
-                    snapshot.height + _ABOVE,
-                    lines=lines,
-                    line_opacity=opacity,
-                    points=ends,
-                    point_opacity=opacity,
-                    bold=True,
-                )
-                for label, opacity in found.items()
-            ),
+            marks("in view", _VIEW, snapshot.height, area=area),
+            seen("seen now", (known & now) * 1.0),
+            seen("seen before", jnp.where(known & ~now, faded, 0.0)),
         )
 
     def visible(self, scene: SensedScene, snapshot: Snapshot) -> jax.Array:
@@ -171,12 +172,9 @@ class Detections(Sensor):
             ahead = jnp.sum(direction * turn(jnp.array([1.0, 0.0]), pose[2]), axis=-1)
             inside = ahead >= np.cos(np.deg2rad(self.field_of_view / 2))
             circles = jnp.concatenate([snapshot.circles[:, :2], radius[:, None]], axis=-1)
-            hidden = jnp.concatenate(
-                [
-                    to_circles(pose[:2], direction, circles) < distance,
-                    to_segments(pose[:2], direction, snapshot.segments) < distance,
-                ]
-            )
+            by_circles = to_circles(pose[:2], direction, circles) < distance
+            by_segments = to_segments(pose[:2], direction, snapshot.segments) < distance
+            hidden = jnp.concatenate([by_circles, by_segments])
             return inside & (distance <= self.range) & ~jnp.any(hidden & apart, axis=0)
 
         # The line of sight begins and ends within the outlines of both.
@@ -188,3 +186,8 @@ class Detections(Sensor):
 def _turns(scene: SensedScene, rows: np.ndarray) -> bool:
     """Returns whether targets are robots or rectangles, whose yaw can be seen."""
     return rows[0, 0] < scene.num_robots or isinstance(scene.outlines.get(rows[0, 0]), Rectangle)
+
+
+def _width(scene: SensedScene, rows: np.ndarray) -> int:
+    """Returns the number of entries of each target, without its mask."""
+    return 5 if _turns(scene, rows) else 3

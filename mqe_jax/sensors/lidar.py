@@ -31,20 +31,14 @@ class Lidar(Sensor):
     """Maximum distance, m."""
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
-        return (
-            Block(
-                "lidar",
-                self.rays,
-                "distances from the trunk's centre, m, counterclockwise from ahead",
-            ),
-        )
+        meaning = "distances from the trunk's centre, m, counterclockwise from ahead"
+        return (Block("lidar", self.rays, meaning),)
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        return {
-            "lidar": reach(scene, snapshot, self._directions(scene, snapshot), self.range)
-        }, memory
+        distances = reach(scene, snapshot, self._directions(scene, snapshot), self.range)
+        return {"lidar": distances}, memory
 
     def draw(
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
@@ -53,15 +47,9 @@ class Lidar(Sensor):
         distance = readings["lidar"]
         hits = origin + distance[..., None] * self._directions(scene, snapshot)
         lines = jnp.stack([jnp.broadcast_to(origin, hits.shape), hits], axis=2)
+        near = distance < 0.99 * self.range
         return (
-            marks(
-                "lidar",
-                _COLOR,
-                snapshot.height,
-                lines=lines,
-                points=hits,
-                point_opacity=distance < 0.99 * self.range,
-            ),
+            marks("lidar", _COLOR, snapshot.height, lines=lines, points=hits, point_opacity=near),
         )
 
     def _directions(self, scene: SensedScene, snapshot: Snapshot) -> jax.Array:

@@ -30,8 +30,7 @@ class Marks:
     point_opacity: jax.Array
     """Opacity of each point (A, P); 0 hides it."""
     area: jax.Array
-    """Corners of a translucent area, the first of which sees all others (A, K, 3), m; none is drawn
-    if K is 0."""
+    """Corners of a translucent area (A, K, 3), m, the first of which sees all others."""
 
 
 def marks(
@@ -46,17 +45,18 @@ def marks(
     area: jax.Array | None = None,
     bold: bool = False,
 ) -> Marks:
-    """Returns marks of A agents at their heights (A,), m; arguments as the fields of `Marks`, with
-    x and y only.
+    """Returns marks of A agents at their heights (A,), m.
+
+    The arguments are the fields of `Marks`, with x and y only.
 
     An opacity is of the shape (A, L) or (A, P), or the same for all.
     """
 
     def raised(corners: jax.Array | None, *shape: int) -> jax.Array:
-        corners = jnp.zeros((len(height), *shape, 2)) if corners is None else corners
-        z = jnp.broadcast_to(
-            height.reshape(-1, *[1] * (corners.ndim - 1)), (*corners.shape[:-1], 1)
-        )
+        if corners is None:
+            corners = jnp.zeros((len(height), *shape, 2))
+        z = height.reshape(-1, *[1] * (corners.ndim - 1))
+        z = jnp.broadcast_to(z, (*corners.shape[:-1], 1))
         return jnp.concatenate([corners, z], axis=-1)
 
     def opacity(value: jax.Array | float, corners: jax.Array) -> jax.Array:

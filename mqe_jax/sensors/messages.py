@@ -20,8 +20,9 @@ _COLOR = (0.95, 0.2, 0.2)
 @register
 @settings_class
 class Messages(Sensor):
-    """The last numbers of an agent's action, which its teammates in range receive with their next
-    observation.
+    """The last numbers of an agent's action.
+
+    Its teammates in range receive them with their next observation.
 
     They do not move the robot. An episode starts without messages, and robots that are out send
     none.
@@ -52,19 +53,18 @@ class Messages(Sensor):
         return (entities("messages", "robot", mates.shape[1], self.numbers, meaning, masked=True),)
 
     def init_memory(self, scene: SensedScene) -> Any:
-        """Returns whether there was a step in which messages were sent, and which of them are
-        received (A, count).
-        """
+        """Returns whether messages were sent in a step, and which of them are received (A, count)."""
         return jnp.zeros((), bool), jnp.zeros(scene.mates[0].shape, bool)
 
     def observe(
         self, scene: SensedScene, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        (mates, there) = scene.mates
+        mates, there = scene.mates
         spots = snapshot.places[: scene.num_agents, :2]
         away = jnp.linalg.norm(spots[mates] - spots[:, None], axis=-1)
         active = snapshot.robots.active[: scene.num_agents]
-        received = there & (away <= self.range) & active[mates] & active[:, None] & memory[0]
+        was_sent, _ = memory
+        received = there & (away <= self.range) & active[mates] & active[:, None] & was_sent
         if self.loss:
             received &= ~jax.random.bernoulli(key, self.loss, received.shape)
         sent = snapshot.action[:, scene.action_size - self.numbers :]
@@ -74,11 +74,13 @@ class Messages(Sensor):
         self, scene: SensedScene, snapshot: Snapshot, readings: Mapping[str, jax.Array], memory: Any
     ) -> tuple[Marks, ...]:
         """Shows a line to each teammate whose message is received."""
-        (mates, _) = scene.mates
+        mates, _ = scene.mates
         spots = snapshot.places[: scene.num_agents, :2]
         ends = spots[mates]
         lines = jnp.stack([jnp.broadcast_to(spots[:, None], ends.shape), ends], axis=2)
-        opacity = memory[1].astype(np.float32)
-        return (
-            marks("message", _COLOR, snapshot.height, lines=lines, line_opacity=opacity, bold=True),
+        _, received = memory
+        opacity = received.astype(np.float32)
+        shown = marks(
+            "message", _COLOR, snapshot.height, lines=lines, line_opacity=opacity, bold=True
         )
+        return (shown,)

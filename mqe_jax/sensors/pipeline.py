@@ -15,8 +15,9 @@ from mqe_jax.core.settings import Range, settings_class
 
 @settings_class
 class Pipeline:
-    """What happens to the readings of one block, in this order; masks are delayed and dropped
-    only.
+    """What happens to the readings of one block, in this order.
+
+    Masks are delayed and dropped only.
     """
 
     noise: NonNegative = 0.0
@@ -35,10 +36,13 @@ class Pipeline:
 
     def block(self, block: Block) -> Block:
         """Returns the block that comes out."""
-        entities = block.entities and dataclasses.replace(
-            block.entities, count=self.history * block.entities.count
-        )
-        image = block.image and (self.history * block.image[0], *block.image[1:])
+        entities = block.entities
+        if entities is not None:
+            entities = dataclasses.replace(entities, count=self.history * entities.count)
+        image = block.image
+        if image is not None:
+            channels, height, width = image
+            image = (self.history * channels, height, width)
         return dataclasses.replace(
             block, width=self.history * block.width, entities=entities, image=image
         )
@@ -49,7 +53,9 @@ class Pipeline:
         return jnp.where(block.continuous > 0, value / self.scale, value)
 
     def init_memory(self, block: Block, agents: int) -> Any:
-        """Returns the readings on their way (D, A, W), those last delivered (H, A, W), and whether
+        """Returns the initial memory of a pipeline.
+
+        It holds the readings on their way (D, A, W), those last delivered (H, A, W), and whether
         there are any.
         """
         return (
@@ -66,20 +72,24 @@ class Pipeline:
         noise: jax.Array | float = 0.0,
         lost: jax.Array | bool = False,
     ) -> tuple[jax.Array, Any]:
-        """Returns what comes out of a reading (A, W), and the next memory; an episode's first
-        reading comes at once.
+        """Returns what comes out of a reading (A, W), and the next memory.
+
+        An episode's first reading comes at once.
 
         `noise` (A, W) is standard normal, and `lost` (A, 1) says whose reading does not arrive.
         """
         underway, delivered, started = memory
-        value = reading + self.noise * noise if self.noise else reading
-        value = value if self.clip is None else jnp.clip(value, *self.clip)
+        value = reading
+        if self.noise:
+            value = reading + self.noise * noise
+        if self.clip is not None:
+            value = jnp.clip(value, *self.clip)
         value = jnp.where(block.continuous > 0, self.scale * value, reading)
         line = jnp.concatenate([value[None], jnp.where(started, underway, value)])
-        now = jnp.where(lost & started, delivered[0], line[-1]) if self.dropout else line[-1]
-        delivered = jnp.concatenate([now[None], jnp.where(started, delivered, now)])[: self.history]
-        return jnp.moveaxis(delivered, 0, 1).reshape(len(reading), -1), (
-            line[:-1],
-            delivered,
-            jnp.ones((), bool),
-        )
+        now = line[-1]
+        if self.dropout:
+            now = jnp.where(lost & started, delivered[0], now)
+        delivered = jnp.concatenate([now[None], jnp.where(started, delivered, now)])
+        delivered = delivered[: self.history]
+        out = jnp.moveaxis(delivered, 0, 1).reshape(len(reading), -1)
+        return out, (line[:-1], delivered, jnp.ones((), bool))

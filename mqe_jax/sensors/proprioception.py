@@ -17,17 +17,18 @@ from mqe_jax.sensors.scene import SensedScene, Snapshot
 
 _COLOR = (0.95, 0.1, 0.5)
 _ABOVE = 0.15  # height of the arrow above the trunk, m
-# m
 _ARROW = np.array(
     [[[0, 0], [0.45, 0]], [[0.45, 0], [0.33, 0.08]], [[0.45, 0], [0.33, -0.08]]], np.float32
 )
+"""Ends of the arrow's lines (3, 2, 2), m."""
 
 
 @register
 @settings_class
 class Proprioception(Sensor):
-    """Gravity, angular velocity, joints, the last action, and an odometry estimate that starts at
-    the true pose.
+    """Gravity, angular velocity, joints, the last action, and an estimate of the pose by odometry.
+
+    The estimate starts at the true pose.
     """
 
     name: Literal["proprioception"] = "proprioception"
@@ -40,23 +41,18 @@ class Proprioception(Sensor):
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
         joints = scene.compiled.robot.num_joints
+        meaning = "estimate of x, y, m, and cosine and sine of yaw, own frame of the task"
         return (
             Block("gravity", 3, "unit vector in the trunk's frame"),
             Block("angular_velocity", 3, "of the trunk in its own frame, rad/s"),
             Block("joint_position", joints, "rad, minus default"),
             Block("joint_velocity", joints, "rad/s"),
             Block("action", scene.action_size, "last action"),
-            Block(
-                "odometry",
-                4,
-                "estimate of x, y, m, and cosine and sine of yaw, own frame of the task",
-            ),
+            Block("odometry", 4, meaning),
         )
 
     def init_memory(self, scene: SensedScene) -> Any:
-        """Returns the estimated and the last true pose of each agent, and whether there are any
-        yet.
-        """
+        """Returns each agent's estimated and last true pose, and whether there are any yet."""
         pose = jnp.zeros((scene.num_agents, 3))
         return pose, pose, jnp.zeros((), bool)
 
@@ -65,8 +61,7 @@ class Proprioception(Sensor):
     ) -> tuple[dict[str, jax.Array], Any]:
         robots = jax.tree.map(lambda x: x[: scene.num_agents], snapshot.robots)
         mirror = scene.mirror[:, None].astype(np.float32)
-        # of y; rotations change the signs of the other two
-        side = np.where(np.arange(3) == 1, mirror, 1.0)
+        side = np.where(np.arange(3) == 1, mirror, 1.0)  # of y; of a rotation, x and z change sign
 
         robot = scene.compiled.robot
 
@@ -108,13 +103,5 @@ class Proprioception(Sensor):
         arrow = at[:, None, None] + turn(_ARROW, yaw[..., None])
         link = jnp.stack([places[:, :2], at], axis=1)[:, None]
         lines = jnp.concatenate([arrow, link], axis=1)
-        return (
-            marks(
-                "odometry",
-                _COLOR,
-                snapshot.height + _ABOVE,
-                lines=lines,
-                points=at[:, None],
-                bold=True,
-            ),
-        )
+        height = snapshot.height + _ABOVE
+        return (marks("odometry", _COLOR, height, lines=lines, points=at[:, None], bold=True),)

@@ -1,5 +1,6 @@
-"""What sensors sense: robots, walls and entities of a scene, as points and planar shapes in the
-environment frame.
+"""What sensors sense: robots, walls and entities of a scene, as points and planar shapes.
+
+All are in the environment frame.
 """
 
 from __future__ import annotations
@@ -93,74 +94,80 @@ class SensedScene:
     @functools.cached_property
     def mirror(self) -> np.ndarray:
         """-1 for agents whose left is the robot's right, 1 for the others (A,)."""
-        return np.concatenate(
-            [
-                np.full(len(t), -1.0 if n and self.reflected else 1.0)
-                for n, t in enumerate(self.teams)
-            ]
-        )
+        signs = np.ones(self.num_agents)
+        if self.reflected:
+            signs[len(self.teams[0]) :] = -1.0
+        return signs
 
     @functools.cached_property
     def mates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Each agent's teammates (A, count), padded by itself to the largest team's size, and which
-        are real.
+        """Each agent's teammates (A, count), and which of them are real (A, count) bool.
+
+        Rows of smaller teams are padded by the agent itself.
         """
         count = max(map(len, self.teams)) - 1
-        rows = [
-            [*(mate for mate in team if mate != agent), *[agent] * count][:count]
-            for team in self.teams
-            for agent in team
-        ]
-        mates = np.array(rows, int).reshape(self.num_agents, count)
-        return mates, mates != np.arange(self.num_agents)[:, None]
+        own = np.arange(self.num_agents)[:, None]
+        mates = np.repeat(own, count, axis=1)
+        for row, others in zip(mates, self._mates, strict=True):
+            row[: len(others)] = others
+        return mates, mates != own
+
+    @property
+    def _mates(self) -> list[list[int]]:
+        """The teammates of each agent."""
+        found = []
+        for team in self.teams:
+            found += [[other for other in team if other != agent] for agent in team]
+        return found
 
     @functools.cached_property
     def targets(self) -> dict[str, np.ndarray]:
         """What each agent may detect by kind, as rows of `Snapshot.places` (A, count)."""
         robots = np.arange(self.num_robots)
-        mates = [
-            [other for other in team if other != agent] for team in self.teams for agent in team
-        ]
         rivals = [np.setdiff1d(robots, team) for team in self.teams for _ in team]
-        found = {"mates": np.array(mates, int), "opponents": np.array(rivals, int)}
+        found = {"mates": np.array(self._mates, int), "opponents": np.array(rivals, int)}
+        first = len(self.teams[0])
         for kind in dict.fromkeys(entity.kind for entity in self.entities):
-            rows = (
-                np.flatnonzero([entity.kind == kind for entity in self.entities]) + self.num_robots
-            )
-            found[kind] = np.array(
-                [rows[::-1] if n else rows for n, team in enumerate(self.teams) for _ in team]
-            )
+            of_kind = np.flatnonzero([entity.kind == kind for entity in self.entities])
+            rows = np.tile(of_kind + self.num_robots, (self.num_agents, 1))
+            rows[first:] = rows[first:, ::-1]  # as the second team sees them
+            found[kind] = rows
         return {kind: rows for kind, rows in found.items() if rows.shape[1]}
 
     @functools.cached_property
     def outlines(self) -> dict[int, Circle | Rectangle]:
         """Outlines of entities by their rows of `Snapshot.places`."""
         objects = self.compiled.scene.objects
-        outlines = {
-            row: objects[entity.place].outline
-            for row, entity in enumerate(self.entities, start=self.num_robots)
-            if isinstance(entity.place, str)
-        }
-        return {row: outline for row, outline in outlines.items() if outline is not None}
+        found = {}
+        for row, entity in enumerate(self.entities, start=self.num_robots):
+            outline = objects[entity.place].outline if isinstance(entity.place, str) else None
+            if outline is not None:
+                found[row] = outline
+        return found
 
     @functools.cached_property
     def owners(self) -> np.ndarray:
         """The row of `Snapshot.places` of each circle and each segment (C + S,); -1 for walls."""
-        circles = [row for row, outline in self.outlines.items() if isinstance(outline, Circle)]
         walls = len(self.compiled.layout.barriers) + 4 * len(self.compiled.layout.walls)
-        rectangles = [
-            row for row, outline in self.outlines.items() if isinstance(outline, Rectangle)
-        ]
-        return np.array(
-            [*range(self.num_robots), *circles, *[-1] * walls, *np.repeat(rectangles, 4)], int
-        )
+        rectangles = np.repeat([*self._rectangles], 4)
+        rows = [*range(self.num_robots), *self._circles, *[-1] * walls, *rectangles]
+        return np.array(rows, int)
+
+    @property
+    def _circles(self) -> dict[int, Circle]:
+        """Circular outlines of entities by their rows of `Snapshot.places`."""
+        return {row: shape for row, shape in self.outlines.items() if isinstance(shape, Circle)}
+
+    @property
+    def _rectangles(self) -> dict[int, Rectangle]:
+        """Rectangular outlines of entities by their rows of `Snapshot.places`."""
+        return {row: shape for row, shape in self.outlines.items() if isinstance(shape, Rectangle)}
 
     def others(self, snapshot: Snapshot) -> jax.Array:
-        """Returns the radii of the circles for the rays of each agent (A, C), m: 0 of its own
-        one.
-        """
-        rows = np.arange(self.num_agents)[:, None]
-        return jnp.where(self.owners[: len(snapshot.circles)] == rows, 0.0, snapshot.circles[:, 2])
+        """Returns the radii of the circles for the rays of each agent (A, C), m; its own is 0."""
+        owners = self.owners[: len(snapshot.circles)]
+        own = owners == np.arange(self.num_agents)[:, None]
+        return jnp.where(own, 0.0, snapshot.circles[:, 2])
 
     def snapshot(
         self,
@@ -170,21 +177,17 @@ class SensedScene:
         pose: jax.Array,
         action: jax.Array,
     ) -> Snapshot:
-        """Returns what there is to sense in a state; arguments as the fields of `State` and
-        `Snapshot`.
+        """Returns what there is to sense in a state.
+
+        The arguments are fields of `State` and `Snapshot`.
         """
-        every = jnp.concatenate(
-            [_planar(robots.position_w, robots.quaternion), *self._entities(data, anchors)]
-        )
-        radius = float(np.hypot(*self.compiled.robot.leg_root))  # at which the hips are
-        circles = dict.fromkeys(range(self.num_robots), radius)
-        circles |= {
-            row: shape.radius for row, shape in self.outlines.items() if isinstance(shape, Circle)
-        }
+        own = _planar(robots.position_w, robots.quaternion)
+        every = jnp.concatenate([own, *self._entities(data, anchors)])
+        hips = float(np.hypot(*self.compiled.robot.leg_root))
+        circles = dict.fromkeys(range(self.num_robots), hips)
+        circles |= {row: shape.radius for row, shape in self._circles.items()}
         radii = np.array([*circles.values()], np.float32)[:, None]
-        rectangles = {
-            row: shape for row, shape in self.outlines.items() if isinstance(shape, Rectangle)
-        }
+        rectangles = self._rectangles
         places = every[np.array([*rectangles], int)]
         sizes = np.reshape([*rectangles.values()], (-1, 2))
         return Snapshot(
@@ -199,32 +202,31 @@ class SensedScene:
 
     def _entities(self, data: mjx.Data, anchors: jax.Array) -> list[jax.Array]:
         """Returns the pose x, y, yaw of each entity (1, 3), m and rad."""
-        found: dict[str | int, jax.Array] = {
-            n: jnp.append(anchors[n], 0.0) for n in range(len(anchors))
-        }
+        found: dict[str | int, jax.Array] = {}
+        for number in range(len(anchors)):
+            found[number] = jnp.append(anchors[number], 0.0)
         names = [entity.place for entity in self.entities if isinstance(entity.place, str)]
         if names:
             bodies = [self.compiled.objects[name].body for name in names]
-            found |= zip(names, _planar(*poses(self.compiled.model, data, bodies)), strict=True)
+            position, quaternion = poses(self.compiled.model, data, bodies)
+            found |= zip(names, _planar(position, quaternion), strict=True)
         return [found[entity.place][None] for entity in self.entities]
 
     def _walls(self, anchors: jax.Array) -> jax.Array:
         """Returns the ends of the walls' sides (S', 2, 2), m."""
         barriers = self.compiled.layout.barriers
         walls = self.compiled.layout.walls
-        along = np.reshape(
-            [(-barrier.normal[1], barrier.normal[0]) for barrier in barriers], (-1, 1, 2)
-        )
-        half = np.reshape([barrier.length / 2 for barrier in barriers], (-1, 1, 1)) * np.array(
-            [[-1.0], [1.0]]
-        )
-        ends = np.reshape([barrier.point for barrier in barriers], (-1, 1, 2)) + along * half
+        along = [(-barrier.normal[1], barrier.normal[0]) for barrier in barriers]
+        half = np.reshape([barrier.length / 2 for barrier in barriers], (-1, 1, 1))
+        middle = np.reshape([barrier.point for barrier in barriers], (-1, 1, 2))
+        both = half * np.array([[-1.0], [1.0]])
+        ends = middle + np.reshape(along, (-1, 1, 2)) * both
         center = jnp.asarray(np.reshape([wall.center[:2] for wall in walls], (-1, 2)), jnp.float32)
         moving = np.flatnonzero([wall.anchor is not None for wall in walls])
         if len(moving):
             center = center.at[moving].add(anchors[self.compiled.mocap_anchor])
-        # jnp.pad has no translation to a graph
-        level = jnp.concatenate([center, jnp.zeros((len(walls), 1))], axis=-1)
+        yaw = jnp.zeros((len(walls), 1))
+        level = jnp.concatenate([center, yaw], axis=-1)  # jnp.pad has no translation to a graph
         boxes = sides(level, np.reshape([wall.size[:2] for wall in walls], (-1, 2)))
         return jnp.concatenate([jnp.asarray(ends, jnp.float32), boxes])
 
@@ -248,16 +250,14 @@ def reach(scene: SensedScene, snapshot: Snapshot, direction: jax.Array, limit: f
 
     def read(origin: jax.Array, direction: jax.Array, radius: jax.Array) -> jax.Array:
         circles = jnp.concatenate([snapshot.circles[:, :2], radius[:, None]], axis=-1)
-        found = (
-            to_circles(origin, direction, circles),
-            to_segments(origin, direction, snapshot.segments),
+        circle = to_circles(origin, direction, circles)
+        segment = to_segments(origin, direction, snapshot.segments)
+        return jnp.minimum(
+            jnp.min(circle, axis=0, initial=limit), jnp.min(segment, axis=0, initial=limit)
         )
-        circle, segment = (jnp.min(each, axis=0, initial=limit) for each in found)
-        return jnp.minimum(circle, segment)
 
-    return jax.vmap(read)(
-        snapshot.places[: scene.num_agents, :2], direction, scene.others(snapshot)
-    )
+    origins = snapshot.places[: scene.num_agents, :2]
+    return jax.vmap(read)(origins, direction, scene.others(snapshot))
 
 
 def _planar(position: jax.Array, quaternion: jax.Array) -> jax.Array:

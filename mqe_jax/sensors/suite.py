@@ -1,12 +1,9 @@
-"""The sensors of a task's robots together: settings by name, and the group of observations that
-they make.
-"""
+"""The sensors of a task's robots together: their settings, and their group of observations."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
@@ -52,8 +49,9 @@ _ALLOWED = f"{', '.join(SETS)}, or a list of sensors, such as [proprioception, l
 
 
 def sensors_of(value: Any) -> tuple[Sensor, ...]:
-    """Returns sensors from the name of a set, or from a sequence of sensors, of their names and of
-    mappings.
+    """Returns sensors from the name of a set, or from a sequence.
+
+    An item is a sensor, a name or a mapping.
 
     Raises:
         InputError: for an unknown name, two sensors of one name, or two that add to actions.
@@ -67,7 +65,8 @@ def sensors_of(value: Any) -> tuple[Sensor, ...]:
     sensors = tuple(map(_sensor, value))
     if len({sensor.name for sensor in sensors}) < len(sensors):
         fail("senses", [sensor.name for sensor in sensors], "sensors of different names")
-    if len(added := [sensor.name for sensor in sensors if sensor.action_size]) > 1:
+    added = [sensor.name for sensor in sensors if sensor.action_size]
+    if len(added) > 1:
         fail("senses", added, "sensors of which at most one adds to actions")
     return sensors
 
@@ -120,7 +119,8 @@ class Suite:
         found = [(sensor, sensor.layout(self.scene)) for sensor in self.sensors]
         for sensor, blocks in found:
             names = ["all", *(block.name for block in blocks)]
-            if unknown := [name for name in sensor.pipeline if name not in names]:
+            unknown = [name for name in sensor.pipeline if name not in names]
+            if unknown:
                 fail(f"senses.{sensor.name}.pipeline", unknown[0], f"one of {', '.join(names)}")
         measured = [(sensor, block) for sensor, blocks in found for block in blocks]
         names = [block.name for _, block in measured]
@@ -132,11 +132,11 @@ class Suite:
         """Returns the state at the start of an episode."""
         action = jnp.zeros((self.scene.num_agents, self.scene.action_size))
         memory = {sensor.name: sensor.init_memory(self.scene) for sensor in self.sensors}
-        queues = {
-            block.name: sensor.pipeline_of(block).init_memory(block, self.scene.num_agents)
-            for sensor, block in self._measured
-            if sensor.pipeline_of(block) != Pipeline()
-        }
+        queues = {}
+        for sensor, block in self._measured:
+            pipeline = sensor.pipeline_of(block)
+            if pipeline != Pipeline():
+                queues[block.name] = pipeline.init_memory(block, self.scene.num_agents)
         return SensorState(action, memory, queues)
 
     @jax.named_scope("sensors")
@@ -152,25 +152,28 @@ class Suite:
                 sensor, snapshot, state.memory[sensor.name], own_key
             )
             readings |= blocks
-        piped = {
-            x.name: (sensor.pipeline_of(x), x)
-            for sensor, x in self._measured
-            if x.name in state.queues
-        }
+        piped = {}
+        for sensor, block in self._measured:
+            if block.name in state.queues:
+                piped[block.name] = sensor.pipeline_of(block), block
         noise, lost = self._chances(piped, jax.random.fold_in(key, len(self.sensors)))
         queues = {}
         for name, (pipeline, block) in piped.items():
-            chances = noise.get(name, 0.0), lost.get(name, False)
             readings[name], queues[name] = pipeline.apply(
-                block, readings[name], state.queues[name], *chances
+                block,
+                readings[name],
+                state.queues[name],
+                noise=noise.get(name, 0.0),
+                lost=lost.get(name, False),
             )
         return readings, SensorState(state.action, memory, queues)
 
     def _read(
         self, sensor: Sensor, snapshot: Snapshot, memory: Any, key: jax.Array
     ) -> tuple[dict[str, jax.Array], Any]:
-        """Returns what a sensor observes; ValueError for blocks unlike its layout, or a memory
-        unlike the last.
+        """Returns what a sensor observes.
+
+        ValueError for blocks unlike its layout, or a memory unlike the last.
         """
         method = f"{type(sensor).__name__}.observe"
         readings, after = sensor.observe(self.scene, snapshot, memory, key)
@@ -183,33 +186,38 @@ class Suite:
     def _chances(
         self, piped: Mapping[str, tuple[Pipeline, Block]], key: jax.Array
     ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-        """Returns the noise and the losses of blocks with pipelines that have some; one draw each,
-        which saves time.
+        """Returns the noise and the losses of blocks whose pipelines have some.
+
+        There is one draw of each for all blocks, which saves time.
         """
         agents = self.scene.num_agents
-        (noise_key, loss_key) = jax.random.split(key)
+        noise_key, loss_key = jax.random.split(key)
         noisy = {name: block.width for name, (pipeline, block) in piped.items() if pipeline.noise}
-        drawn = jax.random.normal(noise_key, (agents, sum(noisy.values())))
-        parts = jnp.split(drawn, np.cumsum([*noisy.values()])[:-1], axis=1) if noisy else []
-        rates = {
-            name: pipeline.dropout for name, (pipeline, _) in piped.items() if pipeline.dropout
-        }
-        losses = jax.random.uniform(loss_key, (len(rates), agents, 1)) if rates else ()
-        lost = {name: loss < rate for (name, rate), loss in zip(rates.items(), losses, strict=True)}
-        return dict(zip(noisy, parts, strict=True)), lost
+        noise = {}
+        if noisy:
+            drawn = jax.random.normal(noise_key, (agents, sum(noisy.values())))
+            parts = jnp.split(drawn, np.cumsum([*noisy.values()])[:-1], axis=1)
+            noise = dict(zip(noisy, parts, strict=True))
+        lossy = [name for name, (pipeline, _) in piped.items() if pipeline.dropout]
+        lost = {}
+        if lossy:
+            drawn = jax.random.uniform(loss_key, (len(lossy), agents, 1))
+            for name, loss in zip(lossy, drawn, strict=True):
+                lost[name] = loss < piped[name][0].dropout
+        return noise, lost
 
     def draw(
         self, snapshot: Snapshot, state: SensorState, readings: Mapping[str, jax.Array]
     ) -> tuple[Marks, ...]:
-        """Returns what shows the sensors' readings, by block as `observe` returns them, in the
-        state after it.
+        """Returns what shows the sensors' readings.
+
+        `readings` are by block as `observe` returns them, `state` is the state after it.
         """
-        newest = {
-            x.name: sensor.pipeline_of(x).newest(x, readings[x.name])
-            for sensor, x in self._measured
-        }
-        drawn = (
-            sensor.draw(self.scene, snapshot, newest, state.memory[sensor.name])
-            for sensor in self.sensors
-        )
-        return tuple(itertools.chain.from_iterable(drawn))
+        newest = {}
+        for sensor, block in self._measured:
+            pipeline = sensor.pipeline_of(block)
+            newest[block.name] = pipeline.newest(block, readings[block.name])
+        drawn = []
+        for sensor in self.sensors:
+            drawn += sensor.draw(self.scene, snapshot, newest, state.memory[sensor.name])
+        return tuple(drawn)

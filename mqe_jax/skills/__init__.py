@@ -1,5 +1,4 @@
-"""Skills: low-level policies of one robot, from commands and proprioception to joint targets; their
-registry.
+"""Skills of one robot: low-level policies from commands to joint targets; their registry.
 
 A skill is a class derived from `Skill` in its own file, registered by `register`. Agents and NPC
 robots use it alike.
@@ -63,13 +62,13 @@ class Skill(abc.ABC):
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
 
-    # -- defined by each skill
-    # ----------------------------------------------------------------------------------
+    # Defined by each skill:
 
     @abc.abstractmethod
     def init_memory(self) -> Any:
-        """Returns the recurrent state after a reset: a dataclass or dictionary of arrays, or ()
-        without one.
+        """Returns the recurrent state after a reset.
+
+        It is a dataclass or dictionary of arrays, or () without one.
         """
 
     @abc.abstractmethod
@@ -79,8 +78,9 @@ class Skill(abc.ABC):
         """Returns the joint targets (12,), rad, and the next recurrent state, for commands (C,)."""
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Reads the parameters from a file, or those shipped for the robot; InputError if they
-        cannot be read.
+        """Reads the parameters from a file, or those shipped for the robot.
+
+        InputError if they cannot be read.
         """
         if path is not None:
             raise InputError(
@@ -90,8 +90,9 @@ class Skill(abc.ABC):
         return ()
 
     def restrict(self, varied: Sequence[str], gait: str | None) -> Skill:
-        """Returns the skill for commands of which only the `varied` ones ever differ from the
-        defaults of a gait.
+        """Returns the skill for commands that mostly stay at the defaults of a gait.
+
+        Only the `varied` commands ever differ from them.
         """
         return self
 
@@ -105,23 +106,22 @@ class Skill(abc.ABC):
         return (self,)
 
     def select(self, name: str) -> tuple[float, ...]:
-        """Returns the values of the commands of `selector` with which the skill of this name
-        acts.
-        """
+        """Returns the values of the commands in `selector` with which the skill of a name acts."""
         return ()
 
     def with_choice(self, name: str, commands: jax.Array) -> jax.Array:
-        """Returns the commands (N, C) that make the skill of this name act with its own commands
-        (N, C').
+        """Returns the commands (N, C) with which the skill of a name acts.
+
+        `commands` (N, C') are that skill's own.
         """
         return commands
 
-    # -- common to all skills
-    # -----------------------------------------------------------------------------------
+    # Common to all skills:
 
     def index(self, names: Sequence[str]) -> np.ndarray:
-        """Returns the positions of commands in the vector of commands; InputError for an unknown
-        name.
+        """Returns the positions of commands in the vector of commands.
+
+        InputError for an unknown name.
         """
         known = [command.name for command in self.commands]
         wrong = f"{self.name} command: unknown name"
@@ -142,12 +142,12 @@ class Skill(abc.ABC):
             raise InputError(
                 f"gait: unknown name {gait!r}{nearest(gait, self.gaits)}; allowed: {allowed}"
             )
-        given = (command.default for command in self.commands)
+        given = [command.default for command in self.commands]
         default = np.array([x(self.robot) if callable(x) else x for x in given], np.float32)
-        for name, value in {
-            **self.gaits.get(gait or next(iter(self.gaits), ""), {}),
-            **values,
-        }.items():
+        if gait is None:
+            gait = next(iter(self.gaits), "")
+        changed = {**self.gaits.get(gait, {}), **values}
+        for name, value in changed.items():
             default[self.index([name])] = value
         return default
 
@@ -180,26 +180,26 @@ class Skill(abc.ABC):
         return changes
 
     def trained_ranges(self, names: Sequence[str]) -> np.ndarray:
-        """Returns the lowest and the highest value of the named commands for which the skill is
-        trained (n, 2).
-        """
+        """Returns the range of the named commands for which the skill is trained (n, 2)."""
         default = self.default_commands()
-        commands = [self.commands[i] for i in self.index(names)]
-        around = zip(commands, default[self.index(names)], strict=True)
-        return np.array(
-            [x.trained or (at - x.limit, at + x.limit) for x, at in around], float
-        ).reshape(-1, 2)
+        ranges = []
+        for i in self.index(names):
+            limit = self.commands[i].limit
+            around = (default[i] - limit, default[i] + limit)
+            ranges.append(self.commands[i].trained or around)
+        return np.array(ranges, float).reshape(-1, 2)
 
     def untrained_commands(self, ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-        """Returns the commands whose range exceeds that for which the skill was trained, each with
-        both ranges.
+        """Returns the commands whose range exceeds that for which the skill was trained.
+
+        Each is a text with both ranges.
         """
-        trained = zip(ranges.items(), self.trained_ranges(list(ranges)), strict=True)
-        return [
-            f"{name} [{low:g}, {high:g}] outside [{least:g}, {most:g}]"
-            for (name, (low, high)), (least, most) in trained
-            if low < least or high > most
-        ]
+        trained = self.trained_ranges(list(ranges))
+        found = []
+        for (name, (low, high)), (least, most) in zip(ranges.items(), trained, strict=True):
+            if low < least or high > most:
+                found.append(f"{name} [{low:g}, {high:g}] outside [{least:g}, {most:g}]")
+        return found
 
     def limit_turn(self, commands: jax.Array) -> jax.Array:
         """Returns commands (..., C) with the yaw rate reduced to the bound `turn`."""
@@ -218,13 +218,14 @@ class Skill(abc.ABC):
             raise InputError(f"commands: {tuple(names)} must be one or more distinct commands")
 
     def check_period(self, timestep: float, num_substeps: int) -> None:
-        """Checks that `num_substeps` physics steps of `timestep` (s) are one period; raises an
-        InputError.
+        """Checks that `num_substeps` physics steps of `timestep`, s, are one period.
+
+        InputError if they are not.
         """
-        if not math.isclose(timestep * num_substeps, self.period):
+        step = timestep * num_substeps
+        if not math.isclose(step, self.period):
             raise InputError(
-                f"Scene.timestep: {timestep} s x {num_substeps} substeps is "
-                f"{timestep * num_substeps:g} s; "
+                f"Scene.timestep: {timestep} s x {num_substeps} substeps is {step:g} s; "
                 f"the period of the skill {self.name!r} is {self.period} s"
             )
 
@@ -242,11 +243,8 @@ def register(skill: type[S]) -> type[S]:
     Raises:
         InputError: for anything else, or if another class is registered under it.
     """
-    if not (
-        isinstance(skill, type)
-        and issubclass(skill, Skill)
-        and isinstance(getattr(skill, "name", None), str)
-    ):
+    derived = isinstance(skill, type) and issubclass(skill, Skill)
+    if not derived or not isinstance(getattr(skill, "name", None), str):
         fail("skill", skill, "a class derived from Skill, with a name")
     if SKILLS.setdefault(skill.name, skill) is not skill:
         raise InputError(f"skill: the name {skill.name!r} is already registered")
@@ -254,8 +252,9 @@ def register(skill: type[S]) -> type[S]:
 
 
 def make(name: str | Sequence[str], robot: Robot) -> Skill:
-    """Returns a skill of a robot, or a `Choice` of several; InputError for an unknown name, with
-    the nearest one.
+    """Returns a skill of a robot, or a `Choice` of several.
+
+    InputError for an unknown name, with the nearest one.
 
     Example:
         ```python

@@ -85,8 +85,9 @@ def frequency(velocity: jax.Array) -> jax.Array:
 
 
 def foot_phases(gait: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Returns each foot's phase (4,) in [0, 1), FL FR RL RR: stance below 0.5, swing above; 0.25 in
-    standing.
+    """Returns each foot's phase (4,) in [0, 1), FL FR RL RR.
+
+    Stance is below 0.5, swing above; standing is 0.25.
     """
     phases = jnp.mod(gait + jnp.array([0.5, 0.0, 0.0, 0.5]), 1.0)
     return jnp.where(stands(velocity), 0.25, phases)

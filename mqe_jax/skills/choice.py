@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -59,15 +59,15 @@ class Choice(Skill):
                     f"skill: {part.name!r} is not allowed with others; it remembers no action and "
                     "gait"
                 )
-        every = [
-            *(command for part in parts for command in part.commands),
-            Command("skill", "of the skills", gain=1.0, limit=1.0),
-        ]
-        first = {command.name: command for command in reversed(every)}
-        self.commands = tuple(
-            first[name] for name in dict.fromkeys(command.name for command in every)
-        )
-        self.gaits = {name: values for part in parts for name, values in part.gaits.items()}
+        commands: dict[str, Command] = {}
+        gaits: dict[str, Mapping[str, float]] = {}
+        for part in parts:
+            for command in part.commands:
+                commands.setdefault(command.name, command)
+            gaits |= part.gaits
+        commands["skill"] = Command("skill", "of the skills", gain=1.0, limit=1.0)
+        self.commands = tuple(commands.values())
+        self.gaits = gaits
         self._columns = [self.index([command.name for command in part.commands]) for part in parts]
         self._bounds = [_bounds(part) for part in parts]
         self._edges = np.linspace(-1.0, 1.0, len(parts) + 1, dtype=np.float32)[1:-1]
@@ -81,7 +81,8 @@ class Choice(Skill):
         return ((2 * place + 1) / len(self.parts) - 1,)
 
     def with_choice(self, name: str, commands: jax.Array) -> jax.Array:
-        default = self.default_commands(skill=self.select(name)[0])
+        (selected,) = self.select(name)
+        default = self.default_commands(skill=selected)
         columns = self._columns[[part.name for part in self.parts].index(name)]
         return jax.vmap(functools.partial(scatter, default, columns))(commands)
 
@@ -98,33 +99,32 @@ class Choice(Skill):
     ) -> tuple[jax.Array, dict[str, Any]]:
         entry = command[-1]
         asked = jnp.sum(entry > self._edges).astype(jnp.float32)
-        free = (memory["wait"] <= 0) & (jnp.min(jnp.abs(entry - self._edges)) > THRESHOLD)
+        clear = jnp.min(jnp.abs(entry - self._edges)) > THRESHOLD
+        free = (memory["wait"] <= 0) & clear
         acting = jnp.where(free, asked, memory["acting"])
-        wait = jnp.where(
-            acting != memory["acting"], HOLD - 1.0, jnp.maximum(memory["wait"] - 1.0, 0.0)
-        )
+        rest = jnp.maximum(memory["wait"] - 1.0, 0.0)
+        wait = jnp.where(acting != memory["acting"], HOLD - 1.0, rest)
         targets = []
         memories = {}
-        for part, weights, columns, bounds in zip(
-            self.parts, params, self._columns, self._bounds, strict=True
-        ):
+        parts = zip(self.parts, params, self._columns, self._bounds, strict=True)
+        for part, weights, columns, bounds in parts:
             own = part.limit_turn(jnp.clip(command[columns], *bounds))
             target, memories[part.name] = part.targets(
                 weights, memory[part.name], own, proprioception
             )
             targets.append(target)
 
-        def of_acting(*values: jax.Array) -> jax.Array:
-            pairs = enumerate(values[1:], 1)
-            return functools.reduce(
-                lambda kept, pair: jnp.where(acting == pair[0], pair[1], kept), pairs, values[0]
-            )
+        def of_acting(values: Sequence[jax.Array]) -> jax.Array:
+            kept = values[0]
+            for number, value in enumerate(values[1:], 1):
+                kept = jnp.where(acting == number, value, kept)
+            return kept
 
-        shared = {
-            field: of_acting(*(getattr(x, field) for x in memories.values())) for field in SHARED
-        }
+        shared = {}
+        for field in SHARED:
+            shared[field] = of_acting([getattr(each, field) for each in memories.values()])
         memories = {name: dataclasses.replace(x, **shared) for name, x in memories.items()}
-        return of_acting(*targets), {"acting": acting, "wait": wait, **memories}
+        return of_acting(targets), {"acting": acting, "wait": wait, **memories}
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> tuple[Any, ...]:
         if path is not None:
@@ -137,32 +137,24 @@ class Choice(Skill):
     def restrict(self, varied: Sequence[str], gait: str | None) -> Choice:
         def of(part: Skill) -> Skill:
             known = {command.name for command in part.commands}
-            return part.restrict(
-                [name for name in varied if name in known], gait if gait in part.gaits else None
-            )
+            own_gait = gait if gait in part.gaits else None
+            return part.restrict([name for name in varied if name in known], own_gait)
 
         return Choice(self.robot, [of(part) for part in self.parts])
 
     def clock(self, memory: dict[str, Any]) -> jax.Array:
-        """Returns the clock of the first skill, which all share, and the index of the skill that
-        acts.
-        """
+        """Returns the clock of the first skill, which all share, and the index of the acting skill."""
         first = self.parts[0]
         return jnp.append(first.clock(memory[first.name]), memory["acting"])
 
     def trained_ranges(self, names: Sequence[str]) -> np.ndarray:
-        """Returns the lowest and the highest value of the named commands for which some skill is
-        trained (n, 2).
-        """
-        known = [
-            [part for part in self.parts if name in [c.name for c in part.commands]]
-            for name in names
-        ]
-        each = [
-            np.concatenate([part.trained_ranges([name]) for part in parts])
-            for name, parts in zip(names, known, strict=True)
-        ]
-        return np.array([(x[:, 0].min(), x[:, 1].max()) for x in each]).reshape(-1, 2)
+        """Returns the range of the named commands for which some skill is trained (n, 2)."""
+        ranges = []
+        for name in names:
+            having = [part for part in self.parts if name in [c.name for c in part.commands]]
+            low, high = np.concatenate([part.trained_ranges([name]) for part in having]).T
+            ranges.append((low.min(), high.max()))
+        return np.array(ranges).reshape(-1, 2)
 
     def check_period(self, timestep: float, num_substeps: int) -> None:
         for part in self.parts:
@@ -170,11 +162,12 @@ class Choice(Skill):
 
 
 def _bounds(part: Skill) -> np.ndarray:
-    """Returns the lowest and the highest value (2, C) of commands that a skill is trained for; none
-    without actions.
+    """Returns the range (2, C) of commands that a skill is trained for.
+
+    Commands that no action sets are unbounded.
     """
     names = [command.name for command in part.commands]
     free = part.column("gain", names) == 0
-    return np.where(free, np.array([[-np.inf], [np.inf]]), part.trained_ranges(names).T).astype(
-        np.float32
-    )
+    unbounded = np.array([[-np.inf], [np.inf]])
+    bounds = np.where(free, unbounded, part.trained_ranges(names).T)
+    return bounds.astype(np.float32)

@@ -60,56 +60,55 @@ class Commander:
     ranges."""
 
     def skill_commands(self, action: jax.Array) -> jax.Array:
-        """Computes the skill's commands (A, C) around the defaults from actions (A, action_size) in
-        [-1, 1].
-        """
-        change = self.change(action)
+        """Computes the skill's commands (A, C) from actions (A, action_size) in [-1, 1]."""
         default = self.default_commands
         columns = self.skill.index(self.commands)
-        commands = jax.vmap(lambda change: scatter(default, columns, default[columns] + change))(
-            change
-        )
-        return self.skill.limit_turn(commands)
+
+        def of_agent(change: Any) -> jax.Array:
+            return scatter(default, columns, default[columns] + change)
+
+        return self.skill.limit_turn(jax.vmap(of_agent)(self.change(action)))
 
     def action_of(self, change: jax.Array) -> jax.Array:
-        """Computes the actions (..., action_size) that change the commands (..., action_size) from
-        the defaults.
+        """Computes the actions (..., action_size) that change the commands from the defaults.
+
+        `change` is (..., action_size).
         """
-        down, up = (
-            np.where(slope > 0, 1.0 / np.maximum(slope, 1e-9), 0.0) for slope in self._slopes
-        )
+        down, up = np.where(self._slopes > 0, 1.0 / np.maximum(self._slopes, 1e-9), 0.0)
         return jnp.clip(jnp.where(change < 0, down, up) * change, -1.0, 1.0)
 
     def change(self, action: jax.Array) -> jax.Array:
-        """Computes the changes of the commands from the defaults that actions ask for (...,
-        action_size).
+        """Computes the changes of the commands (..., action_size) that actions ask for.
+
+        They are differences from the default commands.
         """
         down, up = self._slopes
-        return jnp.clip(jnp.where(action < 0, down, up) * action, *self.changes.T)
+        low, high = self.changes.T
+        return jnp.clip(jnp.where(action < 0, down, up) * action, low, high)
 
     def admits(self, other: Commander) -> bool:
-        """Returns whether actions can have the skill of `other`, one of the skills here, act with
-        all its commands.
+        """Returns whether actions can have the skill of `other` act with all its commands.
+
+        That skill must be one of the skills here.
         """
         names = other.commands
-        if names != self.commands[: len(names)] or other.skill.name not in [
-            part.name for part in self.skill.parts
-        ]:
+        skills = [part.name for part in self.skill.parts]
+        if names != self.commands[: len(names)] or other.skill.name not in skills:
             return False
-        (low, high) = other.limits.T
-        (least, most) = self.limits[: len(names)].T
+        low, high = other.limits.T
+        least, most = self.limits[: len(names)].T
         return bool(np.all((low >= least - 1e-6) & (high <= most + 1e-6)))
 
     def translate(self, action: jax.Array, other: Commander) -> jax.Array:
-        """Computes the actions that give here the commands of actions (..., n) of `other`, which
-        this one `admits`.
+        """Computes the actions that give here the commands of actions (..., n) of `other`.
+
+        This commander must admit `other`.
         """
         entries = self.skill.select(other.skill.name)
         if not entries and np.array_equal(self.changes, other.changes):
             return action
-        shift = (
-            other.limits - other.changes - (self.limits - self.changes)[: len(other.commands)]
-        )[:, 0]
+        here = (self.limits - self.changes)[: len(other.commands)]
+        shift = (other.limits - other.changes - here)[:, 0]  # between the default commands
         entries = jnp.broadcast_to(jnp.array(entries), (*action.shape[:-1], len(entries)))
         return self.action_of(jnp.concatenate([other.change(action) + shift, entries], axis=-1))
 
@@ -140,8 +139,8 @@ class Controller(Commander):
     num_robots: int  # number of robots R
     num_agents: int  # number of agents A: the first A robots
     skill_params: Any  # parameters of the skill, or None if no robot uses it
-    # skill of the NPC robots and its parameters if it is another one
     npc: tuple[Skill, Any] | None = None
+    """Skill of the NPC robots and its parameters, if it is another one."""
     lag: int = 0  # maximum action lag, environment steps
     position_scale: float = 1.0  # factor on the range of the joint targets in the mode `position`
 
@@ -159,8 +158,9 @@ class Controller(Commander):
         return rest
 
     def check_action(self, action: jax.Array, size: int) -> jax.Array:
-        """Returns actions (A, size) as an array; InputError for others, or known ones that are not
-        finite.
+        """Returns actions (A, size) as an array.
+
+        InputError for others, or known ones that are not finite.
         """
         try:
             action = jnp.asarray(action)
@@ -185,24 +185,19 @@ class Controller(Commander):
             jax.tree.map(lambda x, n=n: jnp.broadcast_to(x, (n, *x.shape)), skill.init_memory())
             for skill, _, n in self._groups
         ]
-        return ControlState(
-            _one_or_all(memories), jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1))
-        )
+        delayed = jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1))
+        return ControlState(_one_or_all(memories), delayed)
 
     def clock(self, state: ControlState) -> jax.Array:
         """Returns the clocks of the robots' skills (R, n); n is 0 if no robot uses the skill."""
-        clocks = [
-            jax.vmap(skill.clock, axis_size=n)(memory)
-            for (skill, _, n), memory in zip(self._groups, self._memories(state), strict=True)
-        ]
+        groups = zip(self._groups, self._memories(state), strict=True)
+        clocks = [jax.vmap(skill.clock, axis_size=n)(memory) for (skill, _, n), memory in groups]
         width = max((clock.shape[1] for clock in clocks), default=0)
         clocks = [jnp.pad(clock, ((0, 0), (0, width - clock.shape[1]))) for clock in clocks]
         rest = self.num_robots - sum(len(clock) for clock in clocks)
-        return (
-            jnp.concatenate([jnp.zeros((rest, width)), *clocks])
-            if rest or len(clocks) > 1
-            else clocks[0]
-        )
+        if len(clocks) == 1 and not rest:
+            return clocks[0]
+        return jnp.concatenate([jnp.zeros((rest, width)), *clocks])
 
     @jax.named_scope("control")
     def targets(
@@ -234,24 +229,26 @@ class Controller(Commander):
             target = target.at[:agents].set(action * self.robot.torque_limit)
         asked = [commands] if npc_commands is None else [commands, npc_commands]
         asked = asked[-len(self._groups) :] if self.npc else [jnp.concatenate(asked)]
-        first = self.num_robots - sum(n for *_, n in self._groups)
+        unskilled = self.num_robots - sum(n for *_, n in self._groups)
+        first = unskilled
         skilled = []
-        for (skill, params, n), memory, commands in zip(
-            self._groups, self._memories(state), asked, strict=False
-        ):
+        groups = zip(self._groups, self._memories(state), asked, strict=False)
+        for (skill, params, n), memory, commands in groups:
             sensed = jax.tree.map(lambda x, first=first, n=n: x[first : first + n], proprioception)
-            targets, memory = jax.vmap(functools.partial(skill.targets, params))(
-                memory, commands, sensed
-            )
-            skilled = [*skilled, targets]
-            memories = [*memories, memory]
-            first = first + n
+            act = jax.vmap(functools.partial(skill.targets, params))
+            targets, memory = act(memory, commands, sensed)
+            skilled.append(targets)
+            memories.append(memory)
+            first += n
         if skilled:
-            rest = [target[: self.num_robots - sum(map(len, skilled))]]
-            uses = np.arange(self.num_robots)[:, None] >= (0 if self.mode == "command" else agents)
-            target = jnp.where(uses, jnp.concatenate([*rest, *skilled]), target)
+            unmoved = 0 if self.mode == "command" else agents
+            uses = np.arange(self.num_robots)[:, None] >= unmoved
+            target = jnp.where(uses, jnp.concatenate([target[:unskilled], *skilled]), target)
         delayed = jnp.concatenate([target[None], state.delayed[:-1]])
-        return (delayed[lag] if self.lag else target), ControlState(_one_or_all(memories), delayed)
+        control = ControlState(_one_or_all(memories), delayed)
+        if self.lag:
+            target = delayed[lag]
+        return target, control
 
     @property
     def npc_skill(self) -> Skill:
@@ -266,20 +263,21 @@ class Controller(Commander):
     @property
     def _groups(self) -> list[tuple[Skill, Any, int]]:
         """The robots that use a skill, the last ones, in groups: skill, parameters and number."""
+        if self.npc is None and self.skill_params is None:
+            return []
         if self.npc is None:
-            return (
-                []
-                if self.skill_params is None
-                else [(self.skill, self.skill_params, self.num_robots)]
-            )
-        agents = (
-            [(self.skill, self.skill_params, self.num_agents)] if self.mode == "command" else []
-        )
-        return [*agents, (*self.npc, self.num_robots - self.num_agents)]
+            return [(self.skill, self.skill_params, self.num_robots)]
+        npc, npc_params = self.npc
+        npcs = (npc, npc_params, self.num_robots - self.num_agents)
+        if self.mode != "command":
+            return [npcs]
+        return [(self.skill, self.skill_params, self.num_agents), npcs]
 
     def _memories(self, state: ControlState) -> Sequence[Any]:
         """Returns the recurrent states of the groups."""
-        return [state.skill][: len(self._groups)] if len(self._groups) < 2 else state.skill
+        if len(self._groups) > 1:
+            return state.skill
+        return [state.skill] if self._groups else []
 
 
 def _one_or_all(memories: Sequence[Any]) -> Any:

@@ -1,5 +1,6 @@
-"""Networks of skills: named parts, each a chain of linear layers with an ELU between them, and
-their weight files.
+"""Networks of skills, of named parts, and their weight files.
+
+A part is a chain of linear layers with an ELU between them.
 
 A layer is named `part.index` with even indices, as in torch's `Sequential`; its weight is (outputs,
 inputs).
@@ -30,9 +31,7 @@ Params = dict[str, dict[str, dict[str, jax.Array]]]
 def layers(
     params: Mapping[str, Mapping[str, jax.Array]], x: jax.Array, precision: str, first: int = 0
 ) -> jax.Array:
-    """Applies the layers from number `first` on to x (..., n), with an ELU before each but number
-    0.
-    """
+    """Applies the layers from number `first` on to x (..., n), with an ELU before each but 0."""
     for name in sorted(params, key=int)[first:]:
         x = x if name == "0" else jax.nn.elu(x)
         x = jnp.matmul(x, params[name]["weight"].T, precision=precision) + params[name]["bias"]
@@ -51,25 +50,27 @@ class Networks:
     @property
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Inputs and outputs of each layer, by `part.index`."""
-        chains = ((part, itertools.pairwise(widths)) for part, widths in self.widths.items())
-        return {f"{part}.{2 * i}": sizes for part, chain in chains for i, sizes in enumerate(chain)}
+        found = {}
+        for part, widths in self.widths.items():
+            for i, sizes in enumerate(itertools.pairwise(widths)):
+                found[f"{part}.{2 * i}"] = sizes
+        return found
 
     def init(self, key: jax.Array) -> Params:
-        """Samples initial weights: uniform as in torch's linear layers, those of the action layer
-        scaled by 0.1.
+        """Samples initial weights, uniform as in torch's linear layers.
+
+        The weights of the action layer are scaled by 0.1, its biases are 0.
         """
         params: Params = {part: {} for part in self.widths}
         for name, (n_in, n_out) in self.sizes.items():
             part, layer = name.split(".")
             key, w_key, b_key = jax.random.split(key, 3)
             bound = n_in**-0.5
-            last = name == list(self.sizes)[-1]
-            weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound) * (
-                0.1 if last else 1.0
-            )
-            bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound) * (
-                0.0 if last else 1.0
-            )
+            weight = jax.random.uniform(w_key, (n_out, n_in), minval=-bound, maxval=bound)
+            bias = jax.random.uniform(b_key, (n_out,), minval=-bound, maxval=bound)
+            if name == list(self.sizes)[-1]:
+                weight = weight * 0.1
+                bias = bias * 0.0
             params[part][layer] = {"weight": weight, "bias": bias}
         return params
 
@@ -87,8 +88,7 @@ class Networks:
         return params
 
     def load(self, robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
-        """Reads weights as float32 from a safetensors file; those shipped for the robot if `path`
-        is None.
+        """Reads weights as float32 from a safetensors file, by default those shipped for the robot.
 
         Raises:
             InputError: if the file is missing, damaged, or holds other names or shapes.
@@ -99,8 +99,8 @@ class Networks:
         if not file.is_file() and path is None:
             raise InputError(
                 f"{self.title}: no weights are shipped for {robot.name} (assets/{file.name}); "
-                f"{train} and give them as "
-                "skill_weights=FILE, or use control 'position' or 'torque'"
+                f"{train} and give them as skill_weights=FILE, or use control 'position' or "
+                "'torque'"
             )
         if not file.is_file():
             raise InputError(f"{self.title}: no file {file}; {train}")
@@ -114,19 +114,18 @@ class Networks:
         *,
         half: bool = False,
     ) -> None:
-        """Writes weights and metadata to a safetensors file, atomically; with `half`, rounded to
-        float16.
+        """Writes weights and metadata to a safetensors file, atomically.
+
+        With `half`, weights are rounded to float16.
         """
         from safetensors.numpy import save
 
-        flat = {
-            f"{part}.{layer}.{kind}": np.ascontiguousarray(
-                array, np.float16 if half else np.float32
-            )
-            for part, layers in params.items()
-            for layer, arrays in layers.items()
-            for kind, array in arrays.items()
-        }
+        dtype = np.float16 if half else np.float32
+        flat = {}
+        for part, layers in params.items():
+            for layer, arrays in layers.items():
+                for kind, array in arrays.items():
+                    flat[f"{part}.{layer}.{kind}"] = np.ascontiguousarray(array, dtype)
         file = pathlib.Path(path)
         check_locks(file)
         try:
