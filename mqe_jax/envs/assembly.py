@@ -1,6 +1,4 @@
-"""What an environment is made of: its scene and its controller, from the task and its
-parameters.
-"""
+"""The scene and the controller of an environment, from the task and its parameters."""
 
 from __future__ import annotations
 
@@ -22,14 +20,11 @@ def make_scene(task: Task[Any, Any]) -> Scene:
             "scene: Scene.robots is not empty; the parameter robot says which robots a task has"
         )
     params = task.params
-    # NPC robots follow joint targets in every mode.
-    by_torque = (
-        task.num_agents
-        if task.control == "torque"
-        else scene.num_robots
-        if params.actuator_network
-        else 0
-    )
+    by_torque = 0
+    if task.control == "torque":
+        by_torque = task.num_agents  # NPC robots follow joint targets in every mode
+    elif params.actuator_network:
+        by_torque = scene.num_robots
     return dataclasses.replace(
         scene,
         robots=(task.robot,) * scene.num_robots,
@@ -53,16 +48,19 @@ def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Co
     params = task.params
     skill = skills.make(params.skill, task.robot)
     npc = None
-    npcs = scene.num_robots > task.num_agents
-    if npcs and task.npc_skill != skill.name:
+    shared = scene.num_robots > task.num_agents  # whether NPC robots use the agents' skill
+    if shared and task.npc_skill != skill.name:
+        shared = False
         other = skills.make(task.npc_skill, task.robot)
-        npcs = False
-        other = other.restrict(task.npc_varied, None) if task.npc_varied else other
+        if task.npc_varied:
+            other = other.restrict(task.npc_varied, None)
         other.check_period(scene.timestep, num_substeps)
         npc = other, other.load_params()
-    if not npcs or task.npc_varied:
-        skill = skill.restrict((*params.commands, *(task.npc_varied if npcs else ())), params.gait)
-    uses_skill = task.control == "command" or npcs
+    if not shared:
+        skill = skill.restrict(params.commands, params.gait)
+    elif task.npc_varied:
+        skill = skill.restrict((*params.commands, *task.npc_varied), params.gait)
+    uses_skill = task.control == "command" or shared
     if uses_skill:
         skill.check_period(scene.timestep, num_substeps)
         beyond = ", ".join(skill.untrained_commands(params.command_ranges))

@@ -45,8 +45,7 @@ Start = Callable[[jax.Array, jax.Array], State]
 def autoreset(
     env: QuadrupedEnv, state: State, start: Start | None = None, groups: Sequence[str] = ()
 ) -> State:
-    """Replaces the state of one environment by a new initial state if its episode has ended, and
-    observes it.
+    """Replaces the state of one environment by a new one if its episode has ended, and observes it.
 
     Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step
     that ended the episode, and `assistance` is kept. `start` samples the new state, by default the
@@ -55,16 +54,17 @@ def autoreset(
     done = state.terminated | state.truncated
     with jax.named_scope("reset"):
         key, reset_key = jax.random.split(state.key)
-        fresh = (start or env.begin)(reset_key, state.assistance)
-        merged = {
-            field.name: jax.tree.map(
-                lambda new, old: jnp.where(done, new, old),
-                getattr(fresh, field.name),
-                getattr(state, field.name),
-            )
-            for field in dataclasses.fields(state)
-            if field.name not in ("data", "key", *SEEN, *KEPT)
-        }
+        begin = start or env.begin
+        fresh = begin(reset_key, state.assistance)
+
+        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(done, new, old)
+
+        merged = {}
+        for field in dataclasses.fields(state):
+            name = field.name
+            if name not in ("data", "key", *SEEN, *KEPT):
+                merged[name] = jax.tree.map(choose, getattr(fresh, name), getattr(state, name))
         data = env.physics.merge(done, fresh.data, state.data)
     return env.with_observations(dataclasses.replace(state, data=data, key=key, **merged), groups)
 
@@ -84,8 +84,9 @@ class EnvBatch:
         return f"<{type(self).__name__} of {self.num_envs}: {getattr(self, 'inner', self.env)!r}>"
 
     def check_step(self, state: Any, action: jax.Array, kind: type) -> None:
-        """Raises an InputError unless state is a `kind` of N environments and actions are (N, A,
-        action_size).
+        """Raises an InputError unless `state` is a `kind` of N environments and `action` fits.
+
+        Actions are (N, A, action_size).
         """
         steps = jnp.shape(state.step) if isinstance(state, kind) else ()
         if steps != (self.num_envs,):
@@ -156,8 +157,9 @@ class VectorEnv(EnvBatch):
         self.group_sizes = env.group_sizes
 
     def with_groups(self, names: Iterable[str]) -> Self:
-        """Returns the batch that also observes further groups; InputError for one that the task
-        does not have.
+        """Returns the batch that also observes further groups.
+
+        InputError for a group that the task does not have.
         """
         wanted = {"policy", *names}
         for name in sorted(wanted.difference(self.group_sizes)):
@@ -170,14 +172,14 @@ class VectorEnv(EnvBatch):
     @checked
     def reset(self, key: RandomKey) -> State:
         """Returns N initial states; every leaf has a leading axis N."""
-        return jax.vmap(self._reset)(
-            devices.rows(lambda n: jax.random.split(key, n), self.num_envs)
-        )
+        keys = devices.rows(lambda n: jax.random.split(key, n), self.num_envs)
+        return jax.vmap(self._reset)(keys)
 
     @checked
     def share(self, parts: PositiveInt) -> Self:
-        """Returns the batch of one of several processes; InputError if the environments do not
-        divide evenly.
+        """Returns the batch of one of several processes.
+
+        InputError if the environments do not divide evenly.
         """
         other = copy.copy(self)
         other.num_envs = devices.share("num_envs", self.num_envs, parts)
@@ -185,8 +187,9 @@ class VectorEnv(EnvBatch):
         return other
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances all environments by one step with actions (N, A, action_size); resets those that
-        ended.
+        """Advances all environments by one step with actions (N, A, action_size).
+
+        Environments whose episode ended are reset.
         """
         self.check_step(state, action, State)
         return jax.vmap(self._step)(state, action)
@@ -198,9 +201,7 @@ class VectorEnv(EnvBatch):
 
     @single
     def _step(self, state: State, action: jax.Array, start: Start | None = None) -> State:
-        """Advances one environment, and resets it to `start` if its episode ended; see
-        `autoreset`.
-        """
+        """Advances one environment, and resets it to `start` if its episode ended (`autoreset`)."""
         state = self.env.advance(state, action)
         if self.final:
             seen = with_final(self.env.with_observations(state, self.groups), self.final)

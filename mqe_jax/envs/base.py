@@ -1,5 +1,6 @@
-"""The environment core: one environment of several robots as pure `reset` and `step` functions,
-batched by `jax.vmap`.
+"""The environment core: pure `reset` and `step` functions of one environment of several robots.
+
+`jax.vmap` batches them.
 
 A task is a subclass in its own file (`mqe_jax.envs.task`). This module has what all tasks share:
 spawning, control, physics, randomisation, falls, collisions, the time limit, and the detection of
@@ -45,9 +46,8 @@ from mqe_jax.skills.control import check_mode
 if TYPE_CHECKING:
     from mujoco import mjx
 
-# folded into a state's key for the noise of its observations, and for its sensors
-_NOISE = 7919
-_SENSING = 7907
+_NOISE = 7919  # folded into a state's key for the noise of its observations
+_SENSING = 7907  # folded into it for its sensors
 
 
 T = TypeVar("T")
@@ -63,8 +63,9 @@ class _Recorded(type):
 
 
 class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
-    """Base of all tasks; functions of one environment, to be batched by `jax.vmap` and compiled by
-    `jax.jit`.
+    """Base of all tasks: functions of one environment.
+
+    `jax.vmap` batches and `jax.jit` compiles them.
 
     Example:
         ```python
@@ -103,14 +104,15 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         self.compiled = compile_scene(scene)
         self.index = self.compiled.index
         self.objects = self.compiled.objects
+        constraints = self.params.constraints_per_robot * scene.num_robots
+        constraints += 4 * self.extra_contacts
         self.physics = engines.make(
             self.compiled.model,
             motors=self.compiled.motors,
             impl=impl,
             num_envs=num_envs,
             contacts_per_env=scene.max_contacts,
-            max_constraints_per_env=self.params.constraints_per_robot * scene.num_robots
-            + 4 * self.extra_contacts,
+            max_constraints_per_env=constraints,
             sparse_solver=self.params.sparse_solver,
         )
         self.impl = self.physics.impl
@@ -123,7 +125,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
                 f"at least one environment step, {self.dt} s",
             )
         self.actuators = None
-        if (network := self.params.actuator_network) and control != "torque":
+        network = self.params.actuator_network
+        if network and control != "torque":
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
         self.controller = make_controller(self, scene, self.physics.num_substeps)
@@ -131,14 +134,13 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         self.randomizer = Randomizer(
             self.params.randomization, self.compiled.model, self.index, self.params.friction
         )
+        clock = jax.eval_shape(lambda: self.controller.clock(self.controller.reset()))
         self.privileged = PrivilegedObservation(
             self.robot,
             self.compiled.model,
             self.index,
             num_anchors=len(self.compiled.layout.anchors),
-            clock_size=jax.eval_shape(lambda: self.controller.clock(self.controller.reset())).shape[
-                1
-            ],
+            clock_size=clock.shape[1],
             contact_forces=self.params.privileged_contact_forces,
         )
 
@@ -148,21 +150,19 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         super().__setattr__(name, value)
 
     def __repr__(self) -> str:
-        size = self.observation_size
         actions = f"{self.control} {self.action_size}"
-        actions += f" ({self.params.commanded_text()})" if self.control == "command" else ""
+        if self.control == "command":
+            actions += f" ({self.params.commanded_text()})"
         agents = " vs ".join(str(len(team)) for team in self.teams)
         changed = differences(self.params, self.Params())
-        changed |= (
-            {"senses": [sensor.name for sensor in self.params.senses]} if self.params.senses else {}
-        )
-        changed = [f"{name}={value!r}" for name, value in changed.items()]
+        if self.params.senses:
+            changed["senses"] = [sensor.name for sensor in self.params.senses]
         facts = [
             f"{agents} agents",
-            f"observation {size}",
+            f"observation {self.observation_size}",
             f"action {actions}",
             f"engine {self.impl}",
-            *changed,
+            *(f"{name}={value!r}" for name, value in changed.items()),
         ]
         return f"<{self.name}: {', '.join(facts)}>"
 
@@ -178,8 +178,9 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
-        """Rendering model: the physics model plus visual geoms; qpos and mocap layouts are
-        identical.
+        """Rendering model: the physics model plus visual geoms.
+
+        The layouts of qpos and mocap bodies are identical.
         """
         return build_model(self._scene, visual=True)[0]
 
@@ -255,14 +256,14 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
     @single
     @checked
     def reset(self, key: RandomKey, assistance: Level = 0.0) -> State[S]:
-        """Returns a randomised initial state; the task is unmodified at `assistance` 0, a
-        curriculum level up to 1.
+        """Returns a randomised initial state.
+
+        The task is unmodified at `assistance` 0; a curriculum passes levels up to 1.
         """
         return with_final(self.with_observations(self.begin(key, assistance)))
 
     def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> State[S]:
         """Returns the state of `reset` without observations."""
-        keys = jax.random.split(key, 9)
         (
             next_key,
             anchor_key,
@@ -273,13 +274,12 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             task_key,
             size_key,
             freeze_key,
-        ) = keys
+        ) = jax.random.split(key, 9)
         assistance = jnp.asarray(assistance, jnp.float32)
         anchors = self.compiled.sample_anchors(anchor_key)
         active = self.sizes.draw(size_key, assistance)
-        qpos, qvel = self._sample_robots(
-            self.sizes.line_up(self.spawn(spawn_key), active), body_key
-        )
+        spawn = self.sizes.line_up(self.spawn(spawn_key), active)
+        qpos, qvel = self._sample_robots(spawn, body_key)
         qpos, qvel = self.reset_objects(object_key, qpos, qvel, assistance)
         ctrl = self._ctrl(jnp.asarray(self.controller.neutral))
         data = self.physics.init(qpos, qvel, self.compiled.wall_positions(anchors), ctrl)
@@ -314,18 +314,17 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         now = Moment(state, robot_state)
         _, logged = self.score(now, now, no)
         names = (*logged, "collision", "diverged", "overflow")
-        outcome = dataclasses.replace(
-            self.result(state, robot_state, no), ending=dict.fromkeys(ENDINGS, no)
-        )
+        metrics = {name: jnp.zeros(()) for name in names}
+        outcome = self.result(state, robot_state, no)
+        outcome = dataclasses.replace(outcome, ending=dict.fromkeys(ENDINGS, no))
         outcome = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), outcome)
-        return dataclasses.replace(
-            state, outcome=outcome, metrics={name: jnp.zeros(()) for name in names}
-        )
+        return dataclasses.replace(state, outcome=outcome, metrics=metrics)
 
     @single
     def step(self, state: State[S], action: jax.Array) -> State[S]:
-        """Advances one environment by one environment step with actions (A, action_size), clipped
-        to [-1, 1].
+        """Advances one environment by one environment step with actions (A, action_size).
+
+        They are clipped to `action_limit`.
 
         An episode that has ended continues unless it is reset (see `VectorEnv`). InputError for a
         state of another task or of a batch, and for an action of another shape or dtype, or that is
@@ -339,9 +338,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         self.check_state(state)
         action = self.controller.check_action(action, self.action_size)
         bad_action = ~jnp.all(jnp.isfinite(action) | ~state.active[:, None])
-        action = jnp.clip(
-            jnp.nan_to_num(action.astype(jnp.float32)), -self.action_limit, self.action_limit
-        )
+        action = jnp.nan_to_num(action.astype(jnp.float32))
+        action = jnp.clip(action, -self.action_limit, self.action_limit)
         still = (state.step < state.frozen_steps) | ~self.acting(state)
         own_action = jnp.where(still[:, None], 0.0, action)
         action = self.unmirror_action(self.moving(own_action))
@@ -358,9 +356,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         if self.params.randomization.motor_offset:
             target = target + state.randomized.motor_offset
         target = self.sizes.hold(target, state.active)
-        data = self.step_npcs(
-            self.randomizer.push(state.data, push_key, self.dt), before.robots, npc_key
-        )
+        data = self.randomizer.push(state.data, push_key, self.dt)
+        data = self.step_npcs(data, before.robots, npc_key)
         data = self.sizes.park(data, state.active)
         fields = self.randomizer.fields(state.randomized) | self.fields(state)
         forces = self.external_forces(state)
@@ -378,9 +375,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         moved = {"data": data, "control": control, "actuators": actuators, "senses": senses}
         state = dataclasses.replace(state, **moved, step=state.step + 1, key=key)
         state = self.judge(before, Moment(state, robot_state), bad_action)
-        return dataclasses.replace(
-            state, metrics={**state.metrics, "overflow": overflow.astype(jnp.float32)}
-        )
+        metrics = {**state.metrics, "overflow": overflow.astype(jnp.float32)}
+        return dataclasses.replace(state, metrics=metrics)
 
     @jax.named_scope("task")
     def with_observations(self, state: State[S], groups: Sequence[str] = ()) -> State[S]:
@@ -413,19 +409,13 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
     def judge(
         self, before: Moment[S], after: Moment[S], bad_action: jax.Array | bool = False
     ) -> State[S]:
-        """Returns the state after a step with the task's own fields, reward, metrics and ending of
-        this step.
-        """
+        """Returns the state after a step with its own fields, reward, metrics and ending."""
         state, robot_state = after
         diverged = bad_action | self._diverged(state.data)
-        collision = jnp.any(
-            robot_state.count(
-                robot_state.trunk_force[: self.num_agents] > self.params.collision_force
-            )
-        )
-        state = dataclasses.replace(
-            state, task=alike("step_task", self.step_task(before, after), state.task)
-        )
+        touched = robot_state.trunk_force[: self.num_agents] > self.params.collision_force
+        collision = jnp.any(robot_state.count(touched))
+        task = alike("step_task", self.step_task(before, after), state.task)
+        state = dataclasses.replace(state, task=task)
         reward, logged = self.score(before, Moment(state, robot_state), collision)
         fall = jnp.any(self.fallen(robot_state)) & self.falls_end
         crash = collision & self.params.end_on_collision
@@ -443,11 +433,16 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         first = (causes & (jnp.cumsum(causes) == 1)).astype(jnp.float32)
         ending = dict(zip(ENDINGS, first, strict=True))
         outcome = dataclasses.replace(jax.tree.map(clean, outcome), draw=draw, ending=ending)
-        metrics = {name: clean(value) for name, value in {**logged, "collision": collision}.items()}
+        logged = {**logged, "collision": collision}
+        metrics = {name: clean(value) for name, value in logged.items()}
         metrics["diverged"] = diverged.astype(jnp.float32)
-        ended = {"terminated": terminated, "truncated": ~terminated & late}
         return dataclasses.replace(
-            state, reward=clean(reward), **ended, outcome=outcome, metrics=metrics
+            state,
+            reward=clean(reward),
+            terminated=terminated,
+            truncated=~terminated & late,
+            outcome=outcome,
+            metrics=metrics,
         )
 
     def observe_privileged(self, state: State[S], robot_state: RobotState) -> jax.Array:
@@ -455,27 +450,29 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         return self.privileged.observe(robot_state, state, self.controller.clock(state.control))
 
     def result(self, state: State[S], robot_state: RobotState, failed: jax.Array) -> Outcome:
-        """Returns the outcome of an episode that ends in this step, without the cause; arguments as
-        of `outcome`.
+        """Returns the outcome of an episode that ends in this step, without the cause.
+
+        The arguments are those of `outcome`.
         """
         values = results("outcome", self.outcome(state, robot_state, failed))
         values = {name: value[None] for name, value in values.items()}
         return Outcome(success=values.pop("success"), further=values)
 
     def read(self, data: mjx.Data, active: jax.Array | None = None) -> RobotState:
-        """Returns the state of all robots; `active` (A,) says which agents take part, by default
-        all.
+        """Returns the state of all robots.
+
+        `active` (A,) says which agents take part, by default all.
         """
         return read_robots(self.index, data.qpos, data.qvel, data.sensordata, active)
 
     def object_pose(self, data: mjx.Data, name: str) -> jax.Array:
-        """Returns position, m, and quaternion, wxyz, of an object (7,), environment frame;
-        InputError if unknown.
+        """Returns position, m, and quaternion, wxyz, of an object (7,) in the environment frame.
+
+        InputError for an unknown name.
         """
         check("name", name, Literal[tuple(self.objects)])
-        return jnp.concatenate(
-            poses(self.compiled.model, data, [self.objects[name].body]), axis=-1
-        )[0]
+        found = poses(self.compiled.model, data, [self.objects[name].body])
+        return jnp.concatenate(found, axis=-1)[0]
 
     def fallen(self, robot_state: RobotState) -> jax.Array:
         """Returns which active robots exceed the roll, pitch or height limits (R,) bool."""
@@ -484,9 +481,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         roll = jnp.abs(robot_state.euler[:, 0])
         pitch = jnp.abs(robot_state.euler[:, 1])
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
-        return (
-            out | (height < params.min_height) | (height > params.max_height)
-        ) & robot_state.active
+        out |= (height < params.min_height) | (height > params.max_height)
+        return out & robot_state.active
 
     def _ctrl(self, targets: jax.Array) -> jax.Array:
         """Returns the engine's control (nu,) from targets of all robots (R, 12)."""
@@ -499,9 +495,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         joint_key, velocity_key = jax.random.split(key)
         low, high = params.spawn_joint_scale
         factor = jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
-        joints = jnp.clip(
-            self.robot.default_joints * factor, self.robot.joint_lower, self.robot.joint_upper
-        )
+        joints = self.robot.default_joints * factor
+        joints = jnp.clip(joints, self.robot.joint_lower, self.robot.joint_upper)
         speed = params.spawn_velocity
         velocity = jax.random.uniform(
             velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed
@@ -509,7 +504,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         level = jnp.zeros(len(pose))
         turn = euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
         robots = np.concatenate([index.base_qpos, index.joint_qpos], axis=-1)
-        qpos = scatter(model.qpos0, robots, jnp.concatenate([pose[:, :3], turn, joints], axis=-1))
+        own = jnp.concatenate([pose[:, :3], turn, joints], axis=-1)
+        qpos = scatter(model.qpos0, robots, own)
         return qpos, scatter(np.zeros(model.nv), index.base_qvel, velocity)
 
     def _sample_frozen_steps(
@@ -518,7 +514,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         agent_key, time_key = jax.random.split(key)
         steps = assistance * self.params.frozen_time / self.dt * jax.random.uniform(time_key, ())
         number = 1 + jax.random.randint(agent_key, (), 0, jnp.sum(active))
-        return jnp.where(active & (jnp.cumsum(active) == number), steps, 0.0).astype(jnp.int32)
+        chosen = active & (jnp.cumsum(active) == number)
+        return jnp.where(chosen, steps, 0.0).astype(jnp.int32)
 
     def check_state(self, state: State[S]) -> None:
         """Raises an InputError for anything but a state of one environment of this task."""
@@ -533,12 +530,10 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             found = f"of type {type(state).__name__}"
         raise InputError(
             f"state: {found} is not allowed; it must be one of {self.name}, with qpos ({size},), "
-            "such as `reset` "
-            "returns; jax.vmap or VectorEnv steps a batch"
+            "such as `reset` returns; jax.vmap or VectorEnv steps a batch"
         )
 
     def _diverged(self, data: mjx.Data) -> jax.Array:
-        # false for NaN
-        slow = jnp.abs(data.qvel) < 1e3
+        slow = jnp.abs(data.qvel) < 1e3  # false for NaN, and so is `near`
         near = jnp.abs(data.qpos[self.index.base_qpos[:, :3]]) < 1e3
         return ~(jnp.all(jnp.isfinite(data.qpos)) & jnp.all(slow) & jnp.all(near))

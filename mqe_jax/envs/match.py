@@ -1,5 +1,4 @@
-"""Matches: two teams of the same size against each other, with zero-sum rewards and mirrored
-observations.
+"""Matches: two teams of the same size, with zero-sum rewards and mirrored observations.
 
 A match is symmetric under a half turn about its centre ("turn") or a reflection in the x-z plane
 ("reflect"). Team 1, the second half of the agents, observes in the transformed frame, so that one
@@ -108,22 +107,16 @@ class Match(QuadrupedEnv[S, P]):
         return {}
 
     def teams_blocks(self, masked: bool = False) -> tuple[Block, ...]:
-        """Returns the first blocks of teams of robots; `observe_teams` fills them, if they are not
-        `masked`.
+        """Returns the first blocks of teams of robots.
+
+        `observe_teams` fills them, if they are not `masked`.
         """
         team = self.num_agents // 2
-        mates = (
-            (entities("teammate", "robot", team - 1, 6, BASE_INFO, masked=masked),)
-            if team > 1
-            else ()
-        )
-        opponents = entities("opponents", "robot", team, 6, BASE_INFO, masked=masked)
-        return (
-            one_hot(team, "agent's id within its team"),
-            Block("base", 6, BASE_INFO),
-            *mates,
-            opponents,
-        )
+        blocks = [one_hot(team, "agent's id within its team"), Block("base", 6, BASE_INFO)]
+        if team > 1:
+            blocks.append(entities("teammate", "robot", team - 1, 6, BASE_INFO, masked=masked))
+        blocks.append(entities("opponents", "robot", team, 6, BASE_INFO, masked=masked))
+        return tuple(blocks)
 
     def observe_teams(self, robot_state: RobotState) -> dict[str, jax.Array]:
         """Returns the blocks of `teams_blocks` (A, width), each in its agent's own frame."""
@@ -142,11 +135,12 @@ class Match(QuadrupedEnv[S, P]):
         }
 
     def views(self, info: jax.Array) -> jax.Array:
-        """Transforms base information (R, 6), position and roll, pitch, yaw, to both teams' frames:
-        (2, R, 6).
+        """Transforms base information (R, 6) to both teams' frames (2, R, 6).
+
+        It is position, m, and roll, pitch, yaw, rad.
         """
         position = self.view_points(info[:, :3])[1]
-        (roll, pitch, yaw) = jnp.moveaxis(info[:, 3:], -1, 0)
+        roll, pitch, yaw = jnp.moveaxis(info[:, 3:], -1, 0)
         if self.symmetry == "turn":
             euler = jnp.stack([roll, pitch, jnp.arctan2(-jnp.sin(yaw), -jnp.cos(yaw))], axis=-1)
         else:

@@ -62,31 +62,37 @@ class ObservationLayout:
         )
 
     def pack(self, values: Mapping[str, jax.Array], agents: int | None = None) -> jax.Array:
-        """Concatenates named blocks (A, width) into observations (A, size); ValueError for other
-        names or widths.
+        """Concatenates named blocks (A, width) into observations (A, size).
+
+        ValueError for other names or widths.
         """
         check_names("observe", values, self.names)
-        rows = (agents or len(values[self.names[0]]),)
-        parts = [
-            check_shape(f"observe: {x.name}", values[x.name], (*rows, x.width)) for x in self.blocks
-        ]
+        if agents is None:
+            agents = len(values[self.names[0]])
+        parts = []
+        for block in self.blocks:
+            shape = (agents, block.width)
+            parts.append(check_shape(f"observe: {block.name}", values[block.name], shape))
         return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
 
     def entities(self, observation: jax.Array, name: str) -> tuple[jax.Array, jax.Array]:
-        """Returns a block of observations by entity (..., count, width), and which are there (...,
-        count) bool.
+        """Returns a block of observations by entity (..., count, width), and which are there.
+
+        The second result is (..., count) bool.
         """
         found = next((block.entities for block in self.blocks if block.name == name), None)
         if found is None:
             raise KeyError(f"observation block: {name!r} has no entities")
         rows = observation[..., self.slice(name)].reshape(*observation.shape[:-1], found.count, -1)
-        return rows[..., : found.width], rows[..., -1] > 0.5 if found.masked else jnp.ones(
-            rows.shape[:-1], bool
-        )
+        there = jnp.ones(rows.shape[:-1], bool)
+        if found.masked:
+            there = rows[..., -1] > 0.5
+        return rows[..., : found.width], there
 
     def image(self, observation: jax.Array, name: str) -> jax.Array:
-        """Returns an image block of observations (..., channels, height, width); KeyError if it is
-        none.
+        """Returns an image block of observations (..., channels, height, width).
+
+        KeyError for a block that is no image.
         """
         found = next((block.image for block in self.blocks if block.name == name), None)
         if found is None:
@@ -94,21 +100,18 @@ class ObservationLayout:
         return observation[..., self.slice(name)].reshape(*observation.shape[:-1], *found)
 
     def split(self, observation: jax.Array) -> dict[str, jax.Array]:
-        """Returns the blocks (..., width) of observations (..., size) by name; InputError for
-        another size.
+        """Returns the blocks (..., width) of observations (..., size) by name.
+
+        InputError for another size.
         """
-        if jnp.shape(observation)[-1:] != (self.size,):
-            fail(
-                "obs",
-                f"of shape {jnp.shape(observation)}",
-                f"of {self.size} numbers for each agent",
-            )
+        shape = jnp.shape(observation)
+        if shape[-1:] != (self.size,):
+            fail("obs", f"of shape {shape}", f"of {self.size} numbers for each agent")
         return {name: observation[..., self.slice(name)] for name in self.names}
 
     def __str__(self) -> str:
-        return (
-            " | ".join(f"{block.name} {block.width}" for block in self.blocks) + f" = {self.size}"
-        )
+        blocks = " | ".join(f"{block.name} {block.width}" for block in self.blocks)
+        return f"{blocks} = {self.size}"
 
 
 BASE_INFO = "position, m, and roll, pitch, yaw, rad; environment frame"
@@ -135,27 +138,26 @@ def proprioception_layout(joints: int) -> ObservationLayout:
 
 def team_blocks(agents: int) -> tuple[Block, ...]:
     """Returns the first blocks of cooperating robots; `observe_team` fills them."""
-    mates = (
-        (entities("teammate", "robot", agents - 1, 6, f"of each, {BASE_INFO}"),)
-        if agents > 1
-        else ()
-    )
-    return one_hot(agents), Block("base", 6, BASE_INFO), *mates
+    blocks = [one_hot(agents), Block("base", 6, BASE_INFO)]
+    if agents > 1:
+        blocks.append(entities("teammate", "robot", agents - 1, 6, f"of each, {BASE_INFO}"))
+    return tuple(blocks)
 
 
 def observe_team(info: jax.Array) -> dict[str, jax.Array]:
     """Returns the blocks of `team_blocks` from the base information (A, 6) of its robots."""
-    mates = {"teammate": others(info)} if len(info) > 1 else {}
-    return {"one_hot": jnp.eye(len(info)), "base": info, **mates}
+    blocks = {"one_hot": jnp.eye(len(info)), "base": info}
+    if len(info) > 1:
+        blocks["teammate"] = others(info)
+    return blocks
 
 
 def others(values: jax.Array) -> jax.Array:
     """Returns, for every agent, the other agents' rows in order: (A, D) -> (A, (A - 1) D)."""
-    count = values.shape[0]
-    rows = [
-        jnp.delete(values, agent, axis=0, assume_unique_indices=True).reshape(-1)
-        for agent in range(count)
-    ]
+    rows = []
+    for agent in range(len(values)):
+        row = jnp.delete(values, agent, axis=0, assume_unique_indices=True)
+        rows.append(row.reshape(-1))
     return jnp.stack(rows)
 
 

@@ -5,7 +5,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from mqe_jax import skills, walk_policy  # noqa: F401  (skills register themselves
+from mqe_jax import skills, walk_policy  # noqa: F401  (skills register themselves)
 from mqe_jax.core.limits import (
     Buffer,
     Coordinate,
@@ -25,7 +25,7 @@ from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, settings
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.physics import robots
 from mqe_jax.sensors.suite import Senses
-from mqe_jax.skills import agile  # noqa: F401  (skills register themselves
+from mqe_jax.skills import agile  # noqa: F401  (skills register themselves)
 from mqe_jax.skills.control import Commander
 
 
@@ -144,15 +144,11 @@ class TaskParams:
         return Commander(skill, commands, skill.default_commands(self.gait), self.command_ranges)
 
     def action_ranges(self) -> dict[str, tuple[float, float]]:
-        """Returns the lowest and the highest value of each command that the action sets, in the
-        command's unit.
-        """
+        """Returns the range of each command that the action sets, in the command's unit."""
         commander = self.commander
-        limits = np.round(np.asarray(commander.limits, float), 6)
-        return {
-            name: (float(low), float(high))
-            for name, (low, high) in zip(commander.commands, limits, strict=True)
-        }
+        limits = np.round(np.asarray(commander.limits, float), 6).tolist()
+        pairs = zip(commander.commands, limits, strict=True)
+        return {name: (low, high) for name, (low, high) in pairs}
 
     def actions(self, control: str) -> dict[str, Any]:
         """Returns what an agent's actions mean in a control mode, by names of parameters."""
@@ -162,15 +158,16 @@ class TaskParams:
             ranges = self.action_ranges()
             meaning |= {"skill": self.skill, "gait": gait, "commands": self.commands}
             meaning["command_ranges"] = {name: ranges[name] for name in self.commands}
-        return meaning | ({"position_scale": self.position_scale} if control == "position" else {})
+        if control == "position":
+            meaning["position_scale"] = self.position_scale
+        return meaning
 
     def commanded_text(self) -> str:
         """Returns the skill and these ranges, such as `walk: vx -1 to 1`."""
-        ranges = (
-            f"{name} {low:g} to {high:g}" for name, (low, high) in self.action_ranges().items()
-        )
-        names = " or ".join([self.skill] if isinstance(self.skill, str) else self.skill)
-        return f"{names}: {', '.join(ranges)}"
+        ranges = self.action_ranges().items()
+        texts = [f"{name} {low:g} to {high:g}" for name, (low, high) in ranges]
+        skill = self.skill if isinstance(self.skill, str) else " or ".join(self.skill)
+        return f"{skill}: {', '.join(texts)}"
 
 
 P = TypeVar("P", bound=TaskParams)
@@ -178,8 +175,9 @@ P = TypeVar("P", bound=TaskParams)
 
 
 def check_above(spawn_height: float, top: float, robot: str) -> None:
-    """Raises an InputError unless a standing robot's spawn height clears the supporting surface at
-    `top`, m.
+    """Raises an InputError unless the spawn height of a standing robot is above a surface.
+
+    `top` is the height of that surface, m.
     """
     least = top + robots.get(robot).stand_height
     if spawn_height < least:
@@ -191,8 +189,9 @@ def check_above(spawn_height: float, top: float, robot: str) -> None:
 
 
 def check_teams(num_agents: int, most: int, room: str) -> None:
-    """Raises an InputError unless `num_agents` are two equal teams of at most `most` robots, for
-    which `room` is.
+    """Raises an InputError unless `num_agents` are two equal teams of at most `most` robots.
+
+    `room` says what limits them.
     """
     most = min(2 * most, int(bounds(Robots)[1]))
     if num_agents % 2 or num_agents > most:
@@ -200,8 +199,9 @@ def check_teams(num_agents: int, most: int, room: str) -> None:
 
 
 def check_gap(name: str, width: float, track_width: float) -> None:
-    """Raises an InputError unless the parameter `name`, the width of a gap in a wall, m, fits into
-    the track.
+    """Raises an InputError unless a gap in a wall fits into the track.
+
+    `name` is the parameter that is the gap's width, m.
     """
     if width >= track_width:
         fail(name, width, f"less than the width of the track, {track_width}")

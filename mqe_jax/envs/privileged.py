@@ -1,5 +1,6 @@
-"""The privileged observation: the simulator's state and randomised physics, for critics and
-distillation.
+"""The privileged observation: the simulator's state and randomised physics.
+
+Critics and distillation read it.
 """
 
 import dataclasses
@@ -29,8 +30,7 @@ def _robot_blocks(robot: Robot, number: int) -> list[Block]:
 
 
 class PrivilegedObservation:
-    """State of the R robots and all other moving bodies, anchors, physics parameters, gait phases,
-    contact forces.
+    """State of the robots and all other moving bodies, physics parameters, gaits and forces.
 
     Entries of robots that take no part are 0. Physics parameters are included even if not
     randomised. `clock_size` is the length of the clock of a robot's skill; `contact_forces` adds
@@ -50,14 +50,16 @@ class PrivilegedObservation:
         count = index.num_robots
         self._default_joints = robot.default_joints
         self._foot_force = index.foot_force if contact_forces else None
-        self._qpos = np.setdiff1d(
-            np.arange(model.nq), np.concatenate([index.base_qpos, index.joint_qpos], axis=1)
-        )
-        self._qvel = np.setdiff1d(
-            np.arange(model.nv), np.concatenate([index.base_qvel, index.joint_qvel], axis=1)
-        )
-        blocks = (
-            *(block for number in range(count) for block in _robot_blocks(robot, number)),
+        own_qpos = np.concatenate([index.base_qpos, index.joint_qpos], axis=1)
+        own_qvel = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)
+        self._qpos = np.setdiff1d(np.arange(model.nq), own_qpos)
+        self._qvel = np.setdiff1d(np.arange(model.nv), own_qvel)
+        clock = "of each robot's skill; walk policy: sine and cosine"
+        forces = "on each robot's trunk and feet, N"
+        blocks: list[Block] = []
+        for number in range(count):
+            blocks += _robot_blocks(robot, number)
+        blocks += [
             Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
             Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
             Block("anchors", 2 * num_anchors, "x, y of each, m"),
@@ -66,22 +68,15 @@ class PrivilegedObservation:
             Block("center_of_mass", 3 * count, "shift of each trunk's centre of mass, m"),
             Block("motor_strength", count, "factor on each robot's torques"),
             Block("action_lag", 1, "environment steps"),
-            Block(
-                "gait_phase",
-                clock_size * count,
-                "of each robot's skill; walk policy: sine and cosine",
-            ),
-            Block(
-                "contact_force",
-                5 * count if contact_forces else 0,
-                "on each robot's trunk and feet, N",
-            ),
-        )
+            Block("gait_phase", clock_size * count, clock),
+            Block("contact_force", 5 * count if contact_forces else 0, forces),
+        ]
         self.layout = ObservationLayout(tuple(block for block in blocks if block.width))
 
     def observe(self, robot_state: RobotState, state: State[Any], clock: jax.Array) -> jax.Array:
-        """Returns the observation of one environment (P,); `clock` is that of the skills (R,
-        clock_size).
+        """Returns the observation of one environment (P,).
+
+        `clock` is that of the skills (R, clock_size).
         """
         data = state.data
         randomized = state.randomized

@@ -60,8 +60,9 @@ class Randomization:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RandomizedParams:
-    """Randomised physics parameters of one environment (R robots); the model's values if not
-    randomised.
+    """Randomised physics parameters of one environment (R robots).
+
+    They are the model's values if not randomised.
     """
 
     friction: jax.Array
@@ -110,6 +111,8 @@ class Randomizer:
         random = self.random
         robots = self.index.num_robots
         keys = jax.random.split(key, 5)
+        joint_key = jax.random.fold_in(key, 5)
+        offset_key = jax.random.fold_in(key, 6)
 
         def uniform(
             key: jax.Array, span: Range | None, shape: tuple[int, ...], default: float
@@ -118,18 +121,16 @@ class Randomizer:
                 return jnp.full(shape, default, jnp.float32)
             return jax.random.uniform(key, shape, minval=span[0], maxval=span[1])
 
-        offset = (-random.motor_offset, random.motor_offset) if random.motor_offset else None
+        offset = None
+        if random.motor_offset:
+            offset = (-random.motor_offset, random.motor_offset)
         return RandomizedParams(
             friction=uniform(keys[0], random.friction, (robots,), self.friction),
             payload=uniform(keys[1], random.payload, (robots,), 0.0),
             center_of_mass=uniform(keys[2], random.center_of_mass, (robots, 3), 0.0),
             motor_strength=uniform(keys[3], random.motor_strength, (robots,), 1.0),
-            motor_offset=uniform(
-                jax.random.fold_in(key, 6), offset, self.index.joint_qpos.shape, 0.0
-            ),
-            joint_mechanics=uniform(
-                jax.random.fold_in(key, 5), random.joint_mechanics, (robots,), 1.0
-            ),
+            motor_offset=uniform(offset_key, offset, self.index.joint_qpos.shape, 0.0),
+            joint_mechanics=uniform(joint_key, random.joint_mechanics, (robots,), 1.0),
             action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
         )
 
@@ -143,27 +144,23 @@ class Randomizer:
         def as_float(x):
             return jnp.asarray(x, jnp.float32)
 
+        trunk = index.trunk_body
         if random.friction is not None:
-            fields["geom_friction"] = (
-                as_float(model.geom_friction).at[index.geoms, 0].set(params.friction[:, None])
-            )
+            friction = as_float(model.geom_friction)
+            fields["geom_friction"] = friction.at[index.geoms, 0].set(params.friction[:, None])
         if random.payload is not None:
-            # The payload is distributed like the trunk's own mass: mass and inertia grow by the
-            # same factor.
-            trunk = index.trunk_body
+            # The payload is distributed like the trunk's own mass, so the inertia grows likewise.
+            mass = as_float(model.body_mass)
             factor = 1.0 + params.payload / as_float(model.body_mass[trunk])
-            fields["body_mass"] = as_float(model.body_mass).at[trunk].add(params.payload)
-            fields["body_inertia"] = (
-                as_float(model.body_inertia).at[trunk].multiply(factor[:, None])
-            )
+            fields["body_mass"] = mass.at[trunk].add(params.payload)
+            inertia = as_float(model.body_inertia)
+            fields["body_inertia"] = inertia.at[trunk].multiply(factor[:, None])
         if random.center_of_mass is not None:
-            fields["body_ipos"] = (
-                as_float(model.body_ipos).at[index.trunk_body].add(params.center_of_mass)
-            )
+            center = as_float(model.body_ipos)
+            fields["body_ipos"] = center.at[trunk].add(params.center_of_mass)
         if random.motor_strength is not None:
-            strength = (
-                jnp.ones(model.nu).at[index.actuator].set(params.motor_strength[:, None])[:, None]
-            )
+            strength = jnp.ones(model.nu)
+            strength = strength.at[index.actuator].set(params.motor_strength[:, None])[:, None]
             fields["actuator_gainprm"] = as_float(model.actuator_gainprm) * strength
             fields["actuator_biasprm"] = as_float(model.actuator_biasprm) * strength
         if random.joint_mechanics is not None:
@@ -173,18 +170,15 @@ class Randomizer:
         return fields
 
     def push(self, data: "mjx.Data", key: jax.Array, dt: float) -> "mjx.Data":
-        """Changes each trunk's horizontal velocity at random, on average once per `push_period`;
-        `dt` in s.
-        """
+        """Changes each trunk's horizontal velocity at random, on average once per `push_period`."""
         random = self.random
         index = self.index
         if not random.push:
             return data
         when_key, size_key = jax.random.split(key)
-        now = jax.random.bernoulli(when_key, dt / random.push_period, (index.num_robots, 1))
-        change = jax.random.uniform(
-            size_key, (index.num_robots, 2), minval=-random.push, maxval=random.push
-        )
-        return data.replace(
-            qvel=data.qvel.at[index.base_qvel[:, :2]].add(jnp.where(now, change, 0.0))
-        )
+        robots = index.num_robots
+        now = jax.random.bernoulli(when_key, dt / random.push_period, (robots, 1))
+        most = random.push
+        change = jax.random.uniform(size_key, (robots, 2), minval=-most, maxval=most)
+        across = index.base_qvel[:, :2]
+        return data.replace(qvel=data.qvel.at[across].add(jnp.where(now, change, 0.0)))

@@ -185,8 +185,9 @@ def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
 def register_task(
     task: type[QuadrupedEnv], scripted: ScriptedPolicy | None = None
 ) -> type[QuadrupedEnv]:
-    """Registers a task class under its `name` for `make` and the command line, with its scripted
-    policy if it has one.
+    """Registers a task class under its `name` for `make` and the command line.
+
+    `scripted` is its scripted policy, if it has one.
 
     Also a class decorator. InputError if it is no class of tasks, has no name, or another class has
     that name.

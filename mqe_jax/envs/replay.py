@@ -19,8 +19,17 @@ from mqe_jax.envs.state import State
 from mqe_jax.physics.engines import STATE_FIELDS
 
 # Fields on which a step depends; the others are recomputed by it.
-_FIELDS = tuple(
-    "step anchors control actuators randomized task assistance frozen_steps key active".split()
+_FIELDS = (
+    "step",
+    "anchors",
+    "control",
+    "actuators",
+    "randomized",
+    "task",
+    "assistance",
+    "frozen_steps",
+    "key",
+    "active",
 )
 
 
@@ -32,8 +41,8 @@ class Recording:
     params: dict[str, Any]  # the task's parameters as nested mappings
     impl: str  # physics engine
     control: str  # action mode
-    # the fields of `State` on which a step depends, before each action, by path (T, ...)
     states: dict[str, np.ndarray]
+    """The fields of `State` on which a step depends, before each action, by path (T, ...)."""
     actions: np.ndarray  # actions (T, A, D)
 
     def __post_init__(self) -> None:  # of a file
@@ -59,8 +68,9 @@ class Recording:
 def save_recording(
     file: str | pathlib.Path, env: QuadrupedEnv, states: State, actions: jax.Array
 ) -> None:
-    """Writes the last episode of states of one environment (T, ...), each before an action (T, A,
-    D), as .npz.
+    """Writes the last episode of one environment as .npz.
+
+    `states` (T, ...) are each before an action (T, A, D).
     """
     steps = np.asarray(states.step)  # an episode need not start at 0: see `Demonstrated`
     first = int(np.flatnonzero(np.diff(steps, prepend=steps[0]) != 1)[-1])
@@ -70,10 +80,11 @@ def save_recording(
         "impl": env.impl,
         "control": env.control,
     }
-    arrays: dict[str, Any] = {
-        f"states/{name}": np.asarray(leaf)[first:] for name, leaf in _flat(states).items()
-    }
-    arrays |= {"about": np.array(json.dumps(about)), "actions": np.asarray(actions)[first:]}
+    arrays: dict[str, Any] = {}
+    for name, leaf in _flat(states).items():
+        arrays[f"states/{name}"] = np.asarray(leaf)[first:]
+    arrays["about"] = np.array(json.dumps(about))
+    arrays["actions"] = np.asarray(actions)[first:]
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(pathlib.Path(file), buffer.getvalue())
@@ -87,11 +98,10 @@ def load_recording(file: str | pathlib.Path) -> Recording:
         np.load(path, allow_pickle=False) as arrays,
     ):
         about = parse_json(str(arrays["about"]), "about")
-        states = {
-            name.removeprefix("states/"): arrays[name]
-            for name in arrays
-            if name.startswith("states/")
-        }
+        states = {}
+        for name in arrays:
+            if name.startswith("states/"):
+                states[name.removeprefix("states/")] = arrays[name]
         try:
             return Recording(**about, states=states, actions=arrays["actions"])
         except InputError as error:
@@ -99,16 +109,17 @@ def load_recording(file: str | pathlib.Path) -> Recording:
 
 
 def replay(recording: Recording, env: QuadrupedEnv | None = None) -> State:
-    """Replays a recording, by default on the recorded engine; returns the states after each action
-    (T, ...).
+    """Replays a recording, by default on the recorded engine.
+
+    Returns the states after each action (T, ...).
     """
     env = recording.make_env() if env is None else env
     if (recording.task, recording.control) != (env.name, env.control):
         given = f"recording of {recording.task} with control {recording.control!r}"
         raise InputError(f"env: {env.name} with control {env.control!r} does not fit a {given}")
     actions = (env.num_agents, env.action_size)
-    # the last may diverge
-    if recording.actions.shape[1:] != actions or not np.isfinite(recording.actions[:-1]).all():
+    finite = np.isfinite(recording.actions[:-1]).all()  # the last one may have diverged
+    if recording.actions.shape[1:] != actions or not finite:
         raise InputError(
             f"recording of {recording.task}: its actions are not finite, or not {actions}"
         )

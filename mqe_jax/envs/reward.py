@@ -23,33 +23,24 @@ def weigh(
     names = [field.name for field in dataclasses.fields(weights)]
     agents = sum(map(len, teams))
     check_names("rewards", terms, names)
-    shapes = ((), (agents,))
-    given = {
-        name: check_shape(f"rewards: {name}", terms[name], *shapes).astype(jnp.float32)
-        for name in names
-    }
-    weighted = {name: getattr(weights, name) * term for name, term in given.items()}
-    total = sum(
-        (jnp.broadcast_to(value, (agents,)) for value in weighted.values()), jnp.zeros(agents)
-    )
-    values = {
-        **{f"reward/{name}": value for name, value in weighted.items()},
-        "average_step_reward": total,
-    }
-    logged = {
-        f"team{team}/{name}" if team else name: _first(value, agents, active)
-        if value.ndim
-        else value
-        for team, agents in enumerate(teams)
-        for name, value in values.items()
-    }
+    values = {}
+    total = jnp.zeros(agents)
+    for name in names:
+        term = check_shape(f"rewards: {name}", terms[name], (), (agents,))
+        value = getattr(weights, name) * term.astype(jnp.float32)
+        total = total + jnp.broadcast_to(value, (agents,))
+        values[f"reward/{name}"] = value
+    values["average_step_reward"] = total
+    logged = {}
+    for number, team in enumerate(teams):
+        prefix = f"team{number}/" if number else ""
+        for name, value in values.items():
+            logged[f"{prefix}{name}"] = _first(value, team, active) if value.ndim else value
     return jnp.where(active, total, 0.0), logged
 
 
 def _first(value: jax.Array, agents: Sequence[int], active: jax.Array) -> jax.Array:
-    """Returns the value () of the first active one of some agents; without any, that of the
-    last.
-    """
+    """Returns the value () of the first active one of some agents, or of the last one."""
     *others, chosen = agents
     result = value[chosen]
     for agent in reversed(others):
@@ -62,18 +53,17 @@ def fade(
 ) -> dict[str, jax.Array]:
     """Returns the terms, those of weight 0 in `weights` times a factor ()."""
 
-    def as_float(term):
-        return jnp.asarray(term, jnp.float32)
-
-    return {
-        name: term if getattr(weights, name) else factor * as_float(term)
-        for name, term in terms.items()
-    }
+    faded = dict(terms)
+    for name, term in terms.items():
+        if not getattr(weights, name):
+            faded[name] = factor * jnp.asarray(term, jnp.float32)
+    return faded
 
 
 def crowding(position: jax.Array, active: jax.Array) -> jax.Array:
-    """Sum of 1 / d^2 over all ordered pairs of active robots (A,) at a distance d below 0.5 m: (A,
-    D) -> ().
+    """Returns the sum of 1 / d^2 over all ordered pairs of robots at a distance d below 0.5 m.
+
+    Positions are (A, D), m. Only `active` robots (A,) count.
 
     Example:
         ```python

@@ -33,12 +33,12 @@ class Sensing:
 
     @property
     def action_size(self) -> int:
-        """Length of an agent's action: what moves the robot, then what sensors add, such as
-        messages.
+        """Length of an agent's action.
+
+        It moves the robot, then serves sensors, such as messages.
         """
-        return self.controller.action_size + sum(
-            sensor.action_size for sensor in self.params.senses
-        )
+        added = sum(sensor.action_size for sensor in self.params.senses)
+        return self.controller.action_size + added
 
     def moving(self, action: jax.Array) -> jax.Array:
         """Returns the part of actions (..., action_size) that moves the robots."""
@@ -55,9 +55,7 @@ class Sensing:
 
     @property
     def entities(self) -> tuple[Entity, ...]:
-        """What sensors tell apart besides robots and walls: by default the scene's objects and
-        gaps.
-        """
+        """What sensors tell apart besides robots and walls, by default objects and gaps."""
         return entities_of(self.compiled)
 
     @property
@@ -66,9 +64,7 @@ class Sensing:
         return False
 
     def own_frame(self, info: jax.Array) -> jax.Array:
-        """Maps the agents' base information (A, 6) to each agent's own (possibly mirrored)
-        frame.
-        """
+        """Maps the agents' base information (A, 6) to each agent's own, possibly mirrored, frame."""
         return info
 
     @functools.cached_property
@@ -82,14 +78,13 @@ class Sensing:
     def snapshot(self, state: State[Any], robot_state: RobotState) -> Snapshot:
         """Returns what there is to sense in a state."""
         pose = self.own_frame(robot_state.base_info[: self.num_agents])[:, [0, 1, 5]]
-        action = (
-            state.senses.action if state.senses else jnp.zeros((self.num_agents, self.action_size))
-        )
+        action = jnp.zeros((self.num_agents, self.action_size))
+        if state.senses:
+            action = state.senses.action
         return self.suite.scene.snapshot(state.data, robot_state, state.anchors, pose, action)
 
     def marks(self, state: State[Any]) -> tuple[Marks, ...]:
         """Returns what shows the readings in a state that has the group `onboard`."""
         readings = self.layouts[ONBOARD].split(state.groups[ONBOARD])
-        return self.suite.draw(
-            self.snapshot(state, self.read(state.data, state.active)), state.senses, readings
-        )
+        snapshot = self.snapshot(state, self.read(state.data, state.active))
+        return self.suite.draw(snapshot, state.senses, readings)

@@ -1,5 +1,6 @@
-"""Episodes with fewer robots than the scene has: which take part, where the others are parked, what
-all observe.
+"""Episodes with fewer robots than the scene has.
+
+This module says which take part, where the others are parked, and what all observe.
 
 A parked robot is high above the scene, where it touches nothing. Every step begins with it at rest
 there and with neutral targets, so that nothing in the step depends on its earlier state or its
@@ -35,10 +36,9 @@ HIGH = 100.0
 OUTSIDE = 2.0
 """Distance of parked objects from the end of the track, m."""
 
-# m, of the first parked robot, and of each further one above it
-_HEIGHT = 2 * HIGH
-_ABOVE = 1.0
-_RAISED = 20.0  # m, of the body of the first parked object
+_HEIGHT = 2 * HIGH  # of the first parked robot, m
+_ABOVE = 1.0  # of each further one above it, m
+_RAISED = 20.0  # of the body of the first parked object, m
 _PLACE = Block(
     "place",
     1,
@@ -50,8 +50,9 @@ _NO_MATES = entities("teammate", "robot", 1, 6 + _NEAR, "none in a team of one",
 
 
 def draw(key: jax.Array, fewest: int, most: int, level: jax.Array | float = 0.0) -> jax.Array:
-    """Returns a number () int32 from `fewest` to `most`, uniformly; at a curriculum level () of 1
-    the fewest.
+    """Returns a number () int32 from `fewest` to `most`, uniformly.
+
+    At a curriculum level () of 1 it is the fewest.
     """
     beyond = jnp.round(level * (most - fewest)).astype(jnp.int32)
     return jax.random.randint(key, (), fewest, most + 1 - beyond)
@@ -105,15 +106,14 @@ class Sizes:
         qvel = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)[: env.num_agents]
         agents = np.arange(env.num_agents)[:, None]
         middle = env.compiled.scene.track.start + env.compiled.scene.track.length / 2
+        # The agent of each coordinate; -1: no agent's.
         self._of_qpos = np.full(env.compiled.model.nq, -1)
         self._of_qvel = np.full(env.compiled.model.nv, -1)
-        # the agent of each coordinate, -1 of others
         self._of_qpos[qpos] = agents
         self._of_qvel[qvel] = agents
         self._parked = np.zeros(env.compiled.model.nq, np.float32)
-        upright = np.tile(
-            [middle, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *env.robot.default_joints], (env.num_agents, 1)
-        )
+        pose = [middle, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *env.robot.default_joints]
+        upright = np.tile(pose, (env.num_agents, 1))
         upright[:, 2] = _HEIGHT + _ABOVE * agents[:, 0]
         self._parked[qpos] = upright
 
@@ -125,8 +125,9 @@ class Sizes:
         return jnp.asarray(self._active)[size - self._fewest]
 
     def line_up(self, pose: jax.Array, active: jax.Array) -> jax.Array:
-        """Moves spawn poses x, y, z, yaw of all robots (R, 4) to those of a team of the active ones
-        (A,).
+        """Moves spawn poses x, y, z, yaw of all robots (R, 4) to those of teams of active ones.
+
+        `active` (A,) says which agents take part.
         """
         if not self._vary:
             return pose
@@ -164,21 +165,21 @@ class Herd:
 
     def __init__(self, compiled: CompiledScene, names: Sequence[str]) -> None:
         end = compiled.scene.track.start + compiled.scene.track.length
-        number = np.arange(len(names))
         objects = [compiled.objects[name] for name in names]
         self._outside = end + OUTSIDE
         self._rest = np.asarray(compiled.model.body_pos, np.float32)
         self._bodies = np.array([each.body for each in objects])
         self._x = np.array([each.qpos[0] for each in objects])
-        self._raised = np.stack(
-            [0 * number - 2 * OUTSIDE, 0 * number, number + _RAISED], axis=1
-        ).astype(np.float32)
+        self._raised = np.zeros((len(names), 3), np.float32)
+        self._raised[:, 0] = -2 * OUTSIDE
+        self._raised[:, 2] = np.arange(len(names)) + _RAISED
 
     def start(
         self, key: jax.Array, grids: Sequence[tuple[np.ndarray, float]], level: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Draws a number of objects; returns their positions (S, 2), m, and the half-width of their
-        noise (S, 1), m.
+        """Draws a number of objects; returns their positions and the half-width of their noise.
+
+        Both are in m, (S, 2) and (S, 1).
 
         `grids` holds both for each number; `level` is as in `draw`.
         """
@@ -218,21 +219,25 @@ def robots_there(
 
     `mates` and `opponents` say which agents take part as such (A,) bool. Empty blocks are left out.
     """
-    own = np.array(
-        [[other for other in team if other != agent] for team in teams for agent in team], int
-    )
-    others = [
-        [other for rival in teams if rival is not team for other in rival]
-        for team in teams
-        for _ in team
-    ]
-    found = {"teammate": (mates, own), "opponents": (opponents, np.array(others, int))}
-    return {name: there[agents] for name, (there, agents) in found.items() if agents.size}
+    own = []
+    others = []
+    for team in teams:
+        rivals = [agent for rival in teams if rival is not team for agent in rival]
+        for agent in team:
+            own.append([other for other in team if other != agent])
+            others.append(rivals)
+    found = {}
+    if np.size(own):
+        found["teammate"] = mates[np.array(own)]
+    if np.size(others):
+        found["opponents"] = opponents[np.array(others)]
+    return found
 
 
 def hide(layout: ObservationLayout, obs: jax.Array, there: Mapping[str, jax.Array]) -> jax.Array:
-    """Returns observations (A, O) in which the entries of entities that are not there (A, count)
-    are 0.
+    """Returns observations (A, O) in which the entries of absent entities are 0.
+
+    `there` says by block which entities are there (A, count).
     """
     parts = []
     for block in layout.blocks:
@@ -253,11 +258,11 @@ def entity_layout(layout: ObservationLayout) -> ObservationLayout:
     """
     blocks = [_PLACE]
     for block in layout.blocks:
-        if (of := block.entities) is not None:
+        of = block.entities
+        if of is not None:
             meaning = f"{block.meaning}; x, y from the agent, m"
-            blocks.append(
-                entities(block.name, of.kind, of.count, of.width + _NEAR, meaning, masked=True)
-            )
+            width = of.width + _NEAR
+            blocks.append(entities(block.name, of.kind, of.count, width, meaning, masked=True))
         elif not block.categorical:
             blocks.append(block)
         if block.name == "base" and "teammate" not in layout.names:
@@ -284,14 +289,15 @@ def observe_entities(
     own = jnp.where(active & (last > 0), 2.0 * place / jnp.maximum(last, 1) - 1.0, 0.0)
     found = {_PLACE.name: own[:, None]}
     for block in layout.blocks:
-        if (of := block.entities) is not None:
+        of = block.entities
+        if of is not None:
             rows = blocks[block.name].reshape(agents, of.count, -1)
             shown = there.get(block.name, jnp.ones(rows.shape[:2], bool))
-            shown = shown & (rows[..., -1] > 0.5) if of.masked else shown
+            if of.masked:
+                shown = shown & (rows[..., -1] > 0.5)
             near = rows[..., :_NEAR] - blocks["base"][:, None, :_NEAR]
-            found[block.name] = by_entity(
-                jnp.concatenate([rows[..., : of.width], near], axis=-1), shown
-            )
+            entries = jnp.concatenate([rows[..., : of.width], near], axis=-1)
+            found[block.name] = by_entity(entries, shown)
         elif not block.categorical:
             found[block.name] = blocks[block.name]
     if "teammate" not in layout.names:

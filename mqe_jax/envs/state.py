@@ -25,8 +25,9 @@ end by the task's own rules, which decides a match."""
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentState:
-    """Fields of every environment's state (`mqe_jax.core.types.VectorEnv`); a batch has leading
-    axes.
+    """Fields of every environment's state (`mqe_jax.core.types.VectorEnv`).
+
+    A batch has leading axes.
     """
 
     groups: dict[str, jax.Array]

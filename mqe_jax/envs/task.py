@@ -1,5 +1,6 @@
-"""Interface of a task, in this order: parameters, scene, initial state, observation, reward terms,
-ending.
+"""Interface of a task, in reading order.
+
+The order is parameters, scene, initial state, observation, reward terms, ending.
 """
 
 from __future__ import annotations
@@ -102,41 +103,39 @@ class Task(Sensing, Generic[S, P]):
         return 0
 
     def spawn_poses(self) -> Sequence[tuple[float, float, float]]:
-        """Returns each robot's nominal spawn pose x, y, yaw, m and rad; by default those of the
-        track's blocks.
+        """Returns each robot's nominal spawn pose x, y, yaw, m and rad.
+
+        By default they are those of the track's blocks.
         """
         return self.compiled.layout.spawn
 
     def spawn(self, key: jax.Array) -> jax.Array:
         """Samples spawn poses x, y, z, yaw of all robots (R, 4), m and rad."""
         params = self.params
-        pose = np.array(
-            [(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()], np.float32
-        )
-        noise = jax.random.uniform(
-            key, (len(pose), 2), minval=-params.spawn_noise, maxval=params.spawn_noise
-        )
-        return jnp.asarray(pose).at[:, :2].add(noise)
+        poses = [(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()]
+        most = params.spawn_noise
+        noise = jax.random.uniform(key, (len(poses), 2), minval=-most, maxval=most)
+        return jnp.asarray(np.array(poses, np.float32)).at[:, :2].add(noise)
 
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,), at a
-        curriculum level ().
+        """Samples the initial state of movable objects into qpos (nq,) and qvel (nv,).
+
+        `assistance` () is a curriculum level.
         """
         return qpos, qvel
 
     def reset_task(self, key: jax.Array, state: State[Any], robot_state: RobotState) -> S:
-        """Returns the task's own state fields, not yet in `state`, at the start of an episode; by
-        default None.
+        """Returns the task's own state fields at the start of an episode, by default None.
+
+        They are not yet in `state`.
         """
         none: Any = None
         return none
 
     def npc_commands(self, state: State[S], robot_state: RobotState) -> jax.Array | None:
-        """Returns commands (R - A, C) of `npc_skill` for the NPC robots, or None if there are
-        none.
-        """
+        """Returns commands (R - A, C) of `npc_skill` for the NPC robots; None without such robots."""
         return None
 
     def acting(self, state: State[S]) -> jax.Array:
@@ -144,9 +143,7 @@ class Task(Sensing, Generic[S, P]):
         return state.active
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:
-        """Maps actions (A, action_size) from each agent's own (possibly mirrored) frame to the
-        robots' frame.
-        """
+        """Maps actions (A, action_size) from each agent's own frame to the robots' frame."""
         return action
 
     def step_npcs(self, data: mjx.Data, robot_state: RobotState, key: jax.Array) -> mjx.Data:
@@ -169,8 +166,9 @@ class Task(Sensing, Generic[S, P]):
         return self.params.fewest_agents is not None
 
     def there(self, state: State[S]) -> dict[str, jax.Array]:
-        """Returns which entities of a block take part (A, count) bool, by the block's name; of
-        other blocks all do.
+        """Returns which entities of a block take part (A, count) bool, by the block's name.
+
+        Of other blocks all do.
         """
         return robots_there(self.teams, self.observed(state), state.active)
 
@@ -198,8 +196,9 @@ class Task(Sensing, Generic[S, P]):
 
     @property
     def sized_layout(self) -> ObservationLayout:
-        """Blocks of the group `entities`, which differ between sizes only in the number of
-        entities.
+        """Blocks of the group `entities`.
+
+        They differ between sizes only in the number of entities.
         """
         return self.observation_layout
 
@@ -229,16 +228,17 @@ class Task(Sensing, Generic[S, P]):
         return {name: layout.size for name, layout in self.layouts.items()}
 
     def describe(self, group: str) -> dict[str, Any]:
-        """Returns what policies that see a group of observations need of the task, beside its name
-        and sizes.
-        """
+        """Returns what policies that see a group need of the task, beside its name and sizes."""
         layout = self.layouts[group]
         blocks = tuple(dataclasses.replace(block, meaning="") for block in layout.blocks)
-        senses = (
-            tuple(to_mapping(sensor) for sensor in self.params.senses) if group == ONBOARD else ()
-        )
-        described = {"version": self.version, **self.params.actions(self.control), "senses": senses}
-        return {**described, "layout": str(layout), "blocks": blocks}
+        sensors = self.params.senses if group == ONBOARD else ()
+        return {
+            "version": self.version,
+            **self.params.actions(self.control),
+            "senses": tuple(to_mapping(sensor) for sensor in sensors),
+            "layout": str(layout),
+            "blocks": blocks,
+        }
 
     def observe_group(
         self, name: str, state: State[S], robot_state: RobotState
@@ -267,22 +267,24 @@ class Task(Sensing, Generic[S, P]):
     def rewards(
         self, before: Moment[S], after: Moment[S], collision: jax.Array
     ) -> dict[str, jax.Array]:
-        """Returns the unweighted reward terms of a step, () or (A,); `collision` (): an agent's
-        trunk is touched.
+        """Returns the unweighted reward terms of a step, () or (A,).
+
+        `collision` () says whether an agent's trunk is touched.
         """
         raise NotImplementedError(f"{type(self).__name__}: rewards() is not defined")
 
     def score(
         self, before: Moment[S], after: Moment[S], collision: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Returns the reward (A,) of a step and what is logged of it, as `weigh`; arguments as of
-        `rewards`.
+        """Returns the reward (A,) of a step and what is logged of it, as `weigh`.
+
+        The arguments are those of `rewards`.
         """
         terms = self.rewards(before, after, collision)
-        if (floor := self.params.shaping_floor) < 1.0:
-            terms = fade(
-                terms, weights_of(self.Params()), floor + (1.0 - floor) * after.state.assistance
-            )
+        floor = self.params.shaping_floor
+        if floor < 1.0:
+            factor = floor + (1.0 - floor) * after.state.assistance
+            terms = fade(terms, weights_of(self.Params()), factor)
         return weigh(terms, self.weights, self.teams, after.state.active)
 
     def ending(self, state: State[S], robot_state: RobotState) -> jax.Array:
@@ -304,9 +306,7 @@ class Task(Sensing, Generic[S, P]):
         return {"success": jnp.zeros(())}
 
     def fields(self, state: State[S]) -> dict[str, jax.Array]:
-        """Returns further model fields that differ between environments, by their `mjModel`
-        names.
-        """
+        """Returns further model fields that differ between environments, by `mjModel` names."""
         return {}
 
     def external_forces(self, state: State[S]) -> jax.Array | None:

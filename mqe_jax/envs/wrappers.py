@@ -54,14 +54,14 @@ class Wrapper(Outer):
     def reset(self, key: jax.Array) -> WrappedState:
         """Returns the initial states of all environments."""
         inner = self.inner.reset(key)
-        return self._state(
-            inner, jnp.zeros((self.num_envs, self.num_agents, self.action_size)), inner.step
-        )
+        action = jnp.zeros((self.num_envs, self.num_agents, self.action_size))
+        return self._state(inner, action, inner.step)
 
     @single
     def step(self, state: WrappedState, action: jax.Array) -> WrappedState:
-        """Advances all environments by one step with actions (N, A, action_size); errors as of
-        `VectorEnv`.
+        """Advances all environments by one step with actions (N, A, action_size).
+
+        Errors are those of `VectorEnv`.
         """
         self.check_step(state, action, WrappedState)
         action = self.pass_on(action)
@@ -73,21 +73,23 @@ class Wrapper(Outer):
         return action
 
     def view(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
-        """Returns the fields that differ from the wrapped states'; `reached` (N,) are the steps
-        before any reset.
+        """Returns the fields that differ from the wrapped states'.
+
+        `reached` (N,) are the steps before any reset.
         """
         return {}
 
     def _state(self, inner: Any, action: jax.Array, reached: jax.Array) -> WrappedState:
-        fields = {
-            field.name: getattr(inner, field.name) for field in dataclasses.fields(EnvironmentState)
-        }
-        return WrappedState(**{**fields, **self.view(inner, reached)}, inner=inner, action=action)
+        names = [field.name for field in dataclasses.fields(EnvironmentState)]
+        fields = {name: getattr(inner, name) for name in names}
+        fields |= self.view(inner, reached)
+        return WrappedState(**fields, inner=inner, action=action)
 
 
 class Deadline(Wrapper):
-    """The time limit terminates episodes; the privileged observation has one more number, the share
-    of time left.
+    """The time limit terminates episodes.
+
+    The privileged observation has one more number, the share of time left.
 
     Time-outs are terminal, without bootstrapping (Pardo et al., arXiv 1712.00378).
     """
@@ -98,15 +100,15 @@ class Deadline(Wrapper):
 
     def view(self, inner: Any, reached: jax.Array) -> dict[str, Any]:
         def add_time(privileged: jax.Array, step: jax.Array) -> jax.Array:
-            return jnp.concatenate(
-                [privileged, 1.0 - step[:, None] / self.max_episode_steps], axis=1
-            )
+            left = 1.0 - step[:, None] / self.max_episode_steps
+            return jnp.concatenate([privileged, left], axis=1)
 
+        final = inner.final_privileged_obs
+        if final is not None:
+            final = add_time(final, reached)
         return {
             "privileged_obs": add_time(inner.privileged_obs, inner.step),
-            "final_privileged_obs": jax.tree.map(
-                lambda x: add_time(x, reached), inner.final_privileged_obs
-            ),
+            "final_privileged_obs": final,
             "terminated": inner.terminated | inner.truncated,
             "truncated": jnp.zeros_like(inner.truncated),
         }
