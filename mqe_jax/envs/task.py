@@ -135,7 +135,7 @@ class Task(Sensing, Generic[S, P]):
         return none
 
     def npc_commands(self, state: State[S], robot_state: RobotState) -> jax.Array | None:
-        """Returns commands (R - A, C) of `npc_skill` for the NPC robots; None without such robots."""
+        """Returns commands (R - A, C) of `npc_skill` for the NPC robots, or None without any."""
         return None
 
     def acting(self, state: State[S]) -> jax.Array:

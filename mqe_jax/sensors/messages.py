@@ -53,7 +53,7 @@ class Messages(Sensor):
         return (entities("messages", "robot", mates.shape[1], self.numbers, meaning, masked=True),)
 
     def init_memory(self, scene: SensedScene) -> Any:
-        """Returns whether messages were sent in a step, and which of them are received (A, count)."""
+        """Returns whether messages were sent in a step, and which are received (A, count)."""
         return jnp.zeros((), bool), jnp.zeros(scene.mates[0].shape, bool)
 
     def observe(

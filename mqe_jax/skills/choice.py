@@ -143,7 +143,7 @@ class Choice(Skill):
         return Choice(self.robot, [of(part) for part in self.parts])
 
     def clock(self, memory: dict[str, Any]) -> jax.Array:
-        """Returns the clock of the first skill, which all share, and the index of the acting skill."""
+        """Returns the clock of the first skill, which all share, and the acting skill's index."""
         first = self.parts[0]
         return jnp.append(first.clock(memory[first.name]), memory["acting"])
 
