@@ -248,15 +248,44 @@ def test_team_0_plays_the_same_match_and_sees_its_own_half() -> None:
         half = step(half, action)
         np.testing.assert_allclose(half.data.qpos, whole.data.qpos, atol=1e-5)
         np.testing.assert_allclose(half.obs, whole.obs[:1], atol=1e-5)
-        np.testing.assert_allclose(half.rival_obs, whole.obs[1:], atol=1e-5)
+        np.testing.assert_allclose(half.rival_groups["policy"], whole.obs, atol=1e-5)
         np.testing.assert_allclose(half.reward, whole.reward[:1], atol=1e-6)
     assert bool(half.truncated)
     assert set(half.metrics) == {name for name in whole.metrics if not name.startswith("team1/")}
     assert half.outcome.win.shape == (1,)
     restarted: Any = jax.jit(lambda state: autoreset(team, state))(half)  # type: ignore[arg-type]
-    assert int(restarted.step) == 0 and restarted.rival_obs.shape == half.rival_obs.shape
+    assert int(restarted.step) == 0
+    assert restarted.rival_groups["policy"].shape == half.rival_groups["policy"].shape
     assert np.abs(restarted.obs - half.obs).max() > 1e-4
     np.testing.assert_array_equal(restarted.final_obs, half.obs)
+
+
+def test_an_opponent_may_see_another_group() -> None:
+    """It acts by the gravity in its own frame; the match gets that action."""
+
+    class Falling:
+        task = "go1wrestling"
+        agents = 1
+        groups = ("proprioception",)
+
+        def initial_memory(self, num_envs: int) -> Any:
+            return ()
+
+        def act(self, obs: Any, memory: Any, key: Any) -> Any:
+            gravity = obs.group("proprioception")[..., 2:3]
+            return jnp.broadcast_to(0.5 * gravity, (*gravity.shape[:2], 12)), memory
+
+    env = match()
+    team: Any = TeamEnv(env, Falling())
+    key = jax.random.PRNGKey(0)
+    state = jax.jit(team.reset)(key)
+    assert {*state.groups} == {"policy", "proprioception"}
+    rival = 0.5 * state.rival_groups["proprioception"][1, 2]
+    own = jnp.zeros((1, 12))
+    whole = jnp.concatenate([own, jnp.full((1, 12), rival)])
+    expected = jax.jit(env.step)(jax.jit(env.reset)(key), whole)
+    found = jax.jit(team.step)(state, own)
+    np.testing.assert_allclose(found.data.qpos, expected.data.qpos, atol=1e-5)
 
 
 def test_opponents_of_one_form_share_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,7 +305,7 @@ def test_opponents_of_one_form_share_a_program(monkeypatch: pytest.MonkeyPatch) 
         host: Any = HostEnvs(TeamEnv(match("go1tug"), opponent), 2)
         host.reset([0, 1], np.random.default_rng(0))
         host.step(np.zeros((2, 1, 12)))
-        ended.append(np.asarray(host.state.rival_obs))
+        ended.append(np.asarray(host.state.rival_groups["policy"]))
     assert len(traced) == 2
     assert np.any(ended[0] != ended[1])
     np.testing.assert_array_equal(ended[2], ended[3])

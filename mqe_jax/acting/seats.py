@@ -170,9 +170,13 @@ class Seat:
         first, step = self.block
         return slice(first, num_envs, step)
 
+    def count(self, num_envs: int) -> int:
+        """Returns the number of the block's environments among `num_envs`."""
+        return len(range(num_envs)[self.rows(num_envs)])
+
     def initial_memory(self, num_envs: int) -> Memory:
         """Returns the recurrent state of the block's environments at an episode's start."""
-        return self.policy.initial_memory(len(range(num_envs)[self.rows(num_envs)]))
+        return self.policy.initial_memory(self.count(num_envs))
 
     def act(
         self, seen: Observations, memory: Memory, key: jax.Array, action: jax.Array
@@ -182,7 +186,7 @@ class Seat:
         """
         rows = self.rows(len(action))
         own = jax.tree.map(lambda x: x[rows, _index(self.sees)], seen)
-        shape = (len(own.obs), len(self.sees), action.shape[-1])
+        shape = (self.count(len(action)), len(self.sees), action.shape[-1])
         chosen, memory = _check_act(self.policy.act(own, memory, key), shape, memory)
         chosen = chosen[:, _index(tuple(self.sees.index(agent) for agent in self.acts))]
         return action.at[rows, _index(self.acts)].set(chosen), memory

@@ -34,7 +34,8 @@ class TeamEnvState(State):
     Observations, rewards and metrics are those of team 0.
     """
 
-    rival_obs: jax.Array  # observations of the opponent's agents (T, O)
+    rival_groups: dict[str, jax.Array]
+    """Observations of all agents (2 T, O_g) by the groups that the opponent sees."""
     rival_memory: tuple[Memory]  # recurrent state of the opponent, leading axis 1
 
 
@@ -58,10 +59,6 @@ class TeamEnv:
         rival = actor_of(names.seat(opponent, match, "opponent"))
         self.seats = Seats((Seat(rival, rivals, rivals),))
         """The opponent."""
-        if further := self.seats.groups - {"policy"}:
-            raise InputError(
-                f"opponent: sees the groups {sorted(further)}; here it must see the group 'policy'"
-            )
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} against {self.seats.seats[0].policy}: {self.match}>"
@@ -109,11 +106,15 @@ class TeamEnv:
 
     def begin(self, key: jax.Array, assistance: jax.Array | float = 0.0) -> TeamEnvState:
         """Returns the state of `reset` without observations."""
-        rival = {
-            "rival_obs": jnp.zeros((self.num_agents, self.match.observation_size)),
-            "rival_memory": self.seats.initial_memory(1),
-        }
-        return self._of_team(TeamEnvState(**vars(self.match.begin(key, assistance)), **rival))
+        match = self.match.begin(key, assistance)
+        sizes = self.match.group_sizes
+        agents = self.match.num_agents
+        state = TeamEnvState(
+            **vars(match),
+            rival_groups={name: jnp.zeros((agents, sizes[name])) for name in self.seats.groups},
+            rival_memory=self.seats.initial_memory(1),
+        )
+        return self._of_team(state)
 
     @single
     def step(self, state: State, action: jax.Array) -> TeamEnvState:
@@ -126,7 +127,7 @@ class TeamEnv:
             )
         own: Any = state  # a `TeamEnvState`; the match's step keeps its further fields
         key = jax.random.fold_in(own.key, 1)
-        seen = Observations.at(jnp.concatenate([own.obs, own.rival_obs])[None])
+        seen = Observations({name: x[None] for name, x in own.rival_groups.items()})
         action = jnp.asarray(action, jnp.float32)
         both = jnp.concatenate([action, jnp.zeros_like(action)])[None]
         both, memory = self.seats.act(seen, own.rival_memory, key, both)
@@ -134,9 +135,13 @@ class TeamEnv:
         return with_final(self.with_observations(dataclasses.replace(after, rival_memory=memory)))
 
     def with_observations(self, state: TeamEnvState, groups: Sequence[str] = ()) -> TeamEnvState:
-        """Returns the state with the observations of both teams that belong to it."""
-        seen: Any = self.match.with_observations(state, groups)
-        return dataclasses.replace(self._of_team(seen), rival_obs=seen.obs[self.num_agents :])
+        """Returns the state with its observations of the group `policy` and further groups.
+
+        Those that the opponent sees are among them.
+        """
+        seen: Any = self.match.with_observations(state, (*groups, *self.seats.groups))
+        rival_groups = {name: seen.groups[name] for name in self.seats.groups}
+        return dataclasses.replace(self._of_team(seen), rival_groups=rival_groups)
 
     def _of_team(self, state: TeamEnvState) -> TeamEnvState:
         """Returns a state of the match as team 0 sees it."""

@@ -64,7 +64,7 @@ class Sensing:
         return False
 
     def own_frame(self, info: jax.Array) -> jax.Array:
-        """Maps the agents' base information (A, 6) to each agent's own frame, which may be mirrored."""
+        """Maps the agents' base information (A, 6) to each agent's own frame."""
         return info
 
     @functools.cached_property

@@ -202,11 +202,11 @@ def policy_function(policy: Policy, functions: TaskFunctions) -> tuple[Function,
 
     The function samples if `policy` does.
     """
-    sensed = groups_of([policy]) == {ONBOARD}
-    act, shapes = _act_on_readings(
-        policy, functions.env.group_sizes[ONBOARD if sensed else "policy"]
-    )
-    return _with_noise(*(_sensing(act, shapes, functions) if sensed else (act, shapes)))
+    (group,) = groups_of([policy])
+    act, shapes = _act_on_readings(policy, functions.env.group_sizes[group])
+    if group == ONBOARD:
+        act, shapes = _sensing(act, shapes, functions)
+    return _with_noise(act, shapes)
 
 
 def readings_function(policy: Policy, size: int) -> tuple[Function, Shapes]:
