@@ -80,7 +80,8 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
 
 def _summary(result: Mapping[str, Any]) -> str:
     episodes = result["episodes"]
-    both = Rate.of(result["success_rate"], episodes)
-    one = Rate.of(result["success/one"], episodes)
-    reward = f"average step reward {result['average_step_reward']:.3f}"
-    return f"both robots through {both}, at least one {one}, {reward} ({episodes} episodes)"
+    parts = [f"both robots through {Rate.of(result['success_rate'], episodes)}"]
+    if "success/one" in result:
+        parts.append(f"at least one {Rate.of(result['success/one'], episodes)}")
+    parts.append(f"average step reward {result['average_step_reward']:.3f}")
+    return f"{', '.join(parts)} ({episodes} episodes)"
