@@ -3,6 +3,7 @@ nothing to divide by.
 """
 
 import dataclasses
+import functools
 import json
 import math
 from pathlib import Path
@@ -254,6 +255,26 @@ def test_a_tournament_counts_the_first_episode_of_every_match() -> None:
     ):
         matches: Any = Matches()
         assert tournament.play(matches, idle, [idle] * count, KEY).tolist() == expected
+
+
+def test_one_program_serves_all_policies_of_a_tournament() -> None:
+    traced = []
+
+    class Counted(Matches):
+        def step(self, state: Fields, action: jax.Array) -> Fields:
+            traced.append(1)
+            return super().step(state, action)
+
+    policies = [
+        SimplePolicy("match", 1, functools.partial(lambda x, obs, key: x * obs, x))
+        for x in (0.0, 0.5, 1.0)
+    ]
+    matches: Any = Counted()
+    tournament.play(matches, policies[0], policies, KEY)
+    alone = len(traced)
+    results = tournament.round_robin(matches, dict(zip("abc", policies, strict=True)), KEY)
+    assert len(traced) == 2 * alone
+    assert results.tolist() == [[[4, 0, 0], [0, 4, 0], [0, 0, 4]]] * 3
 
 
 AT = {

@@ -91,9 +91,9 @@ class Fixed:
 
 
 def actor_of(policy: Policy) -> Any:
-    """Returns the `actor` of a trained policy, a pytree of its arrays; of any other a `Fixed`."""
-    actor = getattr(policy, "actor", None)
-    return Fixed(policy) if actor is None else actor
+    """Returns the `actor` of a policy with a `form`, a trained one; of any other a `Fixed`."""
+    either: Any = policy
+    return either.actor if hasattr(either, "form") else Fixed(policy)
 
 
 def groups_of(policies: Iterable[Policy]) -> frozenset[str]:
