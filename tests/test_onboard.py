@@ -22,7 +22,7 @@ from mqe_jax.core.types import Batch, Cast, Observations
 from mqe_jax.policies import zoo
 from mqe_jax.runs.cast import prepare
 from mqe_jax.train.learner import make_learner
-from mqe_jax.train.needs import Needs, needs_of
+from mqe_jax.train.needs import Needs, needs_of, unmet
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, read_policy
 from mqe_jax.train.runner import train_seeds
@@ -164,6 +164,7 @@ def test_other_sensors_are_named_with_both_values() -> None:
     policy: Any = SimpleNamespace(
         task="go1gate", agents=2, needs=needs, config=config, act=None, initial_memory=None
     )
+    policy.unmet = functools.partial(unmet, needs, config=config)
     check_policy(policy, cast.env)
     blind = make("go1gate", impl="c", num_envs=1)
     first, near, *others = needs.senses
