@@ -245,6 +245,7 @@ def policy_of(
     return TrainedPolicy(policy_params, state.obs_normalizer.obs, needs, config, metadata)
 
 
+@checked
 def save_policy(
     run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False
 ) -> Path:
