@@ -48,7 +48,7 @@ class Study:
 
 @pytest.fixture
 def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
-    def write(run_dirs: list[Path], **_: Any) -> None:
+    def write(cast: Cast, configs: Any, run_dirs: list[Path], **_: Any) -> None:
         for run in run_dirs:
             (run / "checkpoints").mkdir(parents=True)
             (run / "checkpoints" / "step_000000000064.safetensors").touch()

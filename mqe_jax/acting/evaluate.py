@@ -54,6 +54,15 @@ def evaluate_batch(
     be a function like a policy's `act`, and `memory` its initial recurrent state, leading axis N;
     `Seats.of_teams` has a policy for each team. A compiled call makes `block` steps. InputError for
     a policy of another task, and for episodes that do not end within `max_steps`.
+
+    Example:
+        ```python
+        from mqe_jax.acting.evaluate import evaluate_batch
+
+        batch = mqe_jax.VectorEnv(mqe_jax.make("go1gate", impl="c"), 4)
+        policy = mqe_jax.load_policy("forward", batch.env)
+        print(evaluate_batch(batch, policy, 4, jax.random.PRNGKey(0)).success)
+        ```
     """
     seats = Seats.of(env, policy, memory).fixed()
     return Evaluator(env, block=block, max_steps=max_steps)(seats, episodes, key[None])[0]
