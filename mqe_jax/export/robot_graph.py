@@ -17,15 +17,14 @@ import numpy as np
 import onnx
 
 from mqe_jax.acting.seats import check_policy
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import fail, to_mapping
-from mqe_jax.core.types import observations
+from mqe_jax.core.types import observations, shapes_of
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors
 from mqe_jax.export.policy import properties
 from mqe_jax.export.task import Shapes, readings_function
 from mqe_jax.export.translate import translate
-from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.train.policy import TrainedPolicy, template
 
 
 def robot_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
@@ -72,10 +71,10 @@ def _one_robot(policy: TrainedPolicy) -> TrainedPolicy:
     if policy.agents == 1:
         return policy
     needs = dataclasses.replace(policy.needs, dims=policy.dims._replace(agents=1, values=1))
-    try:
-        return dataclasses.replace(policy, needs=needs)
-    except InputError:
+    expected = template(needs.dims, policy.config.network)["params"]
+    if shapes_of(policy.params) != shapes_of(expected):
         fail("policy", policy, "one whose robots share a network (--per-robot)")
+    return dataclasses.replace(policy, needs=needs)
 
 
 def _record(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[Arrays, Arrays, float]:

@@ -208,7 +208,7 @@ class TrainedPolicy:
 
 
 @functools.lru_cache(maxsize=32)
-def _template(dims: EnvDims, settings: NetworkSettings) -> dict[str, Any]:
+def template(dims: EnvDims, settings: NetworkSettings) -> dict[str, Any]:
     """Returns the shapes of the parameters and the statistics of a network's policy."""
     network = settings.build(dims)
 
@@ -324,5 +324,5 @@ def policy_in(stored: Stored) -> TrainedPolicy:
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, AttributeError, InputError) as error:
         raise InputError(f"{stored.path}: its settings cannot be read ({error})") from None
-    tree = stored.tree(_template(needs.dims, config.network), half=True)
+    tree = stored.tree(template(needs.dims, config.network), half=True)
     return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)
