@@ -20,8 +20,7 @@ from mqe_jax.skills.control import Commander
 from mqe_jax.train.policy import check_obs
 
 NAMES = ("scripted", "random", "idle", "forward")
-"""Policies of all tasks: the task's scripted one, uniform random actions, zero actions, and half
-speed ahead."""
+"""Policies of all tasks: scripted, uniform random actions, zero actions, half speed ahead."""
 
 _FORWARD = 0.25
 """The first action of `forward`."""
@@ -82,8 +81,9 @@ def named(name: str, env: QuadrupedEnv, field: str = "policy") -> SimplePolicy:
 
 
 def from_function(act: Callable[..., Any], env: QuadrupedEnv) -> SimplePolicy:
-    """Returns the policy of a function `act(obs, memory, key)` without recurrent state, for one
-    team of a task.
+    """Returns the policy of a function `act(obs, memory, key)` for one team of a task.
+
+    The function has no recurrent state.
     """
     return SimplePolicy(env.name, len(env.teams[0]), lambda obs, key: act(obs, (), key)[0])
 

@@ -1,5 +1,6 @@
-"""Trained policies in tasks with wider actions: each acts with its own skill, and some send no
-messages.
+"""Trained policies in tasks with wider actions.
+
+Each policy acts with its own skill. A policy without sensors sends no messages.
 """
 
 from __future__ import annotations
@@ -45,21 +46,16 @@ class _Around:
 
 @dataclasses.dataclass(frozen=True)
 class Translated(_Around):
-    """A trained policy whose actions mean `own`, as a policy of a task whose actions mean
-    `here`.
-    """
+    """A trained policy whose actions mean `own` in a task whose actions mean `here`."""
 
     policy: TrainedPolicy
     own: Commander = dataclasses.field(repr=False)
     here: Commander = dataclasses.field(repr=False)
     sensed: slice | None = None
-    """Place of the last action, as it means here, in the policy's observations; None if they lack
-    it."""
+    """Slice of the last action, as it means here, in the observations; None if they lack it."""
 
     def initial_memory(self, num_envs: int) -> Memory:
-        """Returns the initial recurrent state of the policy; if it sees its last action, with
-        that.
-        """
+        """Returns the policy's initial recurrent state, with its last action if it sees that."""
         memory = self.policy.initial_memory(num_envs)
         shape = (num_envs, self.agents, self.policy.needs.dims.action)
         return memory if self.sensed is None else (memory, jnp.zeros(shape))
@@ -83,9 +79,7 @@ class Translated(_Around):
 
 @dataclasses.dataclass(frozen=True)
 class Silent(_Around):
-    """A policy without sensors, as a policy of a task whose robots send messages of `numbers`
-    numbers: zeros.
-    """
+    """A policy without sensors in a task with messages of `numbers` numbers; it sends zeros."""
 
     policy: Policy
     numbers: int
@@ -103,8 +97,10 @@ class Silent(_Around):
 
 
 def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str, field: str = "policy") -> Policy:
-    """Returns a trained policy as it acts in a task: itself, or of several skills with its own one,
-    or silent.
+    """Returns a trained policy as it acts in a task.
+
+    Among several skills, it acts with its own one. If robots send messages, a policy without
+    sensors is silent. Any other policy acts as it is.
 
     Raises:
         InputError: naming `field`, if the policy does not fit the task.
@@ -151,10 +147,10 @@ def translate(policy: TrainedPolicy, env: QuadrupedEnv, name: str, field: str = 
 
 
 def together(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns the skills and command ranges that let policies of different skills meet, each acting
-    with its own.
+    """Returns the skills and command ranges with which policies of different skills can meet.
 
-    Empty if all have the same skill. Policies are given by their `Needs.by_name()`.
+    Each acts with its own skill. Policies are passed as their `Needs.by_name()`. The result is
+    empty if all have the same skill.
     """
     skills = [needs["skill"] for needs in every]
     if len({*skills}) < 2:

@@ -1,3 +1,4 @@
-"""Trainings, evaluations and clips by one call each: what `mqe_jax` exports, and the layer below
-the command line.
+"""Trainings, evaluations and clips by one call each.
+
+`mqe_jax` exports them; the command line is the layer above.
 """

@@ -54,10 +54,10 @@ def prepare(
     impl: str = "auto",
     seeds: Sequence[int] | None = None,
 ) -> tuple[list[TrainConfig], Cast]:
-    """Returns the settings of each seed and the environments of a training; arguments and errors as
-    `mqe_jax.learn`.
+    """Returns the settings of each seed and the environments of a training.
 
-    `seeds` are trained in one program; by default the one of the settings.
+    One program trains the `seeds`, by default the one of the settings. Arguments and errors are as
+    in `mqe_jax.learn`.
     """
     if len(set(seeds or ())) < len(seeds or ()):
         fail("seeds", seeds, "a list without repetitions")
@@ -86,8 +86,9 @@ def make_learner(
     impl: str = "auto",
     seeds: SeedCount = 1,
 ) -> Learner:
-    """Returns `init(key) -> state` and `update(state) -> (state, metrics)`: a training as pure
-    functions, not compiled.
+    """Returns a training as two pure functions, `init` and `update`, which are not compiled.
+
+    They are `init(key) -> state` and `update(state) -> (state, metrics)`.
 
     Example:
         ```python
@@ -192,8 +193,9 @@ def _batch(
     seeds: int,
     demonstrator: Policy | None,
 ) -> VectorEnv:
-    """Returns the environments of a training, whose episodes may start in a demonstrator's
-    states.
+    """Returns the environments of a training.
+
+    With a demonstrator, episodes may start in its states.
     """
     final = config.network.critic_reads
     if demonstrator is None:
@@ -205,10 +207,10 @@ def _batch(
 def _evaluated(
     trained: QuadrupedEnv, task: str | QuadrupedEnv, config: TrainConfig, seeds: int, impl: str
 ) -> QuadrupedEnv:
-    """Returns the environment in which the policy is evaluated: that of the training, unless
-    parameters or the buffers of a new one differ.
+    """Returns the environment in which the trainer evaluates the policy.
 
-    InputError if the policy could not act there.
+    It is that of the training, unless parameters or the buffers of a new one differ. InputError if
+    the policy could not act there.
     """
     sized = isinstance(task, str) and not trained.physics.holds(_MOST)
     if not config.train_env and not (sized and config.evaluation.every is not None):
@@ -225,8 +227,9 @@ def _evaluated(
 def _evaluations(
     env: QuadrupedEnv, config: TrainConfig, seeds: int, groups: set[str], read: Read
 ) -> Any:
-    """Returns the environments of evaluations, None without: in a match against its fixed
-    opponents, else the strongest reference.
+    """Returns the environments of evaluations, or None if there are no evaluations.
+
+    In a match the policy meets its fixed opponents, else the strongest reference opponent.
     """
     if config.evaluation.every is None:
         return None
@@ -283,8 +286,6 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
 
 
 def reference_opponents(env: QuadrupedEnv) -> list[str]:
-    """Returns the names of a match's fixed opponents, the strongest first: policies are evaluated
-    against that one.
-    """
+    """Returns the names of a match's reference opponents, the strongest first."""
     walking = env.control == "command" and tuple(env.params.commands) == TaskParams.commands
     return [name for name in REFERENCES if name != "scripted" or (walking and env.name in SCRIPTED)]

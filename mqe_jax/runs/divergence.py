@@ -48,10 +48,10 @@ def guard(batch: Any, folder: str | Path | None) -> Iterator[Any]:
 
 
 class Guard(Outer):
-    """A batch of environments that writes the last steps before a divergence to
-    `FOLDER/diverged_0000.npz`, ...
+    """A batch of environments that writes the last steps before a divergence to files.
 
-    Every step sends the fields on which it depends to the host, which keeps the last `STEPS`.
+    The files are `FOLDER/diverged_0000.npz`, ... Every step sends the fields on which it depends to
+    the host, which keeps the last `STEPS`.
     """
 
     written: list[Path]  # files written
@@ -95,8 +95,9 @@ class Guard(Outer):
         )
 
     def _see(self, shown: Any, before: Any, action: Any, diverged: Any) -> np.ndarray:
-        """Stores a step of all environments, of all seeds, and writes a recording of each that
-        diverged in it.
+        """Stores a step of all environments of all seeds.
+
+        It writes a recording of each environment that diverged in the step.
         """
         lead = np.shape(diverged)
 

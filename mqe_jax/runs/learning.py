@@ -45,8 +45,7 @@ class Run:
     metrics: dict[str, np.ndarray]
     """The columns of metrics.csv, one entry per update (U,)."""
     evaluations: list[dict[str, Any]]
-    """Evaluations during training: `env_steps`, `episodes`, and results under `sampled` and
-    `deterministic` actions."""
+    """Evaluations in training: `env_steps`, `episodes`, results `sampled` and `deterministic`."""
     absolute: dict[str, Any] | None = None
     """The absolute metric: an evaluation of the best policy over more episodes; None before the end
     of a training."""
@@ -78,10 +77,10 @@ class Run:
 
     @checked
     def save(self, folder: str | Path) -> None:
-        """Writes a run folder without a checkpoint, for `load_run`, `load_policy` and the command
-        line.
+        """Writes a run folder for `load_run`, `load_policy` and the command line.
 
-        It cannot be resumed; a training can start from its policy (setting `start`).
+        The folder has no checkpoint, so a training cannot resume from it. A training can start from
+        its policy (setting `start`).
 
         Raises:
             InputError: if the folder cannot be written, or holds another run.
@@ -183,8 +182,9 @@ def learn_seeds(
     resume: bool = False,
     dump_diverged: str | Path | None = None,
 ) -> list[Run]:
-    """Trains several seeds in one program, each as `learn` would up to rounding; arguments and
-    errors as there.
+    """Trains several seeds in one program, each as `learn` would up to rounding.
+
+    Arguments and errors are as in `learn`.
 
     Example:
         ```python

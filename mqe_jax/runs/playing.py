@@ -138,8 +138,10 @@ def tournament(
     deterministic: bool = False,
     seed: Seed = 0,
 ) -> Standings | CrossPlay:
-    """Plays policies of a match against each other and rates them, or mixes teams of them, as `mqe
-    tournament`.
+    """Plays a tournament of policies, as `mqe tournament`.
+
+    In a match, it plays the policies against each other and rates them. In a task of one team, it
+    mixes teams of them.
 
     Example:
         ```python
@@ -284,8 +286,9 @@ class Clip:
 
     @checked
     def save(self, file: str | Path, *, at: Time | None = None) -> str:
-        """Writes a .mp4, .webp, .gif or .png file; returns the renderer (`egl`, `osmesa` or
-        `matplotlib`).
+        """Writes a .mp4, .webp, .gif or .png file; returns the name of the renderer.
+
+        Renderers are `egl`, `osmesa` and `matplotlib`.
 
         Args:
             file: to write.
@@ -299,8 +302,9 @@ class Clip:
         return render_episode(self.env, self.episodes[self.best], Path(file), at=at, **self.look)
 
     def _repr_html_(self) -> str:
-        """Returns a video (H.264 with imageio-ffmpeg, of the extra `render`), else a GIF, within
-        the page.
+        """Returns HTML that shows the clip within the page.
+
+        It is a video (H.264) with imageio-ffmpeg, of the extra `render`, else a GIF.
         """
         kind = "mp4" if find_spec("imageio_ffmpeg") is not None else "gif"
         small = {**self.look, "size": self.look.get("size") or (480, 270)}

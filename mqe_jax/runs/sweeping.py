@@ -37,10 +37,10 @@ def sweep(
     impl: str = "auto",
     dry_run: bool = False,
 ) -> dict[str, Any]:
-    """Trains all combinations of tasks, algorithms, variants and seeds, and reports, as `mqe
-    sweep`.
+    """Trains and reports all runs of a sweep, as `mqe sweep`.
 
-    Call it again to resume.
+    Its runs are all combinations of tasks, algorithms, variants and seeds. A second call resumes
+    the sweep.
 
     Example:
         ```python
@@ -113,8 +113,9 @@ def sweep(
 
 
 def train_runs(plan: Sweep, folder: Path, file: str, impl: str) -> list[Path]:
-    """Trains all runs of a sweep, which it also writes to a file; returns their folders, cell by
-    cell.
+    """Trains all runs of a sweep and returns their folders, cell by cell.
+
+    It also writes the sweep to a file.
 
     InputError if trainings failed or are left to other processes.
     """

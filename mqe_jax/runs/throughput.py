@@ -1,5 +1,6 @@
-"""Throughput in environment steps per second: of whole steps with skill and resets, and of physics
-only.
+"""Throughput in environment steps per second.
+
+It is that of whole steps with skill and resets, and that of physics only.
 """
 
 import os
@@ -23,10 +24,10 @@ WARM_UP = 4  # calls after the compiling one that are not counted: episodes spre
 def time_calls(
     run: Callable[[Any], Any], state: Any, repeats: int
 ) -> tuple[float, list[float], Any]:
-    """Returns the seconds of the first call, which compiles, those of `repeats` calls after
-    `WARM_UP` ones, the state.
+    """Returns the seconds of the first call, those of `repeats` calls, and the last state.
 
-    `run(state) -> state`; each call continues from the previous state and is synchronised.
+    The call is `run(state) -> state`. The first one compiles. `WARM_UP` more calls precede the
+    `repeats`. Each call continues from the previous state and is synchronised.
     """
     began = time.perf_counter()
     state = jax.block_until_ready(run(state))

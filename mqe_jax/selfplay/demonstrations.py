@@ -1,5 +1,6 @@
-"""Training episodes that start in states of a demonstrator's episodes: a curriculum for rewards
-that are rarely met.
+"""Training episodes that start in states of a demonstrator's episodes.
+
+They are a curriculum for rare rewards.
 
 Source: resets to demonstrated states (Tao et al., arXiv 2405.03379).
 """
@@ -38,11 +39,10 @@ class DemonstratedState(State[Any]):
 
 
 class Demonstrated(VectorEnv):
-    """A batch of environments whose episodes start in states of a demonstrator's with probability
-    `assistance`.
+    """A batch of environments whose episodes can start in states of a demonstrator's episodes.
 
-    Such an episode has the time that was left to the demonstrator. The states are the same in all
-    runs of a task.
+    An episode starts in such a state with probability `assistance`. It then has the time that was
+    left to the demonstrator. The states are the same in all runs of a task.
     """
 
     def __init__(
@@ -67,8 +67,9 @@ class Demonstrated(VectorEnv):
 
     @single
     def reset(self, key: jax.Array) -> DemonstratedState:
-        """Returns N initial states of the task, with the demonstrator's states, which do not depend
-        on the key.
+        """Returns N initial states of the task, with the demonstrator's states.
+
+        The demonstrator's states do not depend on the key.
         """
         with devices.alone():
             demonstrations = self._record()
@@ -76,8 +77,9 @@ class Demonstrated(VectorEnv):
 
     @single
     def step(self, state: State, action: jax.Array) -> DemonstratedState:
-        """Advances all environments by one step with actions (N, A, action_size); resets those that
-        ended.
+        """Advances all environments by one step and resets those that ended.
+
+        Actions are (N, A, action_size).
         """
         self.check_step(state, action, DemonstratedState)
         assert isinstance(state, DemonstratedState)

@@ -1,5 +1,6 @@
-"""A match as an environment of one team: against opponents (`Versus`), or with both teams learning
-(`Mirror`).
+"""A match as an environment of one team.
+
+The team plays against opponents (`Versus`), or both teams learn (`Mirror`).
 """
 
 import dataclasses
@@ -77,11 +78,10 @@ class OpponentState:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TeamState(EnvironmentState):
-    """State of M environments of one team of T agents, in N matches of A agents; metrics are those
-    of team 0.
+    """State of M environments of one team of T agents, in N matches of A agents.
 
-    `step[::M // N]` and `assistance[::M // N]` hold one entry per match; `key` is for the
-    opponents' actions.
+    Metrics are those of team 0. `step[::M // N]` and `assistance[::M // N]` hold one entry per
+    match. `key` is for the opponents' actions.
     """
 
     match: EnvironmentState  # state of the matches, leading axis N
@@ -110,10 +110,10 @@ class OneTeam(Outer):
 
 
 class Versus(OneTeam):
-    """N matches as N environments of team 0, in K equal blocks with one opponent each; see
-    `mqe_jax.versus`.
+    """N matches as N environments of team 0, in K equal blocks with one opponent each.
 
     Every Kth environment belongs to a block, so that any consecutive K of them meet all opponents.
+    See `mqe_jax.versus`.
     """
 
     def __init__(
@@ -138,8 +138,9 @@ class Versus(OneTeam):
         return f"<{type(self).__name__} of {self.num_envs} against {opponents}: {self.inner!r}>"
 
     def share(self, parts: int) -> Self:
-        """Returns the environments of one of several processes; each process meets all
-        opponents.
+        """Returns the environments of one of several processes.
+
+        Each process meets all opponents.
         """
         self._check_blocks(self.num_envs // parts)
         return super().share(parts)
@@ -169,8 +170,9 @@ class Versus(OneTeam):
 
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
-        """Advances all environments by one step with the actions of team 0 (N, T, D), else an
-        InputError; resets.
+        """Advances all environments by one step and resets those that ended.
+
+        InputError unless the actions are those of team 0 (N, T, D).
         """
         self.check_step(state, action, TeamState)
         key, *keys = jax.random.split(state.key, 1 + len(state.opponents))
@@ -216,12 +218,11 @@ class Versus(OneTeam):
         *,
         at_once: bool = False,
     ) -> TeamState:
-        """Returns the state with another opponent in a block, a trained policy of the same
-        form.
+        """Returns the state with another opponent in a block.
 
-        Each environment keeps its opponent until its episode ends, unless `at_once`. Another change
-        before that replaces only the waiting opponent, also in environments in which it already
-        plays.
+        The opponent is a trained policy of the same form. Each environment keeps its opponent until
+        its episode ends, unless `at_once`. Another change before that replaces only the waiting
+        opponent, also in environments in which it already plays.
         """
         if not block < len(state.opponents):
             fail("block", block, f"below {len(state.opponents)}, the number of blocks")
@@ -258,11 +259,11 @@ class Versus(OneTeam):
 
 
 class Mirror(OneTeam):
-    """N matches as 2 N environments of one team, two in a row per match: one policy learns as both
-    teams.
+    """N matches as 2 N environments of one team: one policy learns as both teams.
 
-    The privileged observation has one more number, the index of the team. Outcome and metrics are
-    those of team 0; `diverged` and `overflow` are counted for the first.
+    The teams of a match are consecutive environments. The privileged observation has one more
+    number, the index of the team. Outcome and metrics are those of team 0. `diverged` and
+    `overflow` count for the first environment of a match.
     """
 
     def __init__(self, matches: VectorEnv) -> None:
@@ -277,8 +278,9 @@ class Mirror(OneTeam):
 
     @single
     def step(self, state: TeamState, action: jax.Array) -> TeamState:
-        """Advances all environments by one step with actions (2 N, T, D), else an InputError;
-        resets.
+        """Advances all environments by one step and resets those that ended.
+
+        InputError unless the actions are (2 N, T, D).
         """
         self.check_step(state, action, TeamState)
         both = action.reshape(self.inner.num_envs, 2 * self.num_agents, self.action_size)

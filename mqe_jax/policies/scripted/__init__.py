@@ -20,8 +20,9 @@ GAIN = 1.5  # 1/s, commanded speed per distance from the goal
 
 
 def find_scripted(task: str, name: str = "scripted", field: str = "policy") -> ScriptedPolicy:
-    """Returns a task's scripted policy: one team's observation blocks (A, width) by name -> its
-    actions (A, 3).
+    """Returns a task's scripted policy, a function of one team's observation blocks.
+
+    It maps blocks (A, width) by name to actions (A, 3).
 
     Raises:
         InputError: naming `field`, if the task has none of this name.
@@ -35,8 +36,7 @@ def find_scripted(task: str, name: str = "scripted", field: str = "policy") -> S
 
 
 def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
-    """Returns the scripted policy of a task, from the observations (A, O) of one team to its
-    actions (A, 3).
+    """Returns the scripted policy of a task: observations (A, O) of one team to actions (A, 3).
 
     Example:
         ```python
@@ -58,11 +58,10 @@ def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.
 
 
 def _plan_with_absent(plan: ScriptedPolicy, layout: ObservationLayout, obs: jax.Array) -> jax.Array:
-    """Returns the actions (A, 3) of a policy that finds robots and other entities that take no part
-    far away.
+    """Returns a policy's actions (A, 3) when some robots or other entities take no part.
 
-    They are those whose entries are 0. The block `active` says which agents take part (A,); the
-    others' actions are 0.
+    Their entries in the observations are 0; the policy sees them far away. The block `active` says
+    which agents take part (A,). The actions of the others are 0.
     """
     blocks = layout.split(obs)
     active = jnp.any(obs != 0, axis=-1)

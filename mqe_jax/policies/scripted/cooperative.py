@@ -1,6 +1,4 @@
-"""Scripted policies of the cooperative tasks but football: Narrow Gate, Climb on Seesaw, Sheep Dog,
-Push Box.
-"""
+"""Scripted policies of Narrow Gate, Climb on Seesaw, Sheep Dog and Push Box."""
 
 import jax
 import jax.numpy as jnp
@@ -90,9 +88,7 @@ _BRAKING = 2.5  # 1/s, approach speed per distance that is left
 
 
 def _sides(obs: Observation) -> np.ndarray | jax.Array:
-    """Returns on which side of the sheep's path each robot walks (A, 1), from -1, the right, to
-    1.
-    """
+    """Returns each robot's side of the sheep's path (A, 1), from -1 (right) to 1 (left)."""
     agents = len(obs["base"])
     if "active" not in obs:
         place = np.arange(agents) - (agents - 1) / 2
@@ -102,8 +98,9 @@ def _sides(obs: Observation) -> np.ndarray | jax.Array:
 
 
 def _apart(position: jax.Array, goal: jax.Array) -> jax.Array:
-    """Returns the goals (A, 2), m, in teams of more than two moved away from robots that are
-    close.
+    """Returns the goals (A, 2), m, moved away from other robots that are close.
+
+    Goals of teams of at most two robots stay as they are.
     """
     if len(position) < 3:
         return goal
@@ -131,8 +128,9 @@ def plan_sheep_easy(obs: Observation) -> jax.Array:
 
 
 def plan_sheep_hard(obs: Observation) -> jax.Array:
-    """Returns the robots' actions (A, 3): teams of two or three divide the flock by sides, others
-    by distance.
+    """Returns the robots' actions (A, 3).
+
+    Teams of two or three divide the flock by sides, larger ones by distance.
     """
     if "active" in obs:
         number = jnp.sum(obs["active"])
@@ -207,8 +205,7 @@ def plan_sheep_by_distance(obs: Observation) -> jax.Array:
 
 
 def _brake(velocity: jax.Array, apart: jax.Array, least: float) -> jax.Array:
-    """Returns velocities (A, 2), m/s, with which robots stop before they come closer to others than
-    a distance.
+    """Returns velocities (A, 2), m/s, that keep robots at a distance from others.
 
     Args:
         velocity: wanted (A, 2), m/s.
@@ -263,8 +260,9 @@ def plan_pushbox(obs: Observation) -> jax.Array:
 
 
 def _places(agents: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Returns each robot's row behind the box and its column from the middle one (A,), and the
-    number of columns.
+    """Returns each robot's row and column (A,) behind the box, and the number of columns.
+
+    Columns count from the middle one.
     """
     columns = min(agents, _ABREAST)
     place = np.arange(agents)

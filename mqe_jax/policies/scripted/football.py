@@ -1,5 +1,6 @@
-"""Scripted policies of football: move behind the ball, facing an open part of the goal, then push
-it.
+"""Scripted policies of football.
+
+A robot moves behind the ball, faces an open part of the goal and pushes the ball.
 """
 
 import jax
@@ -11,14 +12,12 @@ from mqe_jax.policies.scripted import Observation, go_to
 _GOAL_AIMS = np.array([[12.2, -0.6], [12.2, 0.0], [12.2, 0.6]], np.float32)  # m, points in the goal
 _GOAL = np.array([12.0, 0.0], np.float32)  # m
 # Against the defender: the ball passes it on the flank at this point (x, distance from the centre
-# line), m. On the straight line to the goal it touches the defender and is deflected beyond the
-# post.
+# line), m. On the straight line to the goal, the defender would deflect it beyond the post.
 _FLANK = (10.0, 1.5)
 # m, further from the posts
 _INNER_AIMS = np.array([[12.2, -0.55], [12.2, 0.0], [12.2, 0.55]], np.float32)
 _TURN_IN = 9.4  # m, x of the ball from which it is pushed towards the goal
-# m, x of the ball from which both robots attack: a first attack that failed leaves it at the goal
-# line
+# m, x of the ball from which both robots attack: a failed attack leaves it at the goal line
 _BOTH = 11.2
 _LEAD = 0.3  # s, over which the ball's motion is predicted
 _OWN_GOAL = np.array([2.5, 0.0], np.float32)  # m
@@ -28,12 +27,12 @@ _KEEP_BACK = 2.0
 
 
 def plan_defender(obs: Observation) -> jax.Array:
-    """Returns both robots' actions (2, 3): one dribbles past the defender on the flank, then turns
-    in to the goal.
+    """Returns both robots' actions (2, 3) against the defender.
 
-    The defender is not observed; it is assumed to be at the target position of its control law. The
-    robot nearer to the point behind the ball, as seen from the goal, attacks; the other supports.
-    Both attack a ball at the goal line.
+    One robot dribbles past the defender on the flank, then turns in to the goal. The robot nearer
+    to the point behind the ball, as seen from the goal, attacks; the other supports. Both attack a
+    ball at the goal line. Robots do not observe the defender: the policy assumes it at the target
+    position of its control law.
     """
     ball = obs["ball"][0, :2]
     velocity = obs["ball_velocity"][0, :2]
@@ -86,8 +85,9 @@ def _play(
 
 
 def _cover(place: jax.Array, count: int, ball: jax.Array) -> jax.Array:
-    """Returns where one of `count` robots stands that neither attack nor support (2,), m; `place`
-    () from 2.
+    """Returns the place (2,), m, of one of `count` robots that neither attack nor support.
+
+    Its index `place` () counts from 2.
     """
     share = (place - 1) / (count + 1)  # of the way to the own goal
     side = jnp.where(place % 2 == 0, 1.0, -1.0)
@@ -101,8 +101,9 @@ def _attack(
     velocity: jax.Array,
     aims: jax.Array | np.ndarray,
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns the goal position of an attacker (2,), m, and the unit vector from the ball to the
-    chosen aim (2,).
+    """Returns an attacker's goal position (2,), m, and the unit vector from ball to aim (2,).
+
+    It chooses the aim with the most clearance and the least turning.
 
     Args:
         own: base information (6,).

@@ -1,6 +1,4 @@
-"""Scripted policies of the matches but football: Push Cylinder, Revolving Door, Sumo Wrestling,
-Traverse Bridge.
-"""
+"""Scripted policies of Push Cylinder, Revolving Door, Sumo Wrestling and Traverse Bridge."""
 
 import jax
 import jax.numpy as jnp
@@ -52,8 +50,9 @@ _EDGE = (1.5, 1.64)
 
 
 def plan_wrestling(obs: Observation) -> jax.Array:
-    """Returns a team's actions (T, 3) in its own frame; each robot of a larger team meets the
-    nearest opponent.
+    """Returns a team's actions (T, 3) in its own frame.
+
+    Each robot of a larger team meets the nearest opponent.
     """
     (position, yaw) = pose(obs["base"])
     opponent = _nearest(obs)
@@ -76,9 +75,7 @@ def plan_wrestling(obs: Observation) -> jax.Array:
 
 
 def _nearest(obs: Observation) -> jax.Array:
-    """Returns the position (T, 2), m, of the opponent or, of several, of the nearest one that is
-    still in.
-    """
+    """Returns the position (T, 2), m, of the nearest opponent that is still in."""
     if "opponent" in obs:
         return obs["opponent"][:, :2]
     # base information, and whether it is in
@@ -92,8 +89,7 @@ def _nearest(obs: Observation) -> jax.Array:
 
 # Traverse Bridge: push the opponent back from the end of the bridge, then walk beside it.
 _LEAD = 1.0  # m, distance of the goal ahead of the robot, for full speed while it pushes
-# m, distance of the opponent ahead below which the robot aims at its centre, to avoid slipping past
-# it
+# m, distance of the opponent ahead below which the robot aims at its centre, not to slip past it
 _NEAR = 1.0
 _MAX_AIM = 0.1  # m, y; the feet are 0.15 m from the robot's centre, the bridge's edges 0.35 m
 _OFF_BRIDGE = 7.25  # m, x, beyond which the hind feet are on the far platform

@@ -27,11 +27,10 @@ Array = NDArray[np.float64]
 def cross_play(
     batch: VectorEnv, policies: Mapping[str, Policy], episodes: int, key: jax.Array
 ) -> Array:
-    """Returns the success rates of teams whose agent 0 follows one policy and the others another
-    one (P, P).
+    """Returns the success rates (P, P) of each policy of agent 0 with each policy of its mates.
 
-    The batch has P copies: a compiled program evaluates the teams of a row at once, and serves all
-    rows.
+    The rows are agent 0's policies, the columns those of the others. The batch has P copies. One
+    compiled program evaluates the teams of a row at once and serves all rows.
     """
     for name, policy in policies.items():
         check_policy(policy, batch, name)
@@ -56,8 +55,9 @@ def cross_play(
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CrossPlay:
-    """Success of mixed teams of P policies and some reference policies, N in all; as text,
-    tables.
+    """Success of mixed teams of P policies and some reference policies, N in all.
+
+    It prints as tables.
     """
 
     task: str
@@ -69,13 +69,14 @@ class CrossPlay:
     episodes: int
     """Episodes of each team."""
     success: Array
-    """Success rates of teams whose agent 0 follows the row's policy, the others the column's (N,
-    N)."""
+    """Success rates (N, N): the row's policy is agent 0's, the column's that of the others."""
 
     @property
     def means(self) -> dict[str, float]:
-        """Mean success of policies with themselves, `same`, and of different policies, `cross`, and
-        with each reference policy, named as it is, in both places.
+        """Mean success by kind of team: `same` policies, different ones (`cross`), or a reference.
+
+        The mean of a reference policy, under its name, is over teams in which agent 0 or the others
+        follow it.
         """
         count = len(self.policies)
         teams = self.success[:count, :count]
@@ -89,17 +90,16 @@ class CrossPlay:
 
     @property
     def worst(self) -> tuple[int, int] | None:
-        """Indices of agent 0's policy and that of the others in the worst team of different
-        policies; None with one.
+        """The team of different policies with the least success; None if there is one policy.
+
+        A team is the index of agent 0's policy and the index of the others' policy.
         """
         count = len(self.policies)
         pairs = itertools.permutations(range(count), 2)
         return min(pairs, key=lambda pair: self.success[pair], default=None)
 
     def rate(self, first: int, others: int) -> Estimate:
-        """Returns the success of a team, by the indices of agent 0's policy and that of the
-        others.
-        """
+        """Returns the success of a team, from the indices of agent 0's policy and the others'."""
         return Estimate(*Rate.of(float(self.success[first, others]), self.episodes))
 
     def __repr__(self) -> str:

@@ -36,10 +36,10 @@ class Estimate(NamedTuple):
 
 
 def payoffs(results: NDArray[Any]) -> Array:
-    """Returns wins minus losses of a game, on both sides together, from outcomes (..., P, P, 3):
-    (..., P, P).
+    """Returns the wins minus losses per game of each policy against each, over both sides.
 
-    The matrices are antisymmetric. Without games, a payoff is 0.
+    Outcomes are (..., P, P, 3), payoffs (..., P, P). The matrices are antisymmetric. Without games,
+    a payoff is 0.
     """
     lead = results[..., 0] - results[..., 2]
     games = results.sum(axis=-1)
@@ -47,23 +47,26 @@ def payoffs(results: NDArray[Any]) -> Array:
 
 
 def resample(counts: NDArray[Any], random: np.random.Generator) -> Array:
-    """Returns Bayesian bootstrap samples (doi 10.1214/aos/1176345338) of counts by outcome: (...,
-    K) to (S, ..., K).
+    """Returns Bayesian bootstrap samples of counts by outcome: (..., K) to (S, ..., K).
+
+    Source: doi 10.1214/aos/1176345338.
     """
     drawn = random.standard_gamma(counts, (_SAMPLES, *counts.shape))
     return drawn * (counts.sum(axis=-1, keepdims=True) / drawn.sum(axis=-1, keepdims=True))
 
 
 def games_of(results: NDArray[Any]) -> Array:
-    """Returns results with one more drawn game for every pair, so that a few equal games leave
-    doubt.
+    """Returns results with one more drawn game for every pair.
+
+    The draw keeps the interval of a few equal games wide.
     """
     return results + _DRAW
 
 
 def estimate(value: Any, samples: Any) -> Estimate:
-    """Returns a value with the interval of its samples (S, ...), which contains it; samples may be
-    NaN.
+    """Returns a value with the 95% interval of its samples (S, ...).
+
+    The interval contains the value. Samples may be NaN.
     """
     low, high = np.nanquantile(samples, [0.025, 0.975], axis=0)
     return Estimate(np.asarray(value), np.minimum(low, value), np.maximum(high, value))
@@ -73,8 +76,7 @@ class Analysis(NamedTuple):
     """What the results of P policies say about each; payoffs are wins minus losses of a game."""
 
     payoff: Estimate
-    """Payoff of each policy against each, on both sides together (P, P). Intervals are over
-    episodes."""
+    """Payoff of each policy against each, over both sides (P, P). Intervals are over episodes."""
     mean: Estimate
     """Mean payoff against the others (P,). Its interval is over opponents and episodes."""
     worst: Estimate

@@ -1,5 +1,6 @@
-"""A match against a pool of the learner's earlier policies, kept in the learner state between
-updates.
+"""A match against a pool of the learner's earlier policies.
+
+The learner state keeps the pool between updates.
 
 Source: prioritised fictitious self-play (AlphaStar, doi 10.1038/s41586-019-1724-z).
 """
@@ -60,9 +61,9 @@ class Roster:
 
         self.names = tuple(names)
         self.newest = is_one_of("newest")
+        """Blocks that play the policy itself (K,) bool."""
         self.uniform = is_one_of("uniform")
-        """Blocks that play the policy itself; blocks that draw any member of the pool with equal
-        chance (K,) bool."""
+        """Blocks that draw any member of the pool with equal chance (K,) bool."""
         self.members = self.uniform | is_one_of("older")
         """Blocks that play members of the pool (K,) bool."""
         self.reference = is_one_of("scripted")
@@ -114,8 +115,9 @@ class League:
         )
 
     def seat(self, state: TrainState) -> TrainState:
-        """Returns the state whose new environments play the policy itself and the members that the
-        league names.
+        """Returns the state with the league's opponents in its new environments.
+
+        They are the policy itself and members of the pool.
         """
         opponents = list(state.rollout.env_state.opponents)
         for i, opponent in enumerate(opponents):
@@ -127,8 +129,10 @@ class League:
         return _with_opponents(state, opponents)
 
     def after(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
-        """Records the results of an update, takes a snapshot when due, and gives the blocks their
-        opponents.
+        """Records the results of an update and gives the blocks their next opponents.
+
+        It takes a snapshot of the policy when one is due. Returns the state and the league's
+        metrics.
         """
         opponents = list(state.rollout.env_state.opponents)
         own = self._own(state)

@@ -1,5 +1,6 @@
-"""A pool of earlier policies, as arrays: how the learner fares against each, who plays next, who
-leaves.
+"""A pool of earlier policies, as arrays.
+
+It records how the learner fares against each, draws who plays next and replaces members.
 """
 
 from typing import NamedTuple
@@ -42,8 +43,9 @@ def mean_win_rate(pool: Pool) -> jax.Array:
 
 
 def record_result(pool: Pool, member: jax.Array, score: jax.Array, games: jax.Array) -> Pool:
-    """Adds results of blocks against their members: indices (B,), wins plus half of the draws (B,),
-    games (B,).
+    """Returns the pool with the results of B blocks against their members.
+
+    Indices of the members are (B,), scores (wins plus half of the draws) (B,), games (B,).
     """
     met = jnp.zeros_like(pool.games).at[member].add(games) > 0
     fade = jnp.where(met, _DECAY, 1.0)
@@ -54,8 +56,9 @@ def record_result(pool: Pool, member: jax.Array, score: jax.Array, games: jax.Ar
 
 
 def chances(pool: Pool, uniform: bool) -> jax.Array:
-    """Returns unnormalised log-probabilities (M,) of playing each member: `uniform`, or by (1 - win
-    rate)^2.
+    """Returns the unnormalised log-probabilities (M,) of playing each member.
+
+    They are equal if `uniform`, else those of weights (1 - win rate)^2.
     """
     weight = jnp.ones_like(pool.games) if uniform else jnp.square(1.0 - win_rate(pool)) + 1e-4
     return jnp.where(pool.born >= 0, jnp.log(weight), -jnp.inf)

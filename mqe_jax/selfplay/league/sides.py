@@ -54,8 +54,6 @@ class BothSides(Wrapper):
         return devices.rows(lambda n: jnp.arange(n) >= n // 2, self.num_envs)
 
     def _swap(self, x: jax.Array) -> jax.Array:
-        """Exchanges the halves of axis 1, the agents, where the teams have changed places (N, A,
-        ...).
-        """
+        """Exchanges the teams along axis 1 of (N, A, ...) where they have changed places."""
         other = jnp.roll(x, self.num_agents // 2, axis=1)
         return where_rows(self._swaps(), other, x)

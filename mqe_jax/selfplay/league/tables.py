@@ -24,8 +24,9 @@ def shorten(name: str) -> str:
 
 
 def table(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """Yields the lines of a table with numbered rows, from its columns by header; the first one is
-    on the left.
+    """Yields the lines of a table with numbered rows, from its columns by header.
+
+    The first column is aligned to the left.
     """
     every = [[name, *column] for name, column in columns.items()]
     sides = ["<", *">" * len(every)]

@@ -44,8 +44,9 @@ _ITERATIONS = 40
 def play(
     matches: VectorEnv, policy: Policy, opponents: Sequence[Policy], key: jax.Array
 ) -> NDArray[np.int64]:
-    """Returns a policy's outcomes as team 0 against each of K opponents, in each environment's
-    first episode (K, 3).
+    """Returns a policy's outcomes as team 0 against each of K opponents (K, 3).
+
+    The first episode of each environment counts.
     """
     return _play(matches, [policy], opponents, [key])[0]
 
@@ -53,8 +54,9 @@ def play(
 def round_robin(
     matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array
 ) -> NDArray[np.int64]:
-    """Returns the outcomes of each policy as team 0 against each as team 1: (P, P, 3) in
-    `RESULTS`.
+    """Returns the outcomes of each policy as team 0 against each as team 1.
+
+    They are (P, P, 3), in the order of `RESULTS`.
     """
     teams = list(policies.values())
     return _play(matches, teams, teams, jax.random.split(key, len(teams)))
@@ -64,10 +66,9 @@ def round_robin(
 def _play(
     matches: VectorEnv, policies: Sequence[Policy], opponents: Sequence[Policy], keys: Any
 ) -> NDArray[np.int64]:
-    """Returns the outcomes of each of P policies as team 0, with its key, against each of K
-    opponents (P, K, 3).
+    """Returns the outcomes of P policies as team 0 against each of K opponents (P, K, 3).
 
-    One compiled program serves all policies.
+    Each policy has its key. One compiled program serves all policies.
     """
     for policy in policies:
         check_policy(policy, matches)
@@ -102,10 +103,9 @@ def _play(
 
 
 def scores(results: NDArray[Any]) -> Array:
-    """Returns the points of each policy against each, as both teams together, in games: (..., P, P,
-    3) to (..., P, P).
+    """Returns the points of each policy against each, over both sides: (..., P, P).
 
-    A draw counts half.
+    A point is a game won. A draw counts half. Results are (..., P, P, 3).
     """
     points = results[..., 0] + 0.5 * results[..., 1]
     return points + (results.sum(axis=-1) - points).swapaxes(-1, -2)
@@ -123,8 +123,9 @@ def rate(results: NDArray[Any], reference: int) -> Estimate:
 
 
 def _strengths(points: Array, reference: int) -> Array:
-    """Returns the maximum-likelihood ratings (..., P) of points (..., P, P), by Newton's method
-    with bounded steps.
+    """Returns the maximum-likelihood ratings (..., P) of points (..., P, P).
+
+    Newton's method with bounded steps finds them.
     """
     count = points.shape[-1]
     points = points * (1 - np.eye(count))
@@ -194,8 +195,9 @@ class Standings:
 
     @checked
     def save(self, folder: str | Path) -> None:
-        """Writes the results of every pair, what they say of each policy, and a picture of the
-        points, atomically.
+        """Writes the results of every pair, their analysis and a figure of the points.
+
+        It replaces files atomically.
         """
         folder = Path(folder)
         pairs = []

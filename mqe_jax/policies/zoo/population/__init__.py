@@ -1,5 +1,6 @@
-"""Populations: fixed opponents of each match, by version, so that results against them stay
-comparable.
+"""Populations: fixed opponents of each match, by version.
+
+Results against one version stay comparable.
 
 VERSION.json has the members of each match by name: the SHA-256 of the file
 VERSION-TASK-NAME.safetensors, or null for a policy that has this name in the match, such as
@@ -33,16 +34,15 @@ def names() -> list[str]:
 
 
 def is_named(source: object) -> bool:
-    """Returns whether a policy's name is that of a population, not of one member or anything
-    else.
-    """
+    """Returns whether a policy's name is that of a whole population."""
     found = _NAME.fullmatch(str(source))
     return found is not None and found[2] is None
 
 
 def members(name: str, task: str) -> list[str]:
-    """Returns the members of a population for a match, as names of policies; InputError for an
-    unknown one.
+    """Returns the members of a population for a match, as names of policies.
+
+    InputError for an unknown population.
     """
     version = name.removeprefix("population/")
     if name not in names():
@@ -67,8 +67,9 @@ def expand(sources: Any, task: str) -> list[Any]:
 
 
 def find(source: str, task: str, field: str = "policy") -> TrainedPolicy | str | None:
-    """Returns a population's member, its policy or the name that it has in the match; None for
-    another source.
+    """Returns a population's member: its policy, or the name that it has in the match.
+
+    None if the source is not that of a population.
 
     Raises:
         InputError: naming `field`, for a whole population or an unknown member; naming the file, if
@@ -92,8 +93,9 @@ def find(source: str, task: str, field: str = "policy") -> TrainedPolicy | str |
 
 
 def manifest(version: str, folder: Path | None = None) -> Mapping[str, Mapping[str, str | None]]:
-    """Returns the digests of a population's files by match and member, None for policies that have
-    names; `folder` is by default that of the package.
+    """Returns the SHA-256 of a population's files by match and member.
+
+    A policy that has a name has None. `folder` is by default that of the package.
     """
     few = Annotated[dict[str, str | None], MaxLen(MEMBERS)]
     return check("population", read_json((folder or FOLDER) / f"{version}.json"), dict[str, few])
