@@ -190,8 +190,9 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         return round(self.params.episode_length / self.dt)
 
     def with_num_envs(self, num_envs: int) -> QuadrupedEnv[S, P]:
-        """Returns an environment whose engine holds `num_envs` environments: itself, or one with
-        larger buffers; errors as of `changed`.
+        """Returns an environment whose engine holds `num_envs` environments.
+
+        It is this one, or one with larger buffers. Errors are as of `changed`.
         """
         return self.changed({}, num_envs)
 
@@ -231,8 +232,9 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         return made
 
     def _repeat(self, changes: Mapping[str, Any], needed: Sequence[str]) -> QuadrupedEnv[S, P]:
-        """Returns an environment made with the arguments of this one's constructor, of which some
-        are changed; errors name what `needed` it.
+        """Returns an environment made with changed arguments of this one's constructor.
+
+        Errors name what `needed` it.
         """
         kind = type(self).__name__
         names = ", ".join(needed)

@@ -1,5 +1,6 @@
-"""go1revolvingdoor, the paper's Revolving Door: two robots compete to pass a door that is wide
-enough for one.
+"""go1revolvingdoor, the paper's Revolving Door: two robots compete to pass a narrow door.
+
+The door is wide enough for one.
 """
 
 from collections.abc import Sequence

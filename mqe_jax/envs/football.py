@@ -1,5 +1,6 @@
-"""go1football-1vs1 and go1football-2vs2, one match of any size, and what all football tasks share:
-field and ball.
+"""Football matches go1football-1vs1 and go1football-2vs2, and what football tasks share.
+
+Both are one match, which can have any size. All football tasks share field and ball.
 
 The field extends from x 2 to 12; the goals are gaps in the thick walls behind both goal lines.
 """
@@ -31,8 +32,7 @@ from mqe_jax.terrain import LANE, EndWall, Gate, Plane, SpawnArea, Track
 if TYPE_CHECKING:
     from mujoco import mjx
 
-# Midpoints of the goal lines (2, 2), m: of the goal that team 0 attacks, and of the one that team 1
-# attacks.
+# Midpoints of the goal lines (2, 2), m; row t is of the goal that team t attacks.
 GOALS = np.array([[12.0, 0.0], [2.0, 0.0]], np.float32)
 _GOAL_DEPTH = 1.0  # m
 FAR = 1e3  # m; distance of robots that take no part
@@ -120,8 +120,9 @@ class Football(QuadrupedEnv[S, F]):
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Samples the ball's initial position about its spot, and moves ball and robots by the head
-        start.
+        """Samples the ball's initial position about its spot.
+
+        The head start moves ball and robots.
         """
         params = self.params
         key, start_key = jax.random.split(key) if params.head_start else (key, key)
@@ -146,16 +147,18 @@ class Football(QuadrupedEnv[S, F]):
         return jnp.array(self.ball_spot)
 
     def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Returns the midpoint of a goal line (2,), m, of a head start, and which robots attack
-        that goal (R,) bool.
+        """Returns the goal of a head start, and the robots that attack it.
+
+        They are the midpoint of the goal line (2,), m, and whether each robot attacks that goal
+        (R,) bool.
         """
         raise NotImplementedError(f"{type(self).__name__}: sample_attack() is not defined")
 
     def touches(self, before: Moment, after: Moment) -> jax.Array:
-        """Returns which robot touched the ball in a step (R,) bool: the nearest one, if the ball's
-        velocity changed.
+        """Returns which robot touched the ball in a step (R,) bool.
 
-        Contacts themselves are not read, since the engines give them in different forms.
+        It is the nearest one, if the ball's velocity changed. Contacts themselves are not read,
+        since the engines give them in different forms.
         """
         changed = jnp.linalg.norm(
             (self.ball_velocity(after.state.data) - self.ball_velocity(before.state.data))[:2]
@@ -196,8 +199,9 @@ class Football(QuadrupedEnv[S, F]):
         return data.qvel[self.objects["ball"].qvel[:3]]
 
     def in_goal(self, data: mjx.Data) -> jax.Array:
-        """Returns whether the ball's centre is past each goal line of `GOALS`, inside the mouth
-        (2,) bool.
+        """Returns whether the ball is in each goal of `GOALS` (2,) bool.
+
+        Its centre is then past the goal line, inside the mouth.
         """
         x, y, _ = self.ball(data)
         return jnp.stack([x > GOALS[0, 0], x < GOALS[1, 0]]) & (
@@ -205,9 +209,7 @@ class Football(QuadrupedEnv[S, F]):
         )
 
     def goal_distance(self, data: mjx.Data) -> jax.Array:
-        """Returns the ball's horizontal distance to the midpoint of each goal line of `GOALS` (2,),
-        m.
-        """
+        """Returns the ball's horizontal distance to each goal's midpoint in `GOALS` (2,), m."""
         return jnp.linalg.norm(self.ball(data)[:2] - GOALS, axis=-1)
 
 
@@ -343,8 +345,9 @@ class Go1Football1vs1(
         return FootballMatchState(nearest, self.next_play(was.play, before, after))
 
     def distances(self, now: Moment) -> tuple[jax.Array, jax.Array]:
-        """Returns the ball's distances to the goal that each team attacks and to each team's
-        nearest robot (2,), m.
+        """Returns the ball's distances to each team's goal and to its nearest robot, (2,) each, m.
+
+        A team's goal is the one that it attacks.
         """
         apart = jnp.linalg.norm(
             now.robots.position_w[:, :2] - self.ball(now.state.data)[:2], axis=-1
@@ -384,8 +387,9 @@ class Go1Football1vs1(
         return self.in_goal(state.data)
 
     def further(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:
-        """Returns, of teams with mates, `passes` and `both_touched`: a goal after touches by all
-        robots of the team.
+        """Returns `passes` and `both_touched` of teams with mates.
+
+        `both_touched` is a goal after touches by all robots of the team.
         """
         play = state.task.play
         touched = (play.touched | ~state.active).reshape(2, -1)

@@ -1,5 +1,6 @@
-"""go1gate, the paper's Narrow Gate: robots, by default two, pass one by one through a gap wide
-enough for one.
+"""go1gate, the paper's Narrow Gate: robots pass through a gap one by one.
+
+By default there are two robots. The gap is wide enough for one.
 """
 
 import dataclasses

@@ -1,5 +1,6 @@
-"""go1pushbox, the paper's Push Box: robots, by default two, push a box that is too heavy for one
-through a gate.
+"""go1pushbox, the paper's Push Box: robots push a heavy box through a gate.
+
+By default there are two robots. The box is too heavy for one.
 """
 
 import dataclasses
@@ -152,8 +153,9 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
     def reset_objects(
         self, key: jax.Array, qpos: jax.Array, qvel: jax.Array, assistance: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Samples the box's initial position, and moves box and robots forward by the head
-        start.
+        """Samples the box's initial position.
+
+        The head start moves box and robots forward.
         """
         params = self.params
         key, start_key = jax.random.split(key) if params.head_start else (key, key)
@@ -174,8 +176,9 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
         return PushBoxState(self.object_pose(state.data, "box")[0])
 
     def distances(self, now: Moment[PushBoxState]) -> tuple[jax.Array, jax.Array]:
-        """Returns the robots' summed distances to their places behind the box, and that of box and
-        gate in y (), m.
+        """Returns the robots' summed distance to their places and the box's to the gate, (), m.
+
+        The places are behind the box. The distance to the gate is along y.
         """
         box = self.object_pose(now.state.data, "box")[:2]
         length, width, _ = self.params.box.size

@@ -76,8 +76,7 @@ class RandomizedParams:
     motor_offset: jax.Array
     """Offset of the joint targets (R, 12), rad; not in the privileged observation."""
     joint_mechanics: jax.Array
-    """Factor on rotor inertia, damping and dry friction of the joints (R,); not in the privileged
-    observation."""
+    """Factor on rotor inertia, damping and dry friction (R,); not in the privileged observation."""
     action_lag: jax.Array
     """Delay of the actuator targets, environment steps () int32."""
 

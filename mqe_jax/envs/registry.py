@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from mqe_jax.envs.base import QuadrupedEnv
 
 ScriptedPolicy: TypeAlias = Callable[[dict[str, "jax.Array"]], "jax.Array"]
-"""Scripted policy: one team's observation blocks (A, width) by name -> actions (A, 3) in the
-`command` mode."""
+"""Scripted policy: one team's blocks (A, width) by name -> actions (A, 3) in mode `command`."""
 
 
 class Shipped(NamedTuple):
@@ -152,8 +151,7 @@ TASKS = _Tasks(dict.fromkeys(SHIPPED))
 SCRIPTED: dict[str, ScriptedPolicy | str] = {
     name: task.scripted for name, task in SHIPPED.items() if task.scripted is not None
 }
-"""Scripted policies by task id; shipped ones as MODULE:FUNCTION, since `envs` does not import
-`policies`."""
+"""Scripted policies by task id; MODULE:FUNCTION if shipped, as `envs` imports no `policies`."""
 
 NAMED_SCRIPTED: dict[str, dict[str, ScriptedPolicy | str]] = {
     "go1sheep-hard": {"by-distance": "cooperative:plan_sheep_by_distance"}

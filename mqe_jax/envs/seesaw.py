@@ -1,5 +1,6 @@
-"""go1seesaw, the paper's Climb on Seesaw: one robot keeps a seesaw tilted while the other walks up
-to a platform.
+"""go1seesaw, the paper's Climb on Seesaw: one robot keeps a seesaw tilted for the other.
+
+The other robot walks up the seesaw to a platform.
 """
 
 import jax

@@ -1,5 +1,6 @@
-"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: robots, by default two, herd sheep
-through a gate.
+"""go1sheep-easy and go1sheep-hard, the paper's Sheep Dog: robots herd sheep through a gate.
+
+By default there are two robots.
 """
 
 import dataclasses
@@ -130,9 +131,7 @@ class SheepEasyParams(TaskParams):
 
     @property
     def _room(self) -> np.ndarray:
-        """Extents x, y (2,) of the ground on which the flock may stand at the start, about its
-        centre, m.
-        """
+        """Extents x, y (2,), m, of the ground on which the flock may start, about its centre."""
         (x, y) = self.flock_center
         gate = sum(self.lengths[:2]) + _ROOM - self.gate_random[0]
         along = min(x - self.spawn_x - 2 * _ROOM, gate - x - _ROOM)
@@ -150,9 +149,7 @@ class SheepEasyParams(TaskParams):
         return math.prod(self.flock) if self.num_sheep is None else self.num_sheep
 
     def flock_grid(self) -> tuple[np.ndarray, float]:
-        """Returns the sheep's mean positions at the start (S, 2), and half the width of the noise
-        on them, m.
-        """
+        """Returns the sheep's mean initial positions (S, 2) and their noise's half width, m."""
         (rows, columns) = self.flock
         spacing = self.flock_spacing
         noise = self.flock_noise
@@ -347,8 +344,9 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
         }
 
     def _flock(self, state: State) -> tuple[jax.Array, jax.Array]:
-        """Returns which sheep are past the gate (S,) bool and the others' distances to its centre
-        (S,), m, else 0.
+        """Returns which sheep are past the gate (S,) bool, and distances to its centre (S,), m.
+
+        The distance is 0 for a sheep that is past the gate or takes no part.
         """
         through = self.through(state)
         there = self.herd.there(state.data)

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from mqe_jax.physics.scene import CompiledScene
 
 ENTITIES = "entities"
-"""Group of observations of teams of any size: their blocks differ between sizes in the number of
-entities only."""
+"""Group of observations of teams of any size; sizes differ only in the number of entities."""
 
 HIGH = 100.0
 """Height above which only parked robots are, m."""

@@ -34,8 +34,7 @@ class EnvironmentState:
     """The agents' observations by group (A, O_g), `policy` among them; after an auto-reset, those
     of the new episode."""
     privileged_obs: jax.Array
-    """Simulator state, for critics and distillation (P,); after an auto-reset, that of the new
-    episode."""
+    """Simulator state (P,), for critics and distillation; of the new episode after a reset."""
     final_groups: Any
     """Observations at the end of the last step by group, which differ from `groups` only after an
     auto-reset; None in a batch without them (`VectorEnv.final`)."""
@@ -52,8 +51,7 @@ class EnvironmentState:
     metrics: dict[str, jax.Array]
     """`reward/<name>` and the task's own, () each."""
     step: jax.Array
-    """Environment steps counted towards the time limit () int32; a trainer may set it to a random
-    offset."""
+    """Environment steps towards the time limit () int32; a trainer may set a random offset."""
     assistance: jax.Array
     """Curriculum level () in [0, 1]; 0 is the unmodified task."""
     key: jax.Array

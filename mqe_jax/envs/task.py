@@ -47,8 +47,7 @@ class Task(Sensing, Generic[S, P]):
     aim: ClassVar[str] = ""
     """What a team has to do, in one line, for somebody who drives a robot."""
     labels: ClassVar[Mapping[str, str]] = {}
-    """Words for the further results of `outcome` that are rates, by name: `mqe eval` prints these
-    with intervals."""
+    """Labels of further results of `outcome` that are rates, by name, as `mqe eval` prints them."""
     Params: ClassVar[type[Any]] = TaskParams
     """Class of the task's parameters, P."""
     npc_varied: ClassVar[tuple[str, ...]] = ()

@@ -1,5 +1,6 @@
-"""go1tug, the paper's Push Cylinder: two robots push a cylinder, which slides along one axis,
-towards each other.
+"""go1tug, the paper's Push Cylinder: two robots push a cylinder towards each other.
+
+The cylinder slides along one axis.
 """
 
 import dataclasses

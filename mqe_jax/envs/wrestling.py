@@ -1,5 +1,6 @@
-"""go1wrestling, the paper's Sumo Wrestling: teams, by default of one, push each other out of a
-ring, or over.
+"""go1wrestling, the paper's Sumo Wrestling: teams push each other out of a ring, or over.
+
+By default a team is one robot.
 """
 
 from collections.abc import Sequence
@@ -81,9 +82,7 @@ class WrestlingParams(TaskParams):
 
     @property
     def arc(self) -> tuple[float, float]:
-        """Radius, m, and angle between neighbours, rad, of the arc on which each team stands at the
-        start.
-        """
+        """Arc on which each team starts: radius, m, and angle between neighbours, rad."""
         gaps = self.num_agents // 2 - 1
         radius = max(self.spawn_y, _APART / 2 / np.sin(_ARC / gaps / 2)) if gaps else self.spawn_y
         return radius, 2 * np.arcsin(_APART / 2 / max(radius, _APART / 2))
@@ -212,8 +211,9 @@ class Go1Wrestling(Duel[jax.Array, WrestlingParams]):
         return {"win": wins, "push": pushed[self.team_of], "approach": gaps[0] - gaps[1]}
 
     def gap(self, robot_state: RobotState, still_in: jax.Array) -> jax.Array:
-        """Returns each robot's distance to the nearest opponent that is still in (A,), m; 0 if one
-        of them is not.
+        """Returns each robot's distance to the nearest opponent that is still in (A,), m.
+
+        It is 0 if the robot, or every opponent, is out.
         """
         position = robot_state.position_w
         team = self.team_of

@@ -48,8 +48,7 @@ class Snapshot(NamedTuple):
     robots: RobotState
     """State of the robots."""
     pose: jax.Array
-    """Poses x, y, yaw of the agents, each in its own (possibly mirrored) frame (A, 3), m and
-    rad."""
+    """Poses x, y, yaw (A, 3), m and rad, each in the agent's own, possibly mirrored frame."""
     action: jax.Array
     """The agents' last actions, each in its own frame (A, D)."""
     places: jax.Array

@@ -42,8 +42,7 @@ SETS: dict[str, tuple[Sensor, ...]] = {
         Lidar(pipeline={"all": Pipeline(noise=0.02)}),
     ),
 }
-"""Sets of sensors by name, for the parameter `senses`; `full` has none, only the task's own
-observations."""
+"""Sets of sensors by name, for the parameter `senses`; `full`: only the task's observations."""
 
 _ALLOWED = f"{', '.join(SETS)}, or a list of sensors, such as [proprioception, lidar]"
 

@@ -56,8 +56,7 @@ class Commander:
     commands: tuple[str, ...]  # commands that the action sets, in order
     default_commands: np.ndarray  # default commands of the skill (C,)
     ranges: Mapping[str, tuple[float, float]]
-    """Lowest and highest value of some of `commands`; the others have the skill's default
-    ranges."""
+    """Lowest and highest value of some of `commands`; the rest have the skill's default ranges."""
 
     def skill_commands(self, action: jax.Array) -> jax.Array:
         """Computes the skill's commands (A, C) from actions (A, action_size) in [-1, 1]."""
