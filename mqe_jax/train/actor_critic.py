@@ -1,5 +1,6 @@
-"""The network `actor_critic`: feed-forward or recurrent actors, centralised or decentralised
-critic.
+"""The network `actor_critic`: actors and critic of dense layers, optionally recurrent.
+
+The critic is centralised or decentralised.
 """
 
 import functools
@@ -73,8 +74,9 @@ def _trunk(
     encoder: Encoder,
     settings: ActorCritic,
 ) -> tuple[jax.Array, Memory]:
-    """Runs L steps: memory (..., H) or (), is_first (L, ...) bool, x (L, ..., n_in) -> (L, ...,
-    n_out), memory.
+    """Runs the layers over L steps: x (L, ..., n_in) -> (L, ..., n_out), memory.
+
+    The recurrent state `memory` is (..., H) or (). It restarts where `is_first` (L, ...) is true.
     """
     x = _hidden(params, encoder.apply(params.get("encoder", {}), x), settings)
     if settings.recurrent:

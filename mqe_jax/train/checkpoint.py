@@ -61,8 +61,9 @@ def _checksum(arrays: Mapping[str, np.ndarray], metadata: str) -> str:
 
 
 def save_tree(path: str | Path, tree: Any, metadata: Mapping[str, Any], *, kind: str) -> None:
-    """Writes a pytree of arrays with JSON metadata as a file of a kind; equal content gives equal
-    bytes.
+    """Writes a pytree of arrays with JSON metadata to a file.
+
+    `kind` names the kind of file. Equal content gives equal bytes.
     """
     try:
         text = json.dumps(dict(metadata), sort_keys=True)
@@ -95,12 +96,14 @@ class Stored(NamedTuple):
     metadata: dict[str, Any]
 
     def tree(self, template: Any, *, half: bool = False, part: str = "") -> Any:
-        """Returns a pytree; `template` has its structure, and leaves of the expected shapes and
-        dtypes.
+        """Returns the arrays as a pytree of the structure of `template`.
 
-        With `half`, float16 leaves are converted to float32. With `part`, it has only the leaves
-        below this path name, such as "extra/pool/". InputError, naming the file, for leaves that
-        are missing, unknown, impossible or of another shape or dtype.
+        The leaves of `template` have the expected shapes and dtypes. With `half`, float16 leaves
+        are converted to float32. With `part`, such as "extra/pool/", the pytree has only the leaves
+        below this path name.
+
+        InputError, naming the file, for leaves that are missing, unknown, impossible or of another
+        shape or dtype.
         """
         arrays = {
             name.removeprefix(part): array
@@ -209,9 +212,7 @@ def list_checkpoints(run_dir: str | Path) -> list[Path]:
 
 
 def files_by_step(folder: Path) -> list[Path]:
-    """Returns the files of a folder that are named by environment steps, as checkpoints are, oldest
-    first.
-    """
+    """Returns a folder's files named by environment steps, as checkpoints are, oldest first."""
     return sorted(p for p in folder.glob("step_*.safetensors") if _NAME.fullmatch(p.name))
 
 

@@ -100,8 +100,9 @@ class OptimizerSettings:
 
 @settings_class
 class Curriculum:
-    """Curriculum: task modifications annealed to zero during training; not applied in
-    evaluation.
+    """Curriculum: modifications of the task that training anneals to zero.
+
+    Evaluation does not apply them.
     """
 
     assistance: Fraction = 0.0
@@ -122,10 +123,11 @@ class Curriculum:
 
 @settings_class
 class Imitation:
-    """A teacher that the policy imitates in the states that it reaches itself (Schmitt et al.,
-    arXiv 1803.03835).
+    """A teacher that the policy imitates in the states that it reaches itself.
 
     The loss is the negative log-probability of the teacher's action.
+
+    Source: Schmitt et al., arXiv 1803.03835.
     """
 
     teacher: str | None = None
@@ -183,11 +185,11 @@ class Checkpointing:
 
 @settings_class
 class EvaluationSettings:
-    """Evaluation during training, on separate environments of the unmodified task (Gorsane et al.,
-    arXiv 2209.10485).
+    """Evaluation during training, on separate environments of the unmodified task.
 
-    Half of the environments use sampled actions, the others mean actions. The policy of the best
-    evaluation is kept, and the run ends with its absolute metric, over ten times as many episodes.
+    Half of the environments use sampled actions, the others mean actions. The trainer keeps the
+    policy of the best evaluation. The run ends with this policy's absolute metric, over ten times
+    as many episodes. Source: Gorsane et al., arXiv 2209.10485.
     """
 
     every: PositiveInt | None = None
@@ -303,8 +305,9 @@ RETIRED: Mapping[str, Any] = FrozenMapping({"mates": []})
 
 
 def without_retired(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a file without those of `RETIRED`; InputError if one has another
-    value than its default.
+    """Returns the settings of a file without the retired ones, `RETIRED`.
+
+    InputError if a retired setting has another value than its default.
     """
     for name, default in RETIRED.items():
         if values.get(name, default) != default:
@@ -333,8 +336,9 @@ def load_config(path: str | Path) -> TrainConfig:
 
 
 def read_settings(path: str | Path) -> dict[str, Any]:
-    """Returns the names and values of a YAML file without those of `RETIRED`; InputError naming the
-    file, if it cannot be read or as `without_retired`.
+    """Returns the names and values of a YAML file without the retired settings.
+
+    InputError, naming the file, if it cannot be read or as in `without_retired`.
     """
     values = load_yaml(path)
     try:

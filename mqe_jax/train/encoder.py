@@ -34,8 +34,9 @@ def plain(size: int) -> Encoder:
 
 
 def of_team(encoder: Encoder, agents: int) -> Encoder:
-    """Returns the encoder of the observations of all agents, one after another, each by the same
-    encoder.
+    """Returns an encoder that applies `encoder` to the observation of every agent.
+
+    The input holds the observations one after another, the output their features.
     """
 
     def apply(params: Params, x: jax.Array) -> jax.Array:
@@ -107,17 +108,15 @@ def by_block(settings: Blocks, dims: EnvDims) -> Encoder:
 
 
 def _kind(entities: Entities) -> str:
-    """Returns the name of the parameters of a kind; kinds of one name that differ in width share
-    none.
-    """
+    """Returns the name of the parameters that entities of one kind and width share."""
     return f"{entities.kind}_{entities.width}"
 
 
 def pool(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
-    """Returns maxima and means of the features of the entities that are there: (..., block) ->
-    (..., 2 W); 0 if none.
+    """Returns maxima and means of the features of the entities that are there.
 
-    Masked entities have no effect. The order of entities has none beyond rounding.
+    Shapes: (..., block) -> (..., 2 W). They are 0 if no entity is there. Masked entities have no
+    effect. The order of entities has none beyond rounding.
     """
     rows = x.reshape(*x.shape[:-1], entities.count, -1)
     there = rows[..., -1:] > 0.5 if entities.masked else jnp.ones_like(rows[..., :1], bool)
@@ -130,8 +129,9 @@ def pool(params: Params, x: jax.Array, entities: Entities) -> jax.Array:
 
 
 def convolve(params: Params, x: jax.Array, image: tuple[int, int, int]) -> jax.Array:
-    """Returns features of an image (..., channels x height x width): convolutions of 3 x 3 pixels
-    at stride 2.
+    """Returns the features of an image (..., channels x height x width).
+
+    The convolutions cover 3 x 3 pixels at stride 2.
     """
     x = jnp.moveaxis(x.reshape(*x.shape[:-1], *image), -3, -1)
     for i in range(len(params) - 1):
@@ -140,10 +140,9 @@ def convolve(params: Params, x: jax.Array, image: tuple[int, int, int]) -> jax.A
 
 
 def _patches(x: jax.Array) -> jax.Array:
-    """Returns the 3 x 3 neighbourhoods of every second pixel: (..., H, W, C) -> (..., H / 2, W / 2,
-    9 C), rounded up.
+    """Returns the 3 x 3 neighbourhoods of every second pixel.
 
-    Beyond the edges are zeros.
+    Shapes: (..., H, W, C) -> (..., H / 2, W / 2, 9 C), rounded up. Beyond the edges are zeros.
     """
     height, width = x.shape[-3:-1]
     for axis in (-3, -2):  # jnp.pad has no translation to a graph

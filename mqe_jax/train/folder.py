@@ -32,8 +32,9 @@ _OUTPUT = (".log", ".out", ".err", ".txt")  # of commands, in the folder of thei
 
 @contextlib.contextmanager
 def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
-    """Creates and locks run folders; InputError for one with a run, or with `resume` one that
-    cannot be resumed.
+    """Creates run folders and locks them while a training runs.
+
+    InputError for a folder that holds a run, or with `resume` for one that cannot be resumed.
     """
     with contextlib.ExitStack() as locks:
         check_folders(folders, resume)
@@ -45,9 +46,7 @@ def open_folders(folders: Sequence[Path], resume: bool) -> Iterator[None]:
 
 
 def check_folders(folders: Sequence[Path], resume: bool) -> None:
-    """Raises an InputError for folders in which a training could not start or, with `resume`,
-    continue.
-    """
+    """Raises an InputError if a training cannot start or, with `resume`, continue in folders."""
     for folder in folders:
         check_links(folder)
         check_alone(folder)
@@ -70,8 +69,10 @@ def load_run_config(run_dir: str | Path) -> TrainConfig:
 
 
 def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
-    """Returns each folder's checkpoint at the newest common step; None (start from scratch) if any
-    has none.
+    """Returns each folder's checkpoint at the newest step that all have.
+
+    Without such a step, all are None, for a start from scratch. That is an InputError if a folder
+    has checkpoints, but none of step 0.
     """
     if not folders:
         return []
@@ -92,9 +93,7 @@ def common_checkpoints(folders: Sequence[Path]) -> list[Path | None]:
 
 
 def check_links(run_dir: Path) -> None:
-    """Raises an InputError if something in the folder that a training replaces or removes is a
-    link.
-    """
+    """Raises an InputError if a training would replace or remove a link in the folder."""
     for name in (*RUN_FILES, *_FOLDERS):
         if (run_dir / name).is_symlink():
             raise InputError(
@@ -103,9 +102,7 @@ def check_links(run_dir: Path) -> None:
 
 
 def check_alone(run_dir: Path) -> None:
-    """Raises an InputError for a folder inside another run's, or one that holds the runs of several
-    seeds.
-    """
+    """Raises an InputError for a folder inside another run's, or one that holds runs of seeds."""
     seeds = [folder for folder in sorted(run_dir.glob("seed*")) if latest(folder)]
     others = [run_dir.parent] * (latest(run_dir.parent) is not None) + seeds
     if others:
@@ -116,8 +113,9 @@ def check_alone(run_dir: Path) -> None:
 
 
 def check_run(run_dir: Path, resume: bool = False) -> None:
-    """Raises an InputError for a folder with a run that is not to be resumed, or with other files
-    but no checkpoint.
+    """Raises an InputError for a folder that holds a run, unless `resume` continues it.
+
+    A folder with other files but no checkpoint is an error in both cases.
     """
     checkpoint = latest(run_dir)
     if checkpoint is not None and not resume:

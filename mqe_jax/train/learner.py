@@ -71,8 +71,9 @@ class TrainState:
 
 
 class Learner(NamedTuple):
-    """`init(key) -> TrainState`; `update(TrainState) -> (TrainState, metrics)`; both pure, neither
-    jitted.
+    """A training as two pure functions, which the caller jits.
+
+    `init(key) -> TrainState`; `update(TrainState) -> (TrainState, metrics)`.
     """
 
     init: Callable[[jax.Array], TrainState]
@@ -205,8 +206,9 @@ def _set_assistance(state: RolloutState, assistance: jax.Array) -> RolloutState:
 
 
 def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
-    """Sets every environment's step counter to a random value, so that the first episodes end at
-    different steps.
+    """Sets every environment's step counter to a random value.
+
+    The first episodes then end at different steps.
     """
     limit: int = getattr(env, "max_episode_steps")  # noqa: B009
 
@@ -218,8 +220,9 @@ def _stagger(env: VectorEnv, env_state: Any, key: jax.Array) -> Any:
 
 
 def _strongly_typed(state: TrainState) -> TrainState:
-    """Removes weak types, so that input and output states have the same types and `update` is
-    traced once.
+    """Removes weak types from a state, so that JAX traces `update` once.
+
+    The input and output states of `update` then have the same types.
     """
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), state)
 

@@ -75,8 +75,9 @@ class CsvLog(MetricsLog):
 
 
 def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
-    """Reads the columns of a metrics.csv (U,) each; InputError naming the file, if it is missing or
-    malformed.
+    """Reads the columns of a metrics.csv, (U,) each.
+
+    InputError, naming the file, if it is missing or malformed.
     """
     path = Path(path)
     if not path.exists():
@@ -101,8 +102,9 @@ def number(value: float, digits: int = 8) -> str:
 
 
 def _read_rows(path: Path, last: float) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns columns and complete rows up to the environment step `last`; a partial last row is
-    dropped.
+    """Returns the columns, and the complete rows up to the environment step `last`.
+
+    It drops a partial last row.
     """
     if not path.is_file():
         return [], []
@@ -197,18 +199,19 @@ LOGGERS: dict[str, Callable[[Path, int], MetricsLog]] = {
 
 
 def check_loggers(names: tuple[str, ...]) -> None:
-    """Raises an InputError if a logger needs a package that is not installed; TensorBoard is
-    optional.
+    """Raises an InputError if a logger needs a package that is not installed.
+
+    TensorBoard is optional.
     """
     if "wandb" in names and importlib.util.find_spec("wandb") is None:
         raise InputError("loggers: 'wandb' needs the package wandb; pip install 'mqe-jax[log]'")
 
 
 class ProgressLog:
-    """Progress: a live bar on a terminal or in a notebook, otherwise a plain line on standard error
-    every ten seconds.
+    """Shows progress as a live bar, or as a plain line every ten seconds.
 
-    The time left leaves out compilation and evaluation.
+    The bar needs a terminal or a notebook; the lines go to standard error. The time left leaves out
+    compilation and evaluation.
     """
 
     def __init__(self, title: str, total_steps: int, *, shown: bool = True) -> None:
@@ -338,8 +341,9 @@ def row_of(
     start_time: float,
     update_began: float,
 ) -> dict[str, float]:
-    """Returns a row of metrics.csv: steps and times, then the metrics by name; means over no
-    episodes are NaN.
+    """Returns a row of metrics.csv: steps and times, then the metrics by name.
+
+    Means over no episodes are NaN.
     """
     now = time.perf_counter()
     row: dict[str, float] = {

@@ -1,5 +1,6 @@
-"""Generalised advantage estimation, and elementwise terms of the PPO loss, which the caller
-averages.
+"""Generalised advantage estimation and the elementwise terms of the PPO loss.
+
+The caller averages the terms.
 """
 
 import math
@@ -12,17 +13,16 @@ _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Returns the log-density of a diagonal Gaussian per dimension, (..., D), to be summed for the
-    joint one.
+    """Returns the log-density of a diagonal Gaussian in each dimension (..., D).
+
+    Their sum is the joint log-density.
     """
     z = (action - mean) * jnp.exp(-log_std)
     return -0.5 * jnp.square(z) - log_std - _LOG_SQRT_2PI
 
 
 def entropy(log_std: jax.Array) -> jax.Array:
-    """Returns the entropy of a diagonal Gaussian summed over the last axis: (..., D) -> (...),
-    nats.
-    """
+    """Returns the entropy of a diagonal Gaussian, nats: (..., D) -> (...)."""
     return jnp.sum(log_std + 0.5 + _LOG_SQRT_2PI, axis=-1)
 
 
@@ -51,11 +51,10 @@ def value_loss(
     clip: float | None,
     huber_delta: float | None,
 ) -> jax.Array:
-    """Returns the value loss per element: half the square, linear beyond `huber_delta`; all of the
-    same shape.
+    """Returns the loss of each value: half the squared error, linear beyond `huber_delta`.
 
-    With `clip`, the larger of the losses of `value` and of `value` clipped to `old_value` +- clip.
-    Source: Yu et al., arXiv 2103.01955.
+    All arrays have the same shape. With `clip`, the loss is the larger of those of `value` and of
+    `value` clipped to `old_value` +- clip. Source: Yu et al., arXiv 2103.01955.
     """
 
     def loss(error: jax.Array) -> jax.Array:

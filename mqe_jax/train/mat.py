@@ -1,12 +1,11 @@
-"""The network `mat`: a transformer over agents that act sequentially, conditioned on their
-predecessors' actions.
+"""The network `mat`: a transformer over agents that act one after another.
 
-An encoder attends over the observations of all agents and outputs each agent's value; a decoder
+An encoder attends over the observations of all agents and outputs each agent's value. A decoder
 attends over the actions of preceding agents. Acting is sequential, evaluation is parallel under a
 causal mask, and both give the same log-probabilities.
 
-Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer); widths, gains and deviation as
-in OpenRL.
+Sources: Wen et al. 2022, arXiv 2205.14953 (Multi-Agent Transformer). Widths, gains and deviation
+are those of OpenRL.
 """
 
 import math
@@ -116,8 +115,9 @@ def init_params(key: jax.Array, dims: EnvDims, settings: Mat) -> Params:
 
 
 def encode(params: Params, obs: jax.Array, heads: int, active: Mask = None) -> jax.Array:
-    """Returns features of each agent from the observations of all active ones: (..., A, O) -> (...,
-    A, W).
+    """Returns each agent's features from the observations of the active agents.
+
+    Shapes: (..., A, O) -> (..., A, W).
     """
     x = nn.layer_norm(
         params["norm"], _gelu(nn.dense(params["embed"], nn.layer_norm(params["norm_in"], obs)))
@@ -133,11 +133,11 @@ def encode(params: Params, obs: jax.Array, heads: int, active: Mask = None) -> j
 def decode(
     params: Params, features: jax.Array, action: jax.Array, heads: int, active: Mask = None
 ) -> jax.Array:
-    """Returns mean actions given those of preceding active agents: (..., A, W), (..., A, D) ->
-    (..., A, D).
+    """Returns mean actions given those of preceding active agents.
 
-    An agent's own and later actions have no effect on its mean; its token is the action of the
-    active agent before it, and zero for the first one.
+    Shapes: features (..., A, W), actions (..., A, D) -> (..., A, D). An agent's own and later
+    actions have no effect on its mean. Its token is the action of the active agent before it, and
+    zero for the first one.
     """
     token = _preceding(action, active)
     x = nn.layer_norm(params["norm"], _gelu(nn.dense(params["embed"], token)))
@@ -152,9 +152,7 @@ def decode(
 
 
 def _preceding(action: jax.Array, active: Mask) -> jax.Array:
-    """Returns the action (..., A, D) of each agent's predecessor among the active ones, zero
-    without one.
-    """
+    """Returns the action of the active agent before each agent, zero without one: (..., A, D)."""
     tokens = []
     last = jnp.zeros_like(action[..., 0, :])
     for agent in range(action.shape[-2]):

@@ -72,8 +72,9 @@ class _Either:
 
 
 class Monitor:
-    """Evaluates the policies of several seeds in one program, with sampled and with mean
-    actions.
+    """Evaluates the policies of several seeds, with sampled and with mean actions.
+
+    One program evaluates all of them.
     """
 
     def __init__(self, env: VectorEnv, config: TrainConfig) -> None:
@@ -95,16 +96,15 @@ class Monitor:
         *,
         absolute: bool = False,
     ) -> list[dict[str, Any]]:
-        """Returns each policy's evaluation: env_steps, episodes, and results with sampled and with
-        mean actions.
+        """Returns each policy's evaluation, with sampled and with mean actions.
 
-        The `absolute` metric has other episodes than the evaluations that chose its policy.
+        It holds `env_steps`, `episodes` and the results, `sampled` and `deterministic`. The
+        `absolute` metric has other episodes than the evaluations that chose its policy.
         """
         actors = _twice([policy.actor for policy in policies])
         sampled = jnp.tile(jnp.array([True, False]), len(policies))
         seats = Seats((Seat(_Either(actors, sampled), self._agents, self._agents),))
-        # The same random keys for every policy and training step, to reduce the variance of
-        # comparisons.
+        # Equal random keys for every policy and training step reduce the variance of comparisons.
         key = jax.random.PRNGKey(self._config.seed)
         keys = jnp.tile(jax.random.fold_in(key, 2) if absolute else key, (2 * len(policies), 1))
         results = self._evaluator(seats, episodes, keys)
@@ -141,8 +141,7 @@ def _plain(result: Result) -> dict[str, Any]:
 def score(evaluation: dict[str, Any]) -> tuple[float, float]:
     """Returns the score by which evaluations are ranked, under sampled actions.
 
-    It is the average step reward; in a match first the win rate against the opponents of the
-    evaluation.
+    It is the average step reward. In a match, the win rate against the opponents comes first.
     """
     sampled = evaluation["sampled"]
     values = (sampled.get("win_rate", 0.0), sampled["average_step_reward"])
@@ -207,8 +206,9 @@ class EvaluationLog:
         self._write({"ended_at": env_steps})
 
     def prune(self) -> None:
-        """Removes all policies but the best; called once the checkpoint that includes it is on
-        disk.
+        """Removes all policies but the best.
+
+        Call it when the checkpoint that includes the best evaluation is on disk.
         """
         assert self._run_dir is not None
         check_locks(self._run_dir / EVALUATIONS_FILE)
@@ -232,8 +232,9 @@ def write_evaluations(run_dir: Path, evaluations: dict[str, Any]) -> None:
 
 
 def read_evaluations(run_dir: Path) -> dict[str, Any]:
-    """Reads a run's evaluations, as they were written; without the file none; InputError if the
-    file is damaged.
+    """Reads a run's evaluations, as the trainer wrote them.
+
+    There are none without the file. InputError if the file is damaged.
     """
     path = run_dir / EVALUATIONS_FILE
     if not path.is_file():

@@ -1,5 +1,6 @@
-"""What a policy needs of its environment: its file holds it, and
-`mqe_jax.acting.seats.check_policy` compares it.
+"""What a policy needs of its environment.
+
+A policy's file holds its needs. `mqe_jax.acting.seats.check_policy` compares them.
 """
 
 import dataclasses
@@ -26,8 +27,9 @@ ACTIONS = ("robot", "control", "skill", "gait", "commands", "command_ranges", "p
 
 @settings_class
 class Needs:
-    """What a policy needs of its environment; None for what the environment does not describe or
-    its actions ignore.
+    """What a policy needs of its environment.
+
+    A field is None if the environment does not describe it or its actions ignore it.
     """
 
     task: str
@@ -60,8 +62,7 @@ class Needs:
     def by_name(self) -> dict[str, Any]:
         """Returns what must be equal in an environment, by name.
 
-        These include each setting of the sensors, and the form of blocks of entities and images, if
-        known.
+        These include each setting of the sensors, and any known form of entities and images.
         """
         names = ("version", *ACTIONS, "group")
         needs = {
@@ -78,8 +79,9 @@ class Needs:
         return needs | {"observation": self.dims.observation, "action": self.dims.action}
 
     def at_size(self, found: "Needs") -> "Needs":
-        """Returns these needs with the numbers of agents and entities in others, if blocks differ
-        in nothing else.
+        """Returns these needs with the numbers of agents and entities in `found`.
+
+        They stay as they are without blocks, or if the blocks differ in anything else.
         """
         own, other = ([_one(block) for block in needs.dims.blocks] for needs in (self, found))
         if not own or own != other:
@@ -89,9 +91,7 @@ class Needs:
         )
 
     def mismatches(self, found: "Needs") -> dict[str, tuple[Any, Any]]:
-        """Returns what these needs and those of an environment differ in: the values of both by
-        name.
-        """
+        """Returns how an environment's needs differ from these: the values of both, by name."""
         own = self.by_name()
         other = found.by_name()
         known = [
@@ -131,9 +131,7 @@ def needs_of(env: Any, config: TrainConfig) -> Needs:
 
 
 def unmet(needs: Needs, env: Any, config: TrainConfig) -> dict[str, tuple[Any, Any]]:
-    """Returns what an environment lacks of the needs of a policy with these settings: the values of
-    both by name.
-    """
+    """Returns which needs of a policy an environment does not meet: both values, by name."""
     groups = group_sizes(env)
     if needs.group not in groups:
         return {"group": (needs.group, ", ".join(sorted(groups)))}

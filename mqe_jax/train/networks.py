@@ -97,21 +97,21 @@ class NetworkSettings:
 
     @property
     def critic_reads(self) -> tuple[str, ...]:
-        """The observations on which `Network.value` depends; others may be missing at the end of a
-        step.
+        """The observations on which `Network.value` depends.
+
+        Others may be missing at the end of a step.
         """
         return "obs", "privileged_obs"
 
     @property
     def any_size(self) -> bool:
-        """Whether what a policy holds does not depend on the numbers of agents and of entities in a
-        block.
-        """
+        """Whether a policy fits any number of agents, and of entities in a block."""
         return False
 
     def features(self, dims: EnvDims) -> Features | None:
-        """Returns which statistics normalise the entries of an observation; None: each entry has
-        its own.
+        """Returns which statistics normalise the entries of an observation.
+
+        With None, each entry has its own.
         """
         return None
 
@@ -156,8 +156,9 @@ NETWORKS: dict[str, type[NetworkSettings]] = {}
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 @checked
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
-    """Makes a class a settings class and registers it; the functions of its network compute in
-    single precision.
+    """Registers a class as the settings of a network.
+
+    The class becomes a settings class. The functions of its network compute in single precision.
     """
 
     def register(cls: type[Any]) -> type[Any]:
@@ -238,12 +239,11 @@ class ActorCritic(GaussianSettings):
 
 @register_network("blocks")
 class Blocks(ActorCritic):
-    """Settings of an actor and critic that encode an observation by its blocks, as the layout
-    describes them.
+    """Settings of an actor and critic that encode an observation block by block.
 
-    Entities of one kind share parameters, so that the sizes of the actor do not depend on their
-    number; convolutions encode images. Entities of a kind share the statistics of their features,
-    and masks and pixels have none.
+    The layout describes the blocks. Entities of one kind share parameters, so that the sizes of the
+    actor do not depend on their number. Convolutions encode images. Entities of a kind share the
+    statistics of their features; masks and pixels have none.
     """
 
     entity_sizes: Widths = (64, 64)

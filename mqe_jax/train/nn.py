@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from mqe_jax.core.types import Params
 
 PRECISION = "highest"
-"""Precision of the learner's matrix products: full float32, so that results do not depend on the
-GPU model."""
+"""Precision of matrix products: with full float32, results do not depend on the GPU model."""
 
 
 def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Array:
@@ -30,15 +29,15 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], scale: float) -> jax.Arra
         return q.at[:, j].set(column / jnp.linalg.norm(column))
 
     # Gram-Schmidt in place of jnp.linalg.qr, which can deadlock on a CPU with few cores: LAPACK
-    # decompositions in one program run concurrently in XLA's threads, and each waits for a free
-    # thread.
+    # decompositions run concurrently in XLA's threads, and each waits for a free one.
     q = jax.lax.fori_loop(0, min(shape), add_column, jnp.zeros_like(normal))
     return scale * (q if rows >= columns else q.T)
 
 
 def dense_init(key: jax.Array, n_in: int, n_out: int, scale: float = math.sqrt(2.0)) -> Params:
-    """Initialises an affine layer: orthogonal weight (n_in, n_out) of gain `scale`, zero bias
-    (n_out,).
+    """Initialises an affine layer: orthogonal weight of gain `scale`, zero bias.
+
+    Shapes: weight (n_in, n_out), bias (n_out,).
     """
     return {
         "weight": orthogonal(key, (n_in, n_out), scale),
@@ -52,8 +51,9 @@ def dense(params: Params, x: jax.Array, *, precision: str | None = PRECISION) ->
 
 
 def mlp_init(key: jax.Array, sizes: Sequence[int], *, final_scale: float = 1.0) -> Params:
-    """Initialises affine layers `"0"`, `"1"`, ... of shapes (sizes[i], sizes[i + 1]); the last has
-    `final_scale`.
+    """Initialises affine layers `"0"`, `"1"`, ... of shapes (sizes[i], sizes[i + 1]).
+
+    The last layer has the gain `final_scale`.
     """
     count = len(sizes) - 1
     keys = jax.random.split(key, count)
@@ -69,10 +69,10 @@ def mlp(
     activate_last: bool = False,
     precision: str | None = PRECISION,
 ) -> jax.Array:
-    """Applies the layers in order with `activation` between them (and after the last with
-    `activate_last`).
+    """Applies the layers in order, with `activation` between them.
 
-    Shapes: (..., sizes[0]) -> (..., sizes[-1]).
+    Shapes: (..., sizes[0]) -> (..., sizes[-1]). With `activate_last`, the activation follows the
+    last layer as well.
     """
     count = len(params)
     for i in range(count):
@@ -88,10 +88,9 @@ def layer_norm_init(width: int) -> Params:
 
 
 def layer_norm(params: Params, x: jax.Array) -> jax.Array:
-    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it: (..., W) ->
-    (..., W).
+    """Normalises the last axis to mean 0 and variance 1, then scales and shifts it.
 
-    Source: Ba et al., arXiv 1607.06450.
+    Shapes: (..., W) -> (..., W). Source: Ba et al., arXiv 1607.06450.
     """
     x = x - jnp.mean(x, axis=-1, keepdims=True)
     x = x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-5)
@@ -99,8 +98,9 @@ def layer_norm(params: Params, x: jax.Array) -> jax.Array:
 
 
 def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
-    """Initialises a gated recurrent unit: gates reset, update, candidate concatenated, each
-    orthogonal.
+    """Initialises a gated recurrent unit.
+
+    Its weights concatenate the gates reset, update and candidate, each orthogonal.
     """
     keys = jax.random.split(key, 6)
 

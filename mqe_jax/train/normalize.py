@@ -19,8 +19,9 @@ _TINY = 1e-12
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Features:
-    """Which statistics normalise the entries of an observation: entries of one feature share
-    them.
+    """Which statistics normalise the entries of an observation.
+
+    Entries of one feature share them.
     """
 
     index: np.ndarray
@@ -32,8 +33,9 @@ class Features:
 
 
 def features_of(blocks: Sequence[Block]) -> Features:
-    """Returns the features of blocks: entities of a kind share theirs; masks and pixels are not
-    normalised.
+    """Returns the features by which the entries of blocks are normalised.
+
+    Entities of a kind share theirs. Masks and pixels are not normalised.
     """
     names: dict[tuple[str, int, int], int] = {}
     index = []
@@ -57,8 +59,9 @@ def features_of(blocks: Sequence[Block]) -> Features:
 
 
 class RunningStatistics(NamedTuple):
-    """Mean (size,), variance (size,) and number () float32 of all samples so far; with `Features`,
-    each is (F,).
+    """Mean, variance and number of all samples so far, float32.
+
+    Mean and variance are (size,), and the number is (). With `Features`, each is (F,).
     """
 
     mean: jax.Array
@@ -107,8 +110,9 @@ def running_update(
 def _moments(
     batch: jax.Array, mask: jax.Array, features: Features
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns number, mean and variance of each feature (F,) in a batch (B, size), of entries with
-    a mask (B, size).
+    """Returns number, mean and variance of each feature (F,) in a batch (B, size).
+
+    Only entries whose `mask` (B, size) is true count.
     """
     one_hot = np.asarray(features.index[:, None] == np.arange(features.count), np.float32)
 
@@ -125,8 +129,9 @@ def _moments(
 def running_normalize(
     statistics: RunningStatistics, x: jax.Array, features: Features | None = None
 ) -> jax.Array:
-    """Returns x (..., size) normalised to mean 0 and deviation 1, clipped to +-10; constant entries
-    become 0.
+    """Returns x (..., size) normalised to mean 0 and deviation 1, clipped to +-10.
+
+    Constant entries become 0.
     """
     mean = statistics.mean
     variance = statistics.variance
@@ -139,8 +144,9 @@ def running_normalize(
 
 
 class ValueStatistics(NamedTuple):
-    """Exponential averages of value targets () and of their squares (), and the accumulated weight
-    ().
+    """Exponential averages () of value targets and of their squares.
+
+    `weight` () is the accumulated weight of both.
     """
 
     mean: jax.Array
@@ -149,8 +155,9 @@ class ValueStatistics(NamedTuple):
 
 
 def value_init(enabled: bool = True) -> ValueStatistics:
-    """Returns statistics with which values denormalise to 0; if not `enabled`, those that leave
-    values unchanged.
+    """Returns statistics with which values denormalise to 0.
+
+    If not `enabled`, they leave values unchanged.
     """
     return ValueStatistics(jnp.zeros(()), jnp.float32(not enabled), jnp.float32(not enabled))
 
@@ -158,10 +165,10 @@ def value_init(enabled: bool = True) -> ValueStatistics:
 def value_update(
     statistics: ValueStatistics, target: jax.Array, active: jax.Array, decay: float
 ) -> ValueStatistics:
-    """Updates the averages with a rollout's targets where `active`, of the same shape; weights
-    remove the initial bias.
+    """Updates the averages with a rollout's targets where `active`, of the same shape.
 
-    Source: Yu et al., arXiv 2103.01955 (there with decay 0.99999 per minibatch; here per rollout).
+    Weights remove the initial bias. Source: Yu et al., arXiv 2103.01955 (there with decay 0.99999
+    per minibatch; here per rollout).
     """
     mean = decay * statistics.mean + (1.0 - decay) * devices.mean_where(target, active)
     square = decay * statistics.square + (1.0 - decay) * devices.mean_where(
@@ -174,8 +181,7 @@ def value_update(
 def _value_moments(statistics: ValueStatistics) -> tuple[jax.Array, jax.Array]:
     """Returns mean and standard deviation, both 0 before the first update.
 
-    The standard deviation is at least a thousandth of the root mean square: rounding errors are not
-    magnified.
+    The deviation is at least a thousandth of the root mean square, to bound rounding errors.
     """
     weight = jnp.where(statistics.weight > 0.0, statistics.weight, 1.0)
     mean = statistics.mean / weight

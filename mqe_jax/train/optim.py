@@ -22,8 +22,10 @@ class AdamState(NamedTuple):
 
 
 class Optimizer(NamedTuple):
-    """`init(params) -> state`; `update(grads, state, params, learning_rate) -> (params, state,
-    grad_norm)`.
+    """An optimiser as two functions.
+
+    `init(params)` returns its state. `update(grads, state, params, learning_rate)` returns params,
+    state and the norm of the gradients.
     """
 
     init: Callable[[PyTree], AdamState]

@@ -88,8 +88,9 @@ class Actor:
     def act(
         self, seen: Observations, memory: Memory, key: jax.Array | None
     ) -> tuple[jax.Array, Memory]:
-        """Returns actions (N, A, D) in [-1, 1] and the next recurrent state; means without a
-        key.
+        """Returns actions (N, A, D) in [-1, 1] and the next recurrent state.
+
+        Without a key, the actions are the means.
         """
         obs = seen.group(self.form.needs.group)
         key = None if self.form.deterministic else key
@@ -153,8 +154,9 @@ class TrainedPolicy:
 
     @property
     def form(self) -> Form:
-        """Everything but the arrays; policies of equal form can be exchanged within compiled
-        code.
+        """Everything but the arrays.
+
+        Policies of equal form can be exchanged within compiled code.
         """
         normalize = self.config.normalization.observations
         return Form(self.needs, self.config.network, normalize, self.deterministic)
@@ -170,8 +172,9 @@ class TrainedPolicy:
         return dataclasses.replace(self, deterministic=deterministic)
 
     def at_size(self, env: Any) -> Self:
-        """Returns the policy for the numbers of agents and entities in an environment; itself if it
-        has its own.
+        """Returns the policy for the numbers of agents and entities in an environment.
+
+        A policy of fixed sizes stays as it is.
         """
         if not self.config.network.any_size or self.needs.group not in group_sizes(env):
             return self
@@ -192,11 +195,11 @@ class TrainedPolicy:
     def act(
         self, obs: Any, memory: Memory, key: RandomKey | None = None
     ) -> tuple[jax.Array, Memory]:
-        """Returns actions in [-1, 1] and the next memory: obs (N, A, O) or (A, O) -> (N, A, D) or
-        (A, D).
+        """Returns actions in [-1, 1] and the next memory.
 
-        `obs` may also be `Observations`. `memory` is the recurrent state; the caller resets it to
-        `initial_memory` at an episode's start. Without a key, the action is the mean.
+        `obs` (N, A, O) or (A, O) gives actions (N, A, D) or (A, D). It may also be `Observations`.
+        `memory` is the recurrent state; the caller resets it to `initial_memory` at an episode's
+        start. Without a key, the action is the mean.
 
         Raises:
             InputError: for an observation of another shape.
@@ -249,10 +252,10 @@ def policy_of(
 def save_policy(
     run_dir: str | Path, policy: TrainedPolicy, name: str = POLICY_FILE, *, half: bool = False
 ) -> Path:
-    """Writes a policy into a folder, which it creates, atomically; with `half`, its parameters as
-    float16.
+    """Writes a policy into a folder, which it creates.
 
-    The file holds whether the policy acts with its mean actions.
+    The write is atomic. The file also holds whether the policy acts with its mean actions. With
+    `half`, its parameters are float16.
 
     Example:
         ```python
@@ -292,12 +295,12 @@ def _file_content(policy: TrainedPolicy, half: bool) -> tuple[dict[str, Any], di
 
 @single
 def read_policy(run: str | Path) -> TrainedPolicy:
-    """Reads the policy of a run folder, or a policy file; parameters stored as float16 become
-    float32.
+    """Reads the policy of a run folder, or a policy file.
+
+    Parameters stored as float16 become float32.
 
     Raises:
-        InputError: in one line naming the file, if it is missing, damaged, of another format or
-            non-finite.
+        InputError: naming the file, if it is missing, damaged, of another format or non-finite.
     """
     file = policy_path(run)
     return policy_in(read_file(file, kind="policy"))

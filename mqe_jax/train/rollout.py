@@ -1,6 +1,4 @@
-"""Steps all environments under the current policy; collects transitions and metrics; forms
-minibatches.
-"""
+"""Collects transitions and metrics from all environments, and forms minibatches."""
 
 from typing import Any, NamedTuple
 
@@ -28,9 +26,7 @@ from mqe_jax.train.normalize import Features, RunningStatistics, running_normali
 
 
 class RolloutState(NamedTuple):
-    """State carried between rollouts: environment states, recurrent states, episode counters;
-    leading axis N.
-    """
+    """State that one rollout passes on to the next, with a leading axis N."""
 
     env_state: Any
     memory: NetworkMemory
@@ -55,8 +51,9 @@ def normalize_obs(
     enabled: bool,
     features: Features | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns both observations as network inputs: normalised where `enabled`, 0 of agents that are
-    not `active`.
+    """Returns both observations as inputs of the networks.
+
+    They are normalised if `enabled`. The observations of agents that are not `active` are 0.
     """
     if enabled:
         obs = running_normalize(normalizer.obs, obs, features)
@@ -79,13 +76,12 @@ def rollout(
     features: Features | None = None,
     teacher: Seats | None = None,
 ) -> tuple[RolloutState, Transition, dict[str, Any]]:
-    """Steps every environment `length` times; returns the new state, transitions (T, N, ...) and
-    metrics ().
+    """Steps every environment `length` times under the policy.
 
-    The environment receives `action_scale` times the sampled action. A teacher, which sees its own
-    group of observations, labels every step with its action. Metrics are means over steps and
-    environments, but `diverged` and `overflow` are counts; `ended` has the number of `episodes`
-    that ended and means over them.
+    Returns the new state, transitions (T, N, ...) and metrics (). The environment receives
+    `action_scale` times the sampled action. A teacher, which sees its own group of observations,
+    labels every step with its action. Metrics are means over steps and environments, but `diverged`
+    and `overflow` are counts; `ended` has the number of `episodes` that ended and means over them.
     """
 
     def one_step(
@@ -184,11 +180,10 @@ def take(batch: Batch, index: jax.Array) -> Batch:
 
 
 def minibatches(ppo: PPO, key: jax.Array, parts: int, envs: int) -> jax.Array:
-    """Returns the chunks of every minibatch (M, C / M), of the C = parts x envs chunks of this
-    process.
+    """Returns the chunks of every minibatch (M, C / M).
 
-    The chunks of each of `ppo.groups` groups of environments are permuted, every minibatch gets
-    equally many of them.
+    This process has C = parts x envs chunks. They are permuted within each of `ppo.groups` groups
+    of environments. Every minibatch gets equally many chunks of each group.
     """
     groups = ppo.groups // devices.size()
     keys = (

@@ -44,12 +44,11 @@ def train(
     on_update: OnUpdate | None = None,
     eval_env: VectorEnv | None = None,
 ) -> TrainState:
-    """Trains until `config.total_steps` and returns the last state; without a `run_dir`, nothing is
-    written.
+    """Trains until `config.total_steps` and returns the last state.
 
-    `resume` continues the run in the folder from its newest checkpoint; in an empty folder a new
-    run starts. `on_update` gets the state and the row of metrics.csv of every update. `eval_env`
-    has an environment for each of `config.evaluation.episodes`.
+    Without a `run_dir`, it writes nothing. `resume` continues the run in the folder from its newest
+    checkpoint; in an empty folder a new run starts. `on_update` gets the state and the row of
+    metrics.csv of every update. `eval_env` has `config.evaluation.episodes` environments.
 
     InputError, before anything is changed, for a folder that cannot be written, is in use, or holds
     a run that cannot be resumed. NonFiniteError after the first update with a loss or weight that
@@ -66,11 +65,11 @@ def train_seeds(
     on_update: OnUpdate | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[TrainState]:
-    """Trains several seeds in one program, equivalently to separate runs, each with its own run
-    folder; see `train`.
+    """Trains several seeds in one program, equivalently to separate runs.
 
-    `configs` differ only in their seeds. Runs are resumed from the newest checkpoint step common to
-    all. If `stop()` is true before an update, they are saved and end.
+    Each seed has its own run folder; see `train`. `configs` differ only in their seeds. Runs are
+    resumed from the newest checkpoint step common to all. If `stop()` is true before an update,
+    they are saved and end.
     """
     with open_training(cast, configs, run_dirs, resume) as training:
         return training.run(on_update, stop)
@@ -115,8 +114,9 @@ def open_training(
 
 
 class Training:
-    """A training of S seeds, with their states stacked, in checked and locked folders or in
-    none.
+    """A training of S seeds, whose states are stacked.
+
+    Its folders, if it has any, are checked and locked.
     """
 
     def __init__(
@@ -212,8 +212,9 @@ class Training:
         return [self._seeds.take(own, i) for i in range(len(self._configs))]
 
     def _should_stop(self, stop: Callable[[], bool], signalled: Callable[[], int]) -> bool:
-        """Returns whether the run ends here, for all processes; after a signal to one of them, all
-        save and end.
+        """Returns whether the run ends here, for all processes.
+
+        After a signal to one process, all save and end.
         """
         asked = self._processes.gather([int(stop()), signalled()])
         if number := int(asked[:, 1].max()):
@@ -283,8 +284,9 @@ class Training:
             save_policy(folder, policy)
 
     def _evaluate_if_due(self) -> bool:
-        """Evaluates after every `evaluation.every` updates and after the last one; returns whether
-        it was due.
+        """Evaluates after every `evaluation.every` updates and after the last one.
+
+        Returns whether `evaluation.every` made an evaluation due.
         """
         updates = self.env_steps // self._config.steps_per_update
         last = self._config.num_updates
@@ -331,8 +333,9 @@ def _finite(arrays: list[jax.Array]) -> jax.Array:
 
 
 def _check_finite(learned: PyTree, row: Mapping[str, float], run_dir: Path | None) -> None:
-    """Raises a NonFiniteError naming the first metrics and learned arrays that an update made NaN
-    or infinite.
+    """Raises a NonFiniteError if an update made metrics or learned arrays NaN or infinite.
+
+    The error names the first of them.
     """
     wrong = [name for name in _METRICS if not math.isfinite(row[name])] + nonfinite(learned)
     if wrong:

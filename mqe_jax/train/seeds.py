@@ -1,7 +1,6 @@
 """States of several seeds in one pytree: where seeds become a `jax.vmap`.
 
-Warp's contact buffers are shared and overwritten in every step: one copy suffices, and checkpoints
-omit them.
+The seeds share Warp's contact buffers, which every step overwrites. Checkpoints omit them.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,10 +28,10 @@ class SeedBatch:
     def map(
         self, update: Callable[[PyTree], tuple[PyTree, PyTree]]
     ) -> Callable[[PyTree], tuple[PyTree, PyTree]]:
-        """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled; metrics gain a
-        leading axis S.
+        """Returns `update(state) -> (state, metrics)` of all seeds, to be compiled.
 
-        A single seed is computed without a batch axis: bit for bit as outside of `SeedBatch`.
+        Metrics gain a leading axis S. A single seed is computed without a batch axis: bit for bit
+        as outside of `SeedBatch`.
         """
 
         def alone(states: PyTree) -> tuple[PyTree, PyTree]:

@@ -23,8 +23,9 @@ _ADAPTATION = 1.5
 
 
 class Stages:
-    """The stages of PPO, pure functions; a subclass that overrides some of them is another
-    algorithm (`mqe_jax.train.algorithms`).
+    """The stages of PPO: pure functions, which a subclass overrides for another algorithm.
+
+    `mqe_jax.train.algorithms` registers such a subclass.
 
     Example:
         ```python
@@ -45,8 +46,9 @@ class Stages:
         )
 
     def value_mask(self, learners: jax.Array) -> jax.Array:
-        """Returns which values (..., V) count; `learners` (..., A) says from which agents the
-        policy learns.
+        """Returns which values (..., V) count.
+
+        `learners` (..., A) says from which agents the policy learns.
         """
         return (
             jnp.any(learners, axis=-1, keepdims=True)
@@ -83,8 +85,9 @@ class Stages:
         return advantage, target
 
     def loss(self, params: Params, batch: Batch, now: Scheduled) -> tuple[jax.Array, Metrics]:
-        """Returns the PPO loss () of a minibatch and its parts, means over the agents that
-        learn.
+        """Returns the PPO loss () of a minibatch and its parts.
+
+        These are means over the agents that learn.
         """
         network = self.network
         config = self.config
@@ -136,8 +139,9 @@ class Stages:
     def update(
         self, carry: Carry, batch: Batch, now: Scheduled, key: jax.Array
     ) -> tuple[Carry, Metrics]:
-        """Runs the epochs of gradient steps over a rollout's batch; returns their result and mean
-        metrics.
+        """Runs the epochs of gradient steps over a rollout's batch.
+
+        Returns their result and mean metrics.
         """
         config = self.config
         parts = config.rollout_steps // batch.is_first.shape[0]
@@ -167,10 +171,10 @@ class Stages:
 
 
 def _mean(x: jax.Array, learners: jax.Array) -> jax.Array:
-    """Returns the mean over learners of values (L, C, A, ...); of a team's, (L, C, 1, ...), over
-    teams with any.
+    """Returns the mean over learners of values (L, C, A, ...).
 
-    The count is a mean over processes, over which the gradient is averaged.
+    Values (L, C, 1, ...) are those of teams, of which each with a learner counts. The count is a
+    mean over processes, over which the gradient is averaged.
     """
     mask = learners if x.shape[:3] == learners.shape else jnp.any(learners, axis=-1, keepdims=True)
     mask = jnp.broadcast_to(mask.reshape(*mask.shape, *(1,) * (x.ndim - mask.ndim)), x.shape)
@@ -179,8 +183,9 @@ def _mean(x: jax.Array, learners: jax.Array) -> jax.Array:
 
 
 def _adapt(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
-    """Returns a smaller learning rate if the KL divergence exceeds the target, a larger one if it
-    is below.
+    """Returns a learning rate that keeps the KL divergence near its target.
+
+    It falls if the divergence is above twice the target, and rises if below half of it.
     """
     factor = jnp.where(
         kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0)

@@ -1,5 +1,6 @@
-"""The state from which a training run starts: sampled, or restored from a checkpoint of the same
-settings.
+"""The state from which a training run starts.
+
+It is sampled, or restored from a checkpoint of the same settings.
 """
 
 import contextlib
@@ -42,8 +43,9 @@ def initial_key(config: TrainConfig) -> jax.Array:
 
 
 def own_learner(cast: Cast, config: TrainConfig) -> tuple[Learner, Processes]:
-    """Returns the learner of this process, which has its share of the environments, and all
-    processes.
+    """Returns the learner of this process, and all processes.
+
+    The learner has this process's share of the environments.
     """
     count = jax.process_count()
     others = {"league": cast.league, "teacher": cast.teacher}
@@ -69,8 +71,9 @@ def first_state(
     shared: PyTree,
     doing: Callable[[str], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> tuple[TrainState, float]:
-    """Returns this process's initial or restored state and the seconds already spent; `shared` as
-    in `SeedBatch`.
+    """Returns this process's initial or restored state and the seconds already spent.
+
+    `shared` is as in `SeedBatch`.
     """
     env = cast.env
     league = cast.league
@@ -171,9 +174,7 @@ def without_environments(state: TrainState) -> dict[str, Any]:
 
 
 def learned_state(state: TrainState) -> dict[str, Any]:
-    """Returns the learned state: parameters, optimiser and statistics, without environment
-    states.
-    """
+    """Returns what a training has learned: parameters, optimiser and statistics."""
     omitted = ("rollout", "key", "updates")
     return {
         field.name: getattr(state, field.name)
@@ -197,8 +198,9 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
 
 
 def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[str, Any]) -> None:
-    """Raises an InputError naming the first parameter of a task that differs in the settings, if
-    they name any.
+    """Raises an InputError if parameters of a task differ in the settings, if they name any.
+
+    The error names the first parameter that differs.
     """
     task: Any = getattr(env, "env", None)
     if not is_settings(getattr(task, "params", None)) or not (config.task or config.training_env):
