@@ -46,11 +46,9 @@ from mqe_jax.train.policy import (
 )
 
 Source = str | Path | Policy | Act
-"""What users pass as a policy: a name, a path, a policy, or its function `act` without recurrent
-state."""
+"""What users pass as a policy: a name, a path, a policy, or a memoryless function `act`."""
 Config = str | Path | TrainConfig | Mapping[str, Any] | None
-"""Settings of a training: a shipped name, a file, settings, or changes of the task's default
-ones."""
+"""Settings of a training: a shipped name, a file, settings, or changes of the defaults."""
 Params = Mapping[str, Any]
 """Task parameters by name; the control mode may be among them."""
 
@@ -115,12 +113,11 @@ def _find(name: str, task: str, field: str) -> Found:
 
 
 def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
-    """Returns the parameters, with the control mode, that policies need and that differ from a
-    task's defaults.
+    """Returns the parameters that policies need and that differ from a task's defaults.
 
-    Only trained policies of the task need something, their sensors among it, and the scripted
-    member of a population: it acts with the task's default skill. Policies of different skills get
-    parameters with which they can meet.
+    They include the control mode. Only trained policies of the task and the scripted member of a
+    population need any. Trained policies need their sensors as well; the scripted member acts with
+    the task's default skill. Policies of different skills get parameters with which they can meet.
     """
     found = list(found)
     every = [getattr(each, "needs", None) for each in found]
@@ -147,11 +144,9 @@ def environment(
     impl: str = "auto",
     num_envs: int = 1,
 ) -> QuadrupedEnv:
-    """Returns the environment of a task's id; one that is passed as it is, or with other
-    parameters.
+    """Returns the environment of a task's id, or the passed one with other parameters.
 
-    `num_envs` environments fit into the buffers of a new one. `impl` is the physics engine of an
-    id's.
+    `num_envs` environments fit into the buffers of a new one. `impl` is its physics engine.
     """
     if isinstance(task, QuadrupedEnv):
         if impl not in ("auto", task.impl):
@@ -315,8 +310,9 @@ def _usual_policy(name: str, params: Params) -> str:
 
 
 def own_parameters(env: QuadrupedEnv) -> dict[str, Any]:
-    """Returns the parameters of an environment, with the control mode, that differ from its task's
-    defaults.
+    """Returns the parameters of an environment that differ from its task's defaults.
+
+    They include the control mode.
     """
     control = {} if env.control == "command" else {"control": env.control}
     return {**control, **differences(env.params, env.Params())}
@@ -395,8 +391,7 @@ def load_policy(
             a path. A folder with one of these names is ./NAME.
         env: the task; in a match the policy acts for one team. Names need it, and policies of paths
             are checked against it.
-        deterministic: whether a trained policy acts with its mean actions. It also does if its file
-            says so.
+        deterministic: whether a trained policy acts with mean actions. Its file can also say so.
 
     Returns:
         A `TrainedPolicy` for a shipped one or a path, else a `SimplePolicy`.
@@ -463,8 +458,9 @@ def seat(
     *,
     deterministic: bool = False,
 ) -> Policy:
-    """Returns the policy of a name, a path or an object as it acts for a team of an environment;
-    arguments and errors as `find` and `fit`.
+    """Returns the policy of a name, a path or an object as it acts for a team of `env`.
+
+    Arguments and errors are those of `find` and `fit`.
     """
     found = find(source, env.name, field=field, read=read)
     return fit(found, env, deterministic=deterministic, field=field, name=str(source))

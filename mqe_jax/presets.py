@@ -27,8 +27,7 @@ from mqe_jax.train.config import TrainConfig, read_settings
 CONFIG_FOLDER = Path(__file__).parent / "configs"
 
 Layers = Mapping[str, Mapping[str, Any]]
-"""Changes of settings, named as in `override`, by the name that errors give them; the last ones
-count."""
+"""Changes of settings, as `override` has them, by their name in errors; the last ones count."""
 
 
 def resolve(
@@ -49,8 +48,7 @@ def resolve(
     5. `onboard.yaml`, if a layer sets the task parameter `senses` and none sets `group`.
     6. `layers`.
 
-    A `TrainConfig` stands for 1 to 5. A parameter in a layer's `env` leaves the `train_env` of the
-    layers below.
+    A `TrainConfig` stands for 1 to 5. A parameter in a layer's `env` leaves any lower `train_env`.
 
     Raises:
         InputError: for a file, an algorithm or a value that is not allowed, or for sensors above
@@ -162,8 +160,9 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
 
 
 def preset(algorithm: str) -> dict[str, Any]:
-    """Returns the settings that define an algorithm, for `override`; InputError for an unknown
-    name.
+    """Returns the settings that define an algorithm, for `override`.
+
+    InputError for an unknown name.
     """
     algorithms = {name: changes for name, changes in _parts("paper").items() if name != "common"}
     if check("algorithm", algorithm, str) not in algorithms:
@@ -192,7 +191,8 @@ def _is_match(task: str) -> bool:
 
 @functools.cache
 def _parts(file: str) -> dict[str, Any]:
-    """Returns a shipped file of settings: its parts, of which `common` are those of all, or
-    settings.
+    """Returns a shipped file of settings: its parts by name, or settings.
+
+    The part `common` holds the settings of all parts.
     """
     return load_yaml(CONFIG_FOLDER / f"{file}.yaml")

@@ -1,5 +1,6 @@
-"""Unbiased evaluation: a fixed quota of episodes from each environment, so that short ones are not
-over-represented.
+"""Unbiased evaluation: each environment contributes a fixed quota of episodes.
+
+Short episodes are not over-represented.
 """
 
 import math
@@ -102,10 +103,10 @@ class Evaluator:
 
     @single
     def __call__(self, seats: Seats, episodes: int, keys: jax.Array) -> list[Result]:
-        """Returns the results of B evaluations, for random keys (B, 2); errors as in
-        `evaluate_batch`.
+        """Returns the results of B evaluations, for random keys (B, 2).
 
-        The arrays of `seats` have a leading axis B. Seats of one form are compiled once.
+        The arrays of `seats` have a leading axis B. Seats of one form are compiled once. Errors are
+        those of `evaluate_batch`.
         """
         count = self._env.num_envs
         quota = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)

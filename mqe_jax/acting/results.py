@@ -12,8 +12,9 @@ _NORMAL = 1.959964  # two-sided 95% quantile
 
 
 class Rate(NamedTuple):
-    """A rate of episodes with its 95% Wilson interval (Wilson 1927, doi
-    10.1080/01621459.1927.10502953).
+    """A rate of episodes with its 95% Wilson interval.
+
+    Source: Wilson 1927, doi 10.1080/01621459.1927.10502953.
 
     Example:
         ```python
@@ -37,8 +38,9 @@ class Rate(NamedTuple):
 
     @classmethod
     def of(cls, value: float, episodes: int) -> "Rate":
-        """Returns a rate over independent episodes; the interval of a mean of values in [0, 1] is
-        conservative.
+        """Returns a rate over independent episodes.
+
+        The interval of a mean of values in [0, 1] is conservative.
         """
         spread = _NORMAL**2 / episodes
         middle = (value + spread / 2) / (1 + spread)
@@ -127,10 +129,10 @@ class Result:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON; the entries of all mappings but `terms` become top-level
-        keys.
+        """Returns plain values for JSON.
 
-        `intervals` has the ends of the 95% interval of each rate.
+        The entries of all mappings but `terms` become top-level keys. `intervals` has the ends of
+        the 95% interval of each rate.
         """
         mappings = ("task", "about", "endings", "outcomes", "match", "by_opponent", "labels")
         values = {k: v for k, v in vars(self).items() if k not in mappings}

@@ -22,18 +22,16 @@ from mqe_jax.core.types import (
 )
 
 Act = Callable[[Any, Memory, jax.Array], tuple[jax.Array, Memory]]
-"""`act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`, traceable; `memory` is the
-recurrent state."""
+"""Traceable `act(obs (N, A, O), memory, key) -> (action (N, A, D), memory)`."""
 
 
 class Policy(Protocol):
-    """Whatever acts for a team of A agents in N environments; pure, and usable inside compiled
-    code.
+    """Whatever acts for a team of A agents in N environments.
 
-    `initial_memory(num_envs)` returns the recurrent state at an episode's start, leading axis N.
-    `act(obs, memory, key) -> (action, memory)` maps observations (N, A, O) to actions (N, A, D) in
-    [-1, 1]. A policy with `groups`, the names of the observation groups that it sees, gets
-    `Observations`.
+    Its functions are pure, and usable inside compiled code. `initial_memory(num_envs)` returns the
+    recurrent state at an episode's start, leading axis N. `act(obs, memory, key) -> (action,
+    memory)` maps observations (N, A, O) to actions (N, A, D) in [-1, 1]. A policy with `groups`,
+    the names of the observation groups that it sees, gets `Observations`.
     """
 
     @property
@@ -121,8 +119,9 @@ class OneOf:
     def act(
         self, seen: Observations, memory: tuple[Memory, ...], key: jax.Array
     ) -> tuple[jax.Array, tuple[Memory, ...]]:
-        """Returns the actions (N, A, D) of the chosen policy, and the recurrent states with its
-        next one.
+        """Returns the actions (N, A, D) of the chosen policy, and the recurrent states.
+
+        These include the next state of the chosen policy.
         """
 
         def turn(place: int) -> tuple[jax.Array, tuple[Memory, ...]]:
@@ -156,8 +155,7 @@ class Seat:
     """A policy, and the agents of a block of environments for which it acts."""
 
     policy: Any
-    """What acts, with `groups`, `initial_memory` and `act`: a pytree such as an `Actor`, or
-    `Fixed`."""
+    """A pytree with `groups`, `initial_memory` and `act`, such as an `Actor` or `Fixed`."""
     sees: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     """Agents whose observations the policy gets: its team, in the policy's order."""
     acts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
@@ -181,8 +179,9 @@ class Seat:
     def act(
         self, seen: Observations, memory: Memory, key: jax.Array, action: jax.Array
     ) -> tuple[jax.Array, Memory]:
-        """Returns the actions of all agents (N, A, D) with this policy's, and its next recurrent
-        state; see `Seats.act`.
+        """Returns all agents' actions with this policy's, and its next recurrent state.
+
+        `action` (N, A, D) has the actions of all agents; see `Seats.act`.
         """
         rows = self.rows(len(action))
         own = jax.tree.map(lambda x: x[rows, _index(self.sees)], seen)
@@ -305,8 +304,7 @@ class Seats:
         it is, several split it.
 
         Raises:
-            InputError: for a policy that returns actions of another shape or another recurrent
-                state.
+            InputError: for actions of another shape, or another recurrent state.
         """
         keys = key
         if not isinstance(key, tuple):
@@ -344,8 +342,9 @@ class _Function:
 
 
 def check_policy(policy: Policy, env: Any, name: str = "policy", field: str = "policy") -> None:
-    """Checks that a policy fits an environment, a task or a batch of it: its task, its agents, and
-    what it finds `unmet`, as a trained policy does.
+    """Checks that a policy fits an environment, a task or a batch of it.
+
+    It compares the task, the agents, and what the policy finds `unmet`, as a trained policy does.
 
     Raises:
         InputError: naming `field`, the policy and what differs, with the values of both.

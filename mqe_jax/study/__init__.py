@@ -1,3 +1,4 @@
-"""Studies of many runs: statistics over seeds, sweeps over tasks and algorithms, reports with the
-paper's values.
+"""Studies of many runs: statistics over seeds, sweeps and reports.
+
+Sweeps cover tasks and algorithms. Reports show the paper's values beside the runs'.
 """

@@ -28,8 +28,9 @@ def group(runs: Sequence[Run]) -> dict[Cell, list[Run]]:
 
 
 def names(cells: Cells, field: str) -> list[str]:
-    """Returns the tasks, algorithms or variants of cells, in their order; `field` is that of
-    `Cell`.
+    """Returns the tasks, algorithms or variants of cells, in their order.
+
+    `field` is that of `Cell`.
     """
     return list(dict.fromkeys(getattr(cell, field) for cell in cells))
 
@@ -48,11 +49,10 @@ def _per_column(scores: Array) -> Array:
 
 
 def band(runs: Sequence[Run], column: str = REWARD) -> tuple[Array, Array, Array, Array]:
-    """Returns steps (K,), interquartile mean and interval bounds (K,) of a column over a cell's
-    seeds.
+    """Returns steps, interquartile mean and interval bounds of a column over a cell's seeds.
 
-    Curves are interpolated to the first seed's steps, as far as all seeds have come; a missing
-    reward term is zero.
+    Each is (K,). Curves are interpolated to the first seed's steps, as far as all seeds have come.
+    A missing reward term is zero.
     """
     steps = runs[0].curve["env_steps"]
     steps = steps[steps <= min(run.curve["env_steps"][-1] for run in runs)]
@@ -69,8 +69,9 @@ def band(runs: Sequence[Run], column: str = REWARD) -> tuple[Array, Array, Array
 
 
 def final_reward(run: Run) -> float:
-    """Returns the average step reward at the end of a training run: the mean over the last rows of
-    its curve.
+    """Returns the average step reward at the end of a training run.
+
+    It is the mean over the last rows of the run's curve.
     """
     values = run.curve[REWARD]
     return float(values[-max(1, round(LAST * len(values))) :].mean())
@@ -83,8 +84,9 @@ def absolute(run: Run, name: str) -> float:
 
 
 def select_evaluated(cells: Cells) -> Cells:
-    """Returns the cells whose runs all have evaluations, with these, of the unmodified task, as
-    curves.
+    """Returns the cells whose runs all have evaluations, with these as curves.
+
+    The evaluations are of the unmodified task.
     """
     chosen: dict[Cell, list[Run]] = {}
     for cell, runs in cells.items():
@@ -116,8 +118,9 @@ def curve_rows(cells: Cells) -> Rows:
 
 
 def final_rows(cells: Cells) -> Rows:
-    """Returns the table of final values, a row for each cell; an estimate is NaN if a seed has no
-    value.
+    """Returns the table of final values, a row for each cell.
+
+    An estimate is NaN if a seed has no value.
     """
     rows = []
     for cell, runs in cells.items():

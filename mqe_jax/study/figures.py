@@ -84,10 +84,9 @@ def plot_curves(cells: Cells) -> Any:
 
 
 def draw_evaluations(cells: Cells) -> bytes:
-    """Returns the evaluations during training, of the unmodified task with sampled actions: a panel
-    for each task.
+    """Returns a figure of the evaluations during training, a panel for each task.
 
-    Every panel has its own legend.
+    The evaluations are of the unmodified task with sampled actions. Every panel has its own legend.
     """
     tasks = names(cells, "task")
     chosen = select_evaluated(cells)

@@ -16,16 +16,19 @@ from mqe_jax.train.policy import POLICY_FILE
 
 
 def provenance(**passed: Any) -> dict[str, Any]:
-    """Returns what a result comes from, as JSON has it: what was passed, by name, the package's
-    `version`, and `files`, the digests of the files that are named in it.
+    """Returns what a result comes from, as JSON has it.
+
+    It holds what was passed, by name, the package's `version`, and `files`, the digests of the
+    files that the passed values name.
     """
     plain = to_mapping({"version": mqe_jax.__version__, **passed})
     return {**plain, "files": digests(plain)}
 
 
 def digests(values: Any) -> dict[str, str]:
-    """Returns the SHA-256 of every file, and of the policy of every run folder, that a text in
-    nested values names.
+    """Returns the SHA-256 of every file that a text in nested values names.
+
+    For a run folder it is that of its policy.
     """
     named = {text: digest(text) for text in _texts(values) if text and text not in TASKS}
     return {text: found for text, found in named.items() if found is not None}
@@ -51,8 +54,9 @@ def _texts(values: Any) -> Iterator[str]:
 
 
 def check_provenance(file: Path, wanted: Mapping[str, Any]) -> None:
-    """Raises an InputError if the results beside a file, which `keep_provenance` wrote, come from
-    something else.
+    """Raises an InputError if the results beside a file come from something else.
+
+    `keep_provenance` wrote the file.
     """
     if not file.is_file():
         return

@@ -29,8 +29,9 @@ Curve = dict[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Cell:
-    """One task, algorithm and variant of a sweep; runs of different seeds belong to the same
-    cell.
+    """One task, algorithm and variant of a sweep.
+
+    Runs of different seeds belong to the same cell.
     """
 
     task: str
@@ -79,8 +80,9 @@ def is_finished(run_dir: Path) -> bool:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Reads the finished runs of a sweep's folder, ordered by path and seed; InputError without
-    any.
+    """Reads the finished runs of a sweep's folder, ordered by path and seed.
+
+    InputError if there are none.
     """
     runs = []
     for path in sorted(folder.glob(f"runs/*/*/seed*/{CONFIG_FILE}")):
@@ -105,8 +107,9 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def read_curve(path: str | Path) -> Curve:
-    """Reads the columns of a metrics.csv; InputError naming the file, if it is missing, malformed
-    or has no row.
+    """Reads the columns of a metrics.csv.
+
+    InputError, naming the file, if it is missing, malformed or has no row.
     """
     curve = read_metrics(path)
     if not {"env_steps", REWARD} <= set(curve) or not len(curve["env_steps"]):
@@ -119,8 +122,9 @@ def read_curve(path: str | Path) -> Curve:
 def table(
     rows: Sequence[Mapping[str, Any]], names: Sequence[str] = (), digits: int = DIGITS
 ) -> str:
-    """Returns rows as CSV text, of the columns `names` or those of the first row; numbers as
-    `number` writes them.
+    """Returns rows as CSV text.
+
+    The columns are `names`, or those of the first row. Numbers are as `number` writes them.
     """
     text = io.StringIO()
     writer = csv.DictWriter(text, list(names or rows[0]), lineterminator="\n")

@@ -1,10 +1,10 @@
-"""Statistics over few runs: interquartile mean, stratified bootstrap intervals, probability of
-improvement.
+"""Statistics over few runs, such as interquartile means and bootstrap intervals.
 
-Scores are float arrays (runs, tasks); a statistic maps scores with any leading axes (..., runs,
-tasks) to (...). Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al.
-2022, arXiv 2209.10485 (their use in MARL). Numbers equal those of the `rliable` package
-(tests/test_study_report.py).
+Scores are float arrays (runs, tasks). A statistic maps scores with any leading axes (..., runs,
+tasks) to (...). Numbers equal those of the `rliable` package (tests/test_study_report.py).
+
+Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al. 2022, arXiv
+2209.10485 (their use in MARL).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,8 +19,9 @@ Array = NDArray[np.float64]
 
 
 def interquartile_mean(scores: ArrayLike) -> Array:
-    """Returns the mean of scores without the lowest and the highest quarter: (..., runs, tasks) ->
-    (...).
+    """Returns the mean of scores without the lowest and the highest quarter.
+
+    Shapes: (..., runs, tasks) -> (...).
     """
     every = np.asarray(scores, np.float64)
     flat = every.reshape(*every.shape[:-2], -1)
@@ -29,8 +30,9 @@ def interquartile_mean(scores: ArrayLike) -> Array:
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
-    """Returns P(score of x > score of y), mean over tasks: (..., runs, tasks) both -> (...); ties
-    count half.
+    """Returns P(score of x > score of y), mean over tasks; ties count half.
+
+    Shapes: both (..., runs, tasks) -> (...).
     """
     pairs = np.asarray(x, np.float64)[..., :, None, :] - np.asarray(y, np.float64)[..., None, :, :]
     return np.mean((pairs > 0) + 0.5 * (pairs == 0), axis=(-3, -2, -1))
@@ -39,12 +41,12 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
 def bootstrap_interval(
     scores: Sequence[Array], statistic: Callable[..., Array], random: Any, samples: int = 2000
 ) -> tuple[Array, Array]:
-    """Returns the bounds of a 95% percentile bootstrap interval; runs are resampled within each
-    task.
+    """Returns the bounds of a 95% percentile bootstrap interval.
 
-    `scores` are the statistic's arguments, if several, each resampled independently. Tasks are the
-    strata and stay fixed. `random` is a `numpy.random.Generator`, or has its `integers`. The bounds
-    of one run are the statistic. InputError if scores are not (runs, tasks), or not finite.
+    Runs are resampled within each task. `scores` are the statistic's arguments, if several, each
+    resampled independently. Tasks are the strata and stay fixed. `random` is a
+    `numpy.random.Generator`, or has its `integers`. The bounds of one run are the statistic.
+    InputError if scores are not (runs, tasks), or not finite.
     """
     groups = [np.asarray(group, np.float64) for group in scores]
     for group in groups:
@@ -64,8 +66,9 @@ def bootstrap_interval(
 
 
 def normalize(scores: Mapping[str, Array], low: Array, high: Array) -> dict[str, Array]:
-    """Returns scores of each algorithm, (runs, tasks), as fractions of the range low (tasks,) to
-    high (tasks,).
+    """Returns each algorithm's scores as fractions of the range from `low` to `high`.
+
+    Scores are (runs, tasks), the bounds (tasks,).
     """
     width = np.where(high > low, high - low, 1.0)
     return {name: (values - low) / width for name, values in scores.items()}

@@ -44,14 +44,14 @@ SWEEP_FILE = "sweep.yaml"
 PROVENANCE = "provenance.json"
 
 MakeEnvironments = Callable[[TrainConfig, int], Cast]
-"""Factory of the training and evaluation environments for a given number of seeds trained
-together."""
+"""Makes the training and evaluation environments for a number of seeds in one program."""
 
 
 @settings_class
 class Sweep:
-    """Settings of a sweep, which trains every combination of tasks, algorithms, variants and
-    seeds.
+    """Settings of a sweep over tasks, algorithms, variants and seeds.
+
+    The sweep trains every combination.
     """
 
     tasks: Annotated[tuple[str, ...], MinLen(1)]
@@ -120,8 +120,9 @@ class Job:
 
 
 def load_sweep(path: Path, part: str | None = None) -> Sweep:
-    """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to parts; InputError
-    names the file.
+    """Reads a sweep's YAML file, or the sweep `part` of a file that maps names to parts.
+
+    InputError names the file.
     """
     values = read_part(path, part)
     try:
@@ -146,8 +147,9 @@ def read_part(path: Path, part: str | None = None) -> dict[str, Any]:
 
 
 def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
-    """Returns the cells of a sweep whose names, TASK/ALGORITHM[+VARIANT], match a pattern; all
-    without patterns.
+    """Returns the cells of a sweep whose names match a pattern; all without patterns.
+
+    A name is TASK/ALGORITHM[+VARIANT].
     """
     product = itertools.product(sweep.tasks, sweep.algorithms, sweep.variants)
     cells = {cell.path.as_posix(): cell for cell in itertools.starmap(Cell, product)}
@@ -155,8 +157,9 @@ def select(sweep: Sweep, patterns: Sequence[str] = ()) -> list[Cell]:
 
 
 def match_names(names: Iterable[str], patterns: Sequence[str], example: str) -> list[str]:
-    """Returns the names of cells that match a pattern, all without patterns; InputError for one
-    that matches none.
+    """Returns the names of cells that match a pattern; all without patterns.
+
+    InputError for a pattern that matches none.
     """
     known = [*names]
     wanted = set[str]()
@@ -179,14 +182,13 @@ def plan(
     seeds: Sequence[int] = (),
     check: Callable[[TrainConfig, int], object] = lambda config, seeds: None,
 ) -> list[Job]:
-    """Returns the remaining jobs, in the order of training, of the cells that `select` returns for
-    `cells`.
+    """Returns the remaining jobs of a sweep, in the order of training.
 
-    `seeds` are some of the sweep's, all if empty. `config_of(cell, layers)` returns the settings of
-    a cell, with the sweep's changes. `check(config, seeds)` raises an InputError for settings with
-    which so many seeds could not start; no cell is trained before. Seeds whose newest checkpoints
-    differ are trained in separate jobs. InputError for a cell whose runs come from other settings,
-    files or another version.
+    They are of the cells that `select` returns for `cells`. `seeds` are some of the sweep's, all if
+    empty. `config_of(cell, layers)` returns the settings of a cell, with the sweep's changes.
+    `check(config, seeds)` raises an InputError for settings with which so many seeds could not
+    start; no cell is trained before. Seeds whose newest checkpoints differ are trained in separate
+    jobs. InputError for a cell whose runs come from other settings, files or another version.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
@@ -260,8 +262,9 @@ def _run(folder: Path, cell: Cell, seed: int) -> Path:
 
 
 def estimate(folder: Path, jobs: Sequence[Job]) -> list[float]:
-    """Returns the estimated duration of each job, s, from runs of the same task and algorithm, else
-    of all; or NaN.
+    """Returns the estimated duration of each job, s.
+
+    It follows from runs of the same task and algorithm, else from all. It is NaN without runs.
     """
     speeds: dict[tuple[str, ...], list[float]] = {}
     for path in sorted(folder.glob("runs/*/*/seed*/metrics.csv")):
