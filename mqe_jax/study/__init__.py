@@ -1,4 +1,4 @@
 """Studies of many runs: statistics over seeds, sweeps and reports.
 
-Sweeps cover tasks and algorithms. Reports show the paper's values beside the runs'.
+Sweeps train algorithms on tasks. Reports compare the values of their runs.
 """
