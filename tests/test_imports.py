@@ -34,7 +34,6 @@ CHECKING = {
     "selfplay.league.tournament",
     "selfplay.opponents",
     "train.algorithms",
-    "train.networks",
     "train.policy",
     "walk.evaluation",
     "walk.training",

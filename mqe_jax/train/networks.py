@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import nearest
 from mqe_jax.core.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
-from mqe_jax.core.settings import build, checked, fail, name_settings, settings_class
+from mqe_jax.core.settings import build, check, fail, name_settings, settings_class
 
 if TYPE_CHECKING:
     import jax
@@ -154,12 +154,13 @@ NETWORKS: dict[str, type[NetworkSettings]] = {}
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
-@checked
 def register_network(name: str) -> Callable[[type[Any]], type[Any]]:
     """Registers a class as the settings of a network.
 
     The class becomes a settings class. The functions of its network compute in single precision.
     """
+    # Type checkers would not see what `checked` returns as a decorator of settings classes.
+    check("name", name, str)
 
     def register(cls: type[Any]) -> type[Any]:
         if not isinstance(cls, type) or not callable(getattr(cls, "build", None)):
