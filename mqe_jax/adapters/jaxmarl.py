@@ -137,6 +137,7 @@ class Env(MultiAgentEnv):
         return self.get_obs(after), after, rewards, dones, infos
 
     @single
+    @checked
     def step_env(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: RandomKey, state: State, actions: Mapping[str, jax.Array]
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
