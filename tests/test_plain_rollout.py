@@ -276,7 +276,9 @@ def test_results_are_those_of_the_agents_that_take_part() -> None:
     def copy(params, memory, obs, key, active):
         return (obs[..., 2:3], obs[..., 2:3], memory)
 
-    value: Any = lambda *_: (None, ())  # noqa: E731
+    def value(*_: Any) -> Any:
+        return None, ()
+
     network = Network(nothing, lambda p: p, nothing, copy, value, nothing)
     zero = jnp.zeros(N)
     start = RolloutState(

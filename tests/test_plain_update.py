@@ -116,7 +116,10 @@ def drawn(random: np.random.Generator, config: TrainConfig, updates: int) -> tup
     """
     env = Probe(probes.show_hidden, probes.pay_one, N, A, D, features=F - 1)
     env = dataclasses.replace(env, show=lambda hidden, step: jnp.tile(hidden[:, None], (1, F - 1)))
-    normal: Any = lambda *shape: np.asarray(random.normal(size=shape), np.float32)  # noqa: E731
+
+    def normal(*shape: int) -> Any:
+        return np.asarray(random.normal(size=shape), np.float32)
+
     shapes = jax.eval_shape(learner_of(env, config).init, jax.random.PRNGKey(0))
     state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     size = env.observation_size, env.privileged_observation_size
