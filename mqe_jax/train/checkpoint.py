@@ -117,7 +117,7 @@ class Stored(NamedTuple):
                     f"{self.path}: {name} is missing; the file has other settings or is of another "
                     "version"
                 )
-        for name in arrays:
+        for name in sorted(arrays):
             if name not in expected:
                 raise InputError(
                     f"{self.path}: unexpected entry {name}, not defined by the current settings"
