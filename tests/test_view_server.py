@@ -309,6 +309,7 @@ def test_no_text_of_the_panel_runs_as_html(monkeypatch: pytest.MonkeyPatch) -> N
         viewer.announce(env, 2)
         page.goto(viewer.url)
         page.get_by_text("is being compiled").wait_for()
+        run.advance()  # compiles the step with the true names
         run.terms = (EVIL, run.terms[-1])
         run.last = [EVIL, EVIL]
         viewer.show(run)
