@@ -11,8 +11,10 @@ state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64)
 state = jax.jit(jax.vmap(env.step))(state, action)  # (64, env.num_agents, env.action_size)
 """
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from mqe_jax.core.lazy import load
+from mqe_jax.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from mqe_jax.acting.results import Result
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
     from mqe_jax.walk.evaluation import evaluate_skill
     from mqe_jax.walk.training import train_skill
 
-__version__ = "0.3.0"
 __all__ = [
     "Clip",
     "QuadrupedEnv",
@@ -82,4 +83,4 @@ def __getattr__(name: str) -> Any:
     # Heavy imports (JAX, MuJoCo) are deferred to keep `mqe --help` fast.
     if name not in __all__:
         raise AttributeError(f"module 'mqe_jax' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"mqe_jax.{_HOMES.get(name, 'envs')}"), name)
+    return load(f"mqe_jax.{_HOMES.get(name, 'envs')}:{name}")

@@ -11,22 +11,10 @@ up; metres.
 import dataclasses
 import math
 
-import mujoco
-import numpy as np
-
 from mqe_jax.core.errors import InputError
-from mqe_jax.physics.appearance import GOAL_SITE, GROUND_GROUP, HIDDEN_GROUP, SITE_GROUP
-from mqe_jax.physics.appearance.shapes import (
-    WALL_COLOR,
-    WALL_GROUP,
-    Ground,
-    Style,
-    gate_wall,
-    side_wall,
-)
-from mqe_jax.physics.collision import GROUND_BIT, WALL_BIT
+from mqe_jax.physics.appearance.shapes import Ground, Style
+from mqe_jax.physics.walls import Anchor, Barrier, Layout, Wall
 
-_THICKNESS = 0.04  # of the side walls, m
 LANE = 0.75  # m, distance between robots that start side by side, at least
 ROW = 1.0  # m, distance between those that start one behind the other
 
@@ -38,58 +26,6 @@ def rows_of(robots: int, width: float) -> tuple[int, float]:
     """
     rows = math.ceil(robots / max(int(width / LANE), 1))
     return math.ceil(robots / rows), ROW * (rows - 1)
-
-
-@dataclasses.dataclass(frozen=True)
-class Wall:
-    """A box-shaped wall."""
-
-    name: str
-    center: tuple[float, float, float]
-    """Centre (3,), m; relative to the anchor (z: to the ground) if `anchor` is not None."""
-    size: tuple[float, float, float]
-    """Full extents (3,), m."""
-    anchor: int | None = None
-    """Index of the anchor to which it is attached, or None for a fixed wall."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Barrier:
-    """An infinite vertical plane that blocks motion against `normal`; rendered as a box."""
-
-    name: str
-    point: tuple[float, float]
-    """A point on the plane (2,), m."""
-    normal: tuple[float, float]
-    """Unit normal (2,)."""
-    length: float
-    """Rendered length, m."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Anchor:
-    """A reference point for moving walls, sampled at every reset."""
-
-    name: str
-    """The block's name and number, such as `gate1`."""
-    position: tuple[float, float]
-    """Mean position (2,), m."""
-    spread: tuple[float, float]
-    """Half-widths of the uniform range in x and y (2,), m."""
-    kind: str = "gate"
-    """What sensors take the gap at this point for."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """Contribution of one block to the track; positions in the environment frame, m."""
-
-    walls: tuple[Wall, ...] = ()
-    """Fixed and moving walls; `anchor` is an index into this layout's anchors."""
-    barriers: tuple[Barrier, ...] = ()
-    anchors: tuple[Anchor, ...] = ()
-    spawn: tuple[tuple[float, float, float], ...] = ()
-    """Spawn poses (x, y, yaw) of the robots, m and rad."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,65 +184,3 @@ class Track:
             barriers.append(Barrier("side_right", (middle, -half), (0.0, 1.0), start - self.start))
             barriers.append(Barrier("side_left", (middle, half), (0.0, -1.0), start - self.start))
         return Layout(tuple(walls), tuple(barriers), tuple(anchors), tuple(spawn))
-
-
-def build_terrain(spec: mujoco.MjSpec, track: Track, *, visual: bool = True) -> Layout:
-    """Adds a track's ground and walls to a scene and returns their layout.
-
-    Walls that move are mocap bodies `wall/<name>`.
-    """
-    layout = track.layout()
-    world = spec.worldbody
-    solid = {"contype": WALL_BIT, "conaffinity": 0}
-    ground = {
-        "contype": GROUND_BIT,
-        "conaffinity": 0,
-        "condim": 3,
-        "rgba": track.ground.color,
-        "group": GROUND_GROUP,
-    }
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), **ground)
-    if visual:
-        track.ground.add(world)
-    for barrier in layout.barriers:
-        normal = np.array([*barrier.normal, 0.0])
-        world.add_geom(
-            name=f"barrier/{barrier.name}",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=(0, 0, 1),
-            pos=(*barrier.point, 0.0),
-            zaxis=normal,
-            group=HIDDEN_GROUP,
-            **solid,
-        )
-        if visual:
-            half = (_THICKNESS / 2, barrier.length / 2 + _THICKNESS, track.wall_height / 2)
-            center = np.array([*barrier.point, track.wall_height / 2]) - normal * half[0]
-            yaw = np.arctan2(normal[1], normal[0])
-            side_wall(world, track.style, center, half, float(yaw))
-    for wall in layout.walls:
-        half = np.array(wall.size) / 2
-        if wall.anchor is None:
-            body = world
-            position = wall.center
-        else:
-            anchor = layout.anchors[wall.anchor]
-            start = np.add(wall.center, [*anchor.position, 0.0])
-            body = world.add_body(name=f"wall/{wall.name}", mocap=True, pos=start)
-            position = (0, 0, 0)
-        body.add_geom(
-            name=f"wall/{wall.name}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=half,
-            pos=position,
-            rgba=WALL_COLOR,
-            group=HIDDEN_GROUP if visual and track.style == "fence" else WALL_GROUP,
-            **solid,
-        )
-        if visual and wall.anchor is not None:
-            inner = -np.sign(wall.center[1])
-            gate_wall(body, track.style, half, inner)
-            for name, z in (("bottom", -half[2]), ("top", half[2])):
-                place = (0, inner * half[1], z)
-                body.add_site(name=f"{GOAL_SITE}/{wall.name}/{name}", pos=place, group=SITE_GROUP)
-    return layout

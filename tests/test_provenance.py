@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import yaml
 
-import mqe_jax
+from mqe_jax.core import version
 from mqe_jax.core.settings import build
 from mqe_jax.core.types import Cast
 from mqe_jax.presets import Layers, resolve
@@ -81,7 +81,7 @@ CHANGES: dict[str, tuple[Any, str]] = {
         "start: has changed since",
     ),
     "version": (
-        lambda _, patch: patch.setattr(mqe_jax, "__version__", "9.9"),
+        lambda _, patch: patch.setattr(version, "__version__", "9.9"),
         r"version: '9\.9' differs",
     ),
     "version 0.3": (

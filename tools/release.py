@@ -27,7 +27,7 @@ SHORTER = {
 }
 """Flags that shorten the README's command of each name to seconds."""
 VERSIONS = {
-    "mqe_jax/__init__.py": r'^__version__ = "(.+)"$',
+    "mqe_jax/core/version.py": r'^__version__ = "(.+)"$',
     "CITATION.cff": r"^version: (.+)$",
     "CHANGELOG.md": r"^## \[(\d[^]]*)\]",
 }

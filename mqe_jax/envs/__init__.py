@@ -1,8 +1,8 @@
 """The environments: `make` creates one from a task id."""
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
+from mqe_jax.core.lazy import load
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.settings import checked, override
 from mqe_jax.envs.registry import ALIASES, SCRIPTED, TASKS, register_task, task_id
@@ -27,7 +27,7 @@ def __getattr__(name: str) -> Any:
     # Listing tasks and naming an unknown one import neither JAX nor MuJoCo.
     if name not in _HOMES:
         raise AttributeError(f"module 'mqe_jax.envs' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"mqe_jax.envs.{_HOMES[name]}"), name)
+    return load(f"mqe_jax.envs.{_HOMES[name]}:{name}")
 
 
 def tasks() -> tuple[str, ...]:

@@ -6,7 +6,6 @@ nor MuJoCo.
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections import UserDict
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from mqe_jax.core.errors import InputError, known_name
+from mqe_jax.core.lazy import load
 from mqe_jax.core.settings import checked, fail
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class _Tasks(UserDict[str, Any]):
 
     def __getitem__(self, name: str) -> type[QuadrupedEnv]:
         if self.data[name] is None:
-            self.data[name] = load("mqe_jax.envs", SHIPPED[name].task)
+            self.data[name] = load(f"mqe_jax.envs.{SHIPPED[name].task}")
         return self.data[name]
 
 
@@ -233,9 +233,3 @@ def find_task(target: str) -> str | None:
     if ALIASES.get(target, target) not in TASKS and (os.sep in target or Path(target).exists()):
         return None
     return task_id(target)
-
-
-def load(package: str, path: str) -> Any:
-    """Imports and returns the object MODULE:NAME of a package."""
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(f"{package}.{module}"), name)

@@ -18,15 +18,15 @@ from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import RobotIndex, add_sensors, index_robots, prefix
 from mqe_jax.physics.robots.motors import Motors
 from mqe_jax.physics.robots.robot import Robot
-from mqe_jax.terrain import Layout, Track, build_terrain
+from mqe_jax.physics.walls import Layout, Terrain, build_terrain
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
     """A scene to compile."""
 
-    track: Track
-    """Ground, walls and spawn poses."""
+    track: Terrain
+    """Ground, walls and spawn poses, such as a `mqe_jax.terrain.Track`."""
     num_robots: int = 2
     """Number of robots R."""
     robots: tuple[Robot, ...] = ()

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import mqe_jax
+from mqe_jax.core import version
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import read_json, write_atomically
 from mqe_jax.core.settings import leaves, to_mapping
@@ -21,7 +21,7 @@ def provenance(**passed: Any) -> dict[str, Any]:
     It holds what was passed, by name, the package's `version`, and `files`, the digests of the
     files that the passed values name.
     """
-    plain = to_mapping({"version": mqe_jax.__version__, **passed})
+    plain = to_mapping({"version": version.__version__, **passed})
     return {**plain, "files": digests(plain)}
 
 

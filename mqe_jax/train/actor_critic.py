@@ -15,9 +15,9 @@ from mqe_jax.core import devices
 from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.train import nn
-from mqe_jax.train.encoder import Encoder, of_team, plain
+from mqe_jax.train.encoder import Encoder, by_block, of_team, plain
 from mqe_jax.train.loss import entropy, log_prob
-from mqe_jax.train.networks import ActorCritic, ChunkResult, EnvDims, Network
+from mqe_jax.train.networks import ActorCritic, Blocks, ChunkResult, EnvDims, Network
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "relu": jax.nn.relu,
@@ -92,9 +92,9 @@ def _trunk(
     return nn.dense(params["head"], x), memory
 
 
-def network(settings: ActorCritic, dims: EnvDims, encoder: Encoder | None = None) -> Network:
-    """Returns the network; `encoder` is that of an agent's observation, by default none."""
-    encoder = encoder or plain(dims.observation)
+def network(settings: ActorCritic, dims: EnvDims) -> Network:
+    by_blocks = isinstance(settings, Blocks)
+    encoder = by_block(settings, dims) if by_blocks else plain(dims.observation)
     agents = dims.agents
     share = settings.share_policy
     own = settings.critic_input == "own"

@@ -12,18 +12,13 @@ other stages from `mqe_jax.train.stages.Stages` and register their settings:
 The settings import no JAX, so that a wrong flag of `mqe train` is named at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NoReturn, dataclass_transform
+from typing import Any, NoReturn, dataclass_transform
 
 from mqe_jax.core.errors import nearest
+from mqe_jax.core.lazy import load
 from mqe_jax.core.settings import FrozenMapping, build, check, checked, fail, name_settings
-
-if TYPE_CHECKING:
-    from mqe_jax.train.config import TrainConfig
-    from mqe_jax.train.networks import Network
-    from mqe_jax.train.stages import Stages
+from mqe_jax.train.networks import Network
 
 
 class StagesSettings:
@@ -55,8 +50,11 @@ class StagesSettings:
     name: str
     """Registered name of the algorithm that the other fields configure."""
 
-    def build(self, network: Network, config: TrainConfig) -> Stages:
-        """Returns the stages of a training; InputError if the settings do not fit them."""
+    def build(self, network: Network, config: Any) -> Any:
+        """Returns the `Stages` of a training with the settings `config`, a `TrainConfig`.
+
+        InputError if the settings do not fit them.
+        """
         raise NotImplementedError
 
 
@@ -85,7 +83,7 @@ class UnknownStages(FrozenMapping, StagesSettings):
         super().__init__(values)
         self.name = values["name"]
 
-    def build(self, network: Network, config: TrainConfig) -> Stages:
+    def build(self, network: Network, config: Any) -> Any:
         """Raises the InputError of `refuse`."""
         self.refuse()
 
@@ -107,7 +105,5 @@ def stages_settings(value: Any) -> Any:
 class PPOStages(StagesSettings):
     """The package's algorithms, which the settings `ppo` tell apart."""
 
-    def build(self, network: Network, config: TrainConfig) -> Stages:
-        from mqe_jax.train.stages import Stages
-
-        return Stages(network, config)
+    def build(self, network: Network, config: Any) -> Any:
+        return load("mqe_jax.train.stages:Stages")(network, config)

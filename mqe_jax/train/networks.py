@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import nearest
+from mqe_jax.core.lazy import load
 from mqe_jax.core.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
 from mqe_jax.core.settings import build, check, fail, name_settings, settings_class
 
@@ -233,9 +234,7 @@ class ActorCritic(GaussianSettings):
         return ("privileged_obs",) if self.critic_input == "privileged" else ("obs",)
 
     def build(self, dims: EnvDims) -> Network:
-        from mqe_jax.train import actor_critic
-
-        return actor_critic.network(self, dims)
+        return load("mqe_jax.train.actor_critic:network")(self, dims)
 
 
 @register_network("blocks")
@@ -263,11 +262,6 @@ class Blocks(ActorCritic):
         from mqe_jax.train.normalize import features_of
 
         return features_of(dims.blocks)
-
-    def build(self, dims: EnvDims) -> Network:
-        from mqe_jax.train import actor_critic, encoder
-
-        return actor_critic.network(self, dims, encoder.by_block(self, dims))
 
 
 @register_network("mat")
@@ -297,6 +291,4 @@ class Mat(GaussianSettings):
         return ("obs",)
 
     def build(self, dims: EnvDims) -> Network:
-        from mqe_jax.train import mat
-
-        return mat.network(self, dims)
+        return load("mqe_jax.train.mat:network")(self, dims)

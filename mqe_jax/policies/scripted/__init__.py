@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.lazy import load
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import ObservationLayout
-from mqe_jax.envs.registry import NAMED_SCRIPTED, SCRIPTED, ScriptedPolicy, load
+from mqe_jax.envs.registry import NAMED_SCRIPTED, SCRIPTED, ScriptedPolicy
 
 # The blocks (A, width) of one environment's observations by name.
 Observation = Mapping[str, jax.Array]
@@ -32,7 +33,7 @@ def find_scripted(task: str, name: str = "scripted", field: str = "policy") -> S
         raise InputError(
             f"{field}: {task} has no {name} policy; allowed for: {', '.join(SCRIPTED)}"
         )
-    return load("mqe_jax.policies.scripted", policy) if isinstance(policy, str) else policy
+    return load(f"mqe_jax.policies.scripted.{policy}") if isinstance(policy, str) else policy
 
 
 def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.Array], jax.Array]:
