@@ -238,6 +238,8 @@ def test_settings_that_a_batch_ignores_are_named(own: Bonus) -> None:
         "imitation.teacher: 'scripted'": ({"imitation.teacher": "scripted"}, {}),
         "impl: 'banana'": ({}, {"impl": "banana"}),
         "env: ": ({}, {"env": {"gate_width": 1.0}}),
+        "env: .*'gate_width': 1.1": ({"env": {"gate_width": 1.1}}, {}),
+        "train_env: .*'torque'": ({"train_env": {"control": "torque"}}, {}),
     }
     for said, (config, options) in refused.items():
         refuses(said, prepare, batch, config, **options)

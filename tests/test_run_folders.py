@@ -226,12 +226,6 @@ def test_evaluations_keep_the_best_policy_and_end_with_the_absolute_metric(tmp_p
         )
 
 
-def test_seeds_need_the_same_settings_and_evaluation_needs_environments(tmp_path: Path) -> None:
-    seeds = [seeded(0), seeded(1, ppo__clip=0.3)]
-    refuses("only in the seed", train_seeds, Cast(PROBE), seeds, [tmp_path / "a", tmp_path / "b"])
-    refuses(r"evaluation\.every", train, PROBE, seeded(0, evaluation__every=2), tmp_path)
-
-
 def test_a_compiled_program_is_stored_whole_or_not_at_all(tmp_path: Path) -> None:
     """JAX reads a file that was cut off, by a kill or a full disk, in vain at every start, and
     never replaces it.

@@ -16,7 +16,6 @@ from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.core.types import Cast
-from mqe_jax.envs import VectorEnv, make
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints, save_tree
@@ -25,7 +24,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train, train_seeds
-from mqe_jax.train.start import check_parameters, check_same
+from mqe_jax.train.start import check_same
 from tests import training as probes
 from tests.inputs import refuses
 from tests.training import (
@@ -105,30 +104,6 @@ def test_a_resumed_run_has_all_parameters_of_before(before: dict[str, Any]) -> N
     )
     refuses(lost, check_same, Path("x"), {**to_mapping(config), "env": before}, config)
     check_same(Path("x"), to_mapping(config), config)
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"task": "go1gate"}, r"env.gate_width: .* differs from the environments, which have 0\.7"),
-        (
-            {"env": {"gate_width": 0.7, "rewards.approach": 9.0}},
-            r"env.rewards.approach: 9\.0 differs .*, which have",
-        ),
-        (
-            {"env": {"gate_width": 0.7}, "train_env": {"control": "torque"}},
-            r"train_env.control: 'torque' differs",
-        ),
-    ],
-)
-def test_environments_with_other_parameters_are_refused(
-    values: dict[str, Any], said: str, tmp_path: Path
-) -> None:
-    batch = VectorEnv(make("go1gate", num_envs=4, gate_width=0.7), 4)
-    refuses(said, train, batch, settings(**values), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-    for same in ({}, {"task": "go1gate", "env": {"gate_width": 0.7}}):
-        check_parameters(batch, settings(**same), settings(**same).env)
 
 
 @pytest.mark.parametrize("left", ["policy.safetensors", "metrics.csv", "config.yaml", "notes.md"])

@@ -270,6 +270,10 @@ def _settings_around(
         fail(name, value, "left out for a batch of environments, which has its own")
     if config.num_envs not in (usual.num_envs, batch.num_envs):
         fail("num_envs", config.num_envs, f"{batch.num_envs}, or left out, for this batch")
+    inner = getattr(batch, "env", None)
+    for name, params in (("env", config.env), ("train_env", config.train_env)):
+        if params and not (isinstance(inner, QuadrupedEnv) and inner.changed(params) is inner):
+            fail(name, dict(params), "left out for a batch of environments, which has its own")
     if config.time_limit_ends and not isinstance(batch, EnvBatch):
         fail("time_limit_ends", True, f"false for {batch.name}, whose states are its own")
     return override(config, {"num_envs": batch.num_envs, "evaluation.every": None})

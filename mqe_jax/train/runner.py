@@ -1,7 +1,6 @@
 """The training loop: updates, evaluations, logs, and what it writes into a run folder."""
 
 import contextlib
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ import numpy as np
 
 from mqe_jax.core import interrupts
 from mqe_jax.core.devices import Processes, translate_errors
-from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.core.settings import fail, to_mapping
 from mqe_jax.core.types import Cast, PyTree, VectorEnv, generator, raw_keys
 from mqe_jax.train.checkpoint import checkpoint_step, latest, nonfinite, save_checkpoint
@@ -25,7 +24,6 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import SeedBatch, without_shared
 from mqe_jax.train.start import (
-    check_parameters,
     first_state,
     learned_state,
     own_learner,
@@ -83,17 +81,6 @@ def open_training(
     resume: bool = False,
 ) -> Iterator["Training"]:
     """Yields the training that `train_seeds` runs, in folders that are locked until the end."""
-    if any(dataclasses.replace(config, seed=configs[0].seed) != configs[0] for config in configs):
-        raise InputError(
-            "seeds: the settings of seeds trained together may differ only in the seed"
-        )
-    if configs[0].evaluation.every is not None and cast.eval_env is None:
-        fail(
-            "evaluation.every", configs[0].evaluation.every, "none without evaluation environments"
-        )
-    check_parameters(cast.env, configs[0], configs[0].training_env)
-    if cast.eval_env is not None:
-        check_parameters(cast.eval_env, configs[0], configs[0].env)
     folders = [Path(run_dir) for run_dir in run_dirs if run_dir is not None]
     if folders:
         check_loggers(configs[0].loggers)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import fail, is_settings, leaves, override, to_mapping
+from mqe_jax.core.settings import fail, leaves, to_mapping
 from mqe_jax.core.types import Cast, Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, read_file
 from mqe_jax.train.config import TrainConfig, without_retired
@@ -194,30 +194,4 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
                 f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
                 f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in "
                 f"{path / CONFIG_FILE}"
-            )
-
-
-def check_parameters(env: VectorEnv, config: TrainConfig, parameters: Mapping[str, Any]) -> None:
-    """Raises an InputError if parameters of a task differ in the settings, if they name any.
-
-    The error names the first parameter that differs.
-    """
-    task: Any = getattr(env, "env", None)
-    if not is_settings(getattr(task, "params", None)) or not (config.task or config.training_env):
-        return
-    overrides = dict(parameters)
-    control = overrides.pop("control", "command")
-    found = dict(leaves({"control": task.control, **to_mapping(task.params)}))
-    for name, value in leaves(
-        {"control": control, **to_mapping(override(type(task.params)(), overrides))}
-    ):
-        if found.get(name) != value:
-            field = (
-                "train_env"
-                if parameters != config.env and name in dict(leaves(config.train_env))
-                else "env"
-            )
-            raise InputError(
-                f"{field}.{name}: {value!r} differs from the environments, which have "
-                f"{found.get(name)!r}"
             )
