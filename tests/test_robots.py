@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_export import new_policy
 
-from mqe_jax import cli, make
+from mqe_jax import cli, evaluate, make
 from mqe_jax.core.settings import build
 from mqe_jax.core.types import Observations
 from mqe_jax.export.task import normal_numbers
@@ -27,8 +27,9 @@ from tests.training import random_params
 pytest.importorskip("jax2onnx")
 pytest.importorskip("onnxruntime")
 
+from mqe_jax.export import robot
 from mqe_jax.export.robot_graph import robot_onnx, verify_robot
-from mqe_jax.export.robot_team import open_team
+from mqe_jax.export.robot_team import RobotTeam, open_team
 
 SENSES = {"control": "position", "senses": ["proprioception", "messages"], "episode_length": 0.2}
 
@@ -119,16 +120,115 @@ def test_a_robot_imports_nothing_of_the_simulation(policy: TrainedPolicy, files:
     assert out == f"(1, {policy.dims.action})\nmqe_jax mqe_jax.export mqe_jax.export.robot\n"
 
 
+def act(team: RobotTeam) -> None:
+    seen = Observations({"onboard": jnp.zeros((2, 2, team.needs.dims.observation))})
+    jax.block_until_ready(team.act(seen, team.initial_memory(2), jax.random.PRNGKey(0)))
+
+
 def test_a_process_that_ends_is_reported_in_a_line(files: Any) -> None:
     with pytest.raises(
         ConnectionError,
         match=r"^export: the process of robot 1 ended with -9 \(without a message\)$",
     ):
         with open_team(files["mean"]) as team:
+            act(team)
             team._processes[1]._process.kill()
-            size = team.needs.dims.observation
-            seen = Observations({"onboard": jnp.zeros((2, 2, size))})
-            jax.block_until_ready(team.act(seen, team.initial_memory(2), jax.random.PRNGKey(0)))
+            act(team)
+
+
+def damage(file: Path, kind: str) -> Path:
+    """Writes a graph whose loop has no end, or with weights that are not finite."""
+    import onnx
+
+    model = onnx.load(file)
+    graph = model.graph
+    if kind == "endless":
+        boolean = onnx.helper.make_tensor_value_info("go", onnx.TensorProto.BOOL, [])
+        count = onnx.helper.make_tensor_value_info("i", onnx.TensorProto.INT64, [])
+        values = [
+            onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None)
+            for name in ("value", "next_value")
+        ]
+        nodes = [
+            onnx.helper.make_node("Identity", ["go"], ["next_go"]),
+            onnx.helper.make_node("Identity", ["value"], ["next_value"]),
+        ]
+        goes = onnx.helper.make_tensor_value_info("next_go", onnx.TensorProto.BOOL, [])
+        body = onnx.helper.make_graph(nodes, "body", [count, boolean, values[0]], [goes, values[1]])
+        for node in graph.node:
+            node.input[:] = ["looped" if name == "obs" else name for name in node.input]
+        graph.node.insert(
+            0, onnx.helper.make_node("Loop", ["", "on", "obs"], ["looped"], body=body)
+        )
+        graph.initializer.append(onnx.numpy_helper.from_array(np.array(True), "on"))
+    else:
+        for weights in graph.initializer:
+            numbers = onnx.numpy_helper.to_array(weights)
+            if numbers.dtype == np.float32:
+                full = np.full_like(numbers, float(kind))
+                weights.CopyFrom(onnx.numpy_helper.from_array(full, weights.name))
+    made = file.with_name(f"{kind}.onnx")
+    onnx.save(model, str(made))
+    return made
+
+
+@pytest.fixture
+def hasty(tmp_path: Path, monkeypatch: Any) -> Path:
+    """The program of robots that answer within a second."""
+    program = tmp_path / "robot.py"
+    code = Path(robot.__file__).read_text()
+    program.write_text(code.replace("ANSWER = 10.0", "ANSWER = 1.0"))
+    monkeypatch.setattr(robot, "__file__", str(program))
+    return program
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [("endless", r"0 ended with 1 \(no answer within 1 s\)"), ("nan", "0 answered .* not finite")],
+)
+def test_a_robot_answers_in_time_with_finite_numbers(
+    files: Any, hasty: Any, kind: str, said: str
+) -> None:
+    with pytest.raises(ConnectionError, match=said), open_team(damage(files["mean"], kind)) as team:
+        act(team)
+
+
+def test_a_robot_ends_with_its_parent_even_while_its_graph_computes(
+    policy: Any, files: Any, hasty: Path
+) -> None:
+    command = [sys.executable, str(hasty), str(damage(files["mean"], "endless"))]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes) as process:
+        frame = np.ones((1, 1 + policy.dims.observation), np.float32)
+        robot.write_frame(process.stdin, frame)
+        process.stdin.close()  # as the end of its parent does
+        try:
+            assert process.wait(30) == 1
+        finally:
+            process.kill()
+
+
+def test_a_file_starts_no_processes(files: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    import onnx
+
+    def start(*args: Any, **options: Any) -> None:
+        raise AssertionError
+
+    def file(agents: int) -> Path:
+        model = onnx.load(files["mean"])
+        about = {entry.key: entry for entry in model.metadata_props}["needs"]
+        needs = json.loads(about.value)
+        dims = needs["dims"]
+        needs["dims"] = [agents, *dims[1:]]
+        about.value = json.dumps(needs)
+        onnx.save(model, str(tmp_path / f"{agents}.onnx"))
+        return tmp_path / f"{agents}.onnx"
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with open_team(file(64)) as team:
+        env = make("go1gate", impl="c", num_envs=1, **SENSES)
+        refuses("needs agents 64; the environment has 2", evaluate, env, team)
+    refuses("65 is not allowed", open_team(file(65)).__enter__)
 
 
 @pytest.mark.parametrize(

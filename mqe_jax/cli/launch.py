@@ -32,8 +32,9 @@ LIMIT = 40.0
 HEARTBEAT = 30
 """Time after which a process is dead whose host does not answer, s."""
 
-PROGRAM = [sys.executable, "-m", "mqe_jax.cli"]
-"""What runs a command in a process of the training."""
+PROGRAM = [sys.executable, "-P", "-m", "mqe_jax.cli"]
+"""What runs a command in a process of the training; with -P it imports no module of the current
+folder."""
 
 _DEVICES = "CUDA_VISIBLE_DEVICES"
 _NO_DEVICES = ("", "-1")  # of `_DEVICES`: JAX computes on the CPU

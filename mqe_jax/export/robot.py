@@ -7,16 +7,21 @@ standard input ends. The file is what `mqe export` writes with `--per-robot`. In
 step the program reads a frame (N, 1 + O): whether the row's episode starts, 1 or 0, then the
 robot's readings. It answers with the frame of its actions (N, D). A frame is the number of rows and
 of columns as little-endian uint32, then the numbers as float32. The seed is that of the normal
-numbers with which a graph samples.
+numbers with which a graph samples. The program ends if an answer takes longer than `ANSWER`.
 """
 
+import contextlib
+import os
 import struct
 import sys
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
 from typing import IO, Any
 
 import numpy as np
 
+ANSWER = 10.0
+"""Time in which a robot answers, s."""
 _HEAD = struct.Struct("<II")
 
 
@@ -82,7 +87,26 @@ def main(file: str, seed: str = "0") -> None:
     """Runs the program."""
     robot = Robot(file, int(seed))
     while (frame := read_frame(sys.stdin.buffer)) is not None:
-        write_frame(sys.stdout.buffer, robot.act(frame[:, 1:], frame[:, 0]))
+        with _in_time():
+            action = robot.act(frame[:, 1:], frame[:, 0])
+        write_frame(sys.stdout.buffer, action)
+
+
+@contextlib.contextmanager
+def _in_time() -> Iterator[None]:
+    """Ends the process if this takes longer than `ANSWER`, even while the graph computes."""
+    timer = threading.Timer(ANSWER, _give_up)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _give_up() -> None:
+    os.write(2, f"no answer within {ANSWER:g} s\n".encode())
+    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -21,20 +21,21 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_file, parse_json, parsing
 from mqe_jax.core.settings import build, checked, fail
 from mqe_jax.core.types import Memory, Observations
+from mqe_jax.export import robot
 from mqe_jax.export.robot import Robot, read_frame, write_frame
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import Needs, unmet
 from mqe_jax.train.policy import check_obs
 
-_PROGRAM = "mqe_jax.export.robot"
 _CLOSING = 10.0  # s, after which a process that does not end is killed
 
 
 class RobotTeam:
-    """A policy that asks a process per robot for its actions; `open_team` starts and ends them.
+    """A policy that asks a process per robot for its actions; `open_team` ends them.
 
-    A process gets its row of the observations and whether an episode starts. It keeps its recurrent
-    state, so that the one of `act` only says whether the episode has started.
+    The first observations start them, one for each robot of the environment. A process gets its row
+    of the observations and whether an episode starts. It keeps its recurrent state, so that the one
+    of `act` only says whether the episode has started.
     """
 
     def __init__(self, file: Path, needs: Needs, deterministic: bool, seed: int) -> None:
@@ -46,8 +47,8 @@ class RobotTeam:
         self.task = needs.task
         self.agents = needs.dims.agents  # number of robots A
         self.groups: tuple[str, ...] = (needs.group,)  # of observations that the robots see
-        seeds = np.random.SeedSequence(seed).generate_state(self.agents)
-        self._processes = [_Process(file, number, int(own)) for number, own in enumerate(seeds)]
+        self._seed = seed
+        self._processes: list[_Process] = []
 
     def __repr__(self) -> str:
         return str(self.file)
@@ -84,8 +85,11 @@ class RobotTeam:
         rows = readings.reshape(-1, *readings.shape[-2:])
         starts = 1.0 - np.asarray(started).reshape(-1, 1)
         try:
-            for robot, process in enumerate(self._processes):
-                process.send(np.concatenate([starts, rows[:, robot]], axis=1))
+            if not self._processes:
+                seeds = np.random.SeedSequence(self._seed).generate_state(rows.shape[1])
+                self._processes = [_Process(self.file, i, int(x)) for i, x in enumerate(seeds)]
+            for i, process in enumerate(self._processes):
+                process.send(np.concatenate([starts, rows[:, i]], axis=1))
             shape = len(rows), self.needs.dims.action
             actions = [process.receive(shape) for process in self._processes]
         except OSError as error:
@@ -100,7 +104,8 @@ class _Process:
     def __init__(self, file: Path, number: int, seed: int) -> None:
         self._name = f"export: the process of robot {number}"
         self._errors: IO[bytes] = tempfile.TemporaryFile()
-        command = [sys.executable, "-m", _PROGRAM, str(file), str(seed)]
+        # -P: no module of the current folder
+        command = [sys.executable, "-P", robot.__file__, str(file), str(seed)]
         # Ctrl-C must reach the parent only; this process sees its end.
         self._process = subprocess.Popen(
             command,
@@ -125,6 +130,8 @@ class _Process:
             raise ConnectionError(f"{self._name} ended with {code} ({last or 'without a message'})")
         if frame.shape != shape:
             raise ConnectionError(f"{self._name} answered {frame.shape} numbers, not {shape}")
+        if not np.isfinite(frame).all():
+            raise ConnectionError(f"{self._name} answered numbers that are not finite")
         return frame
 
     def close(self) -> None:
@@ -144,7 +151,7 @@ class _Process:
 @contextlib.contextmanager
 @checked
 def open_team(file: str | Path, seed: limits.Seed = 0) -> Iterator[RobotTeam]:
-    """Starts the processes of a team of robots that share one file, and yields its policy.
+    """Yields the policy of a team of robots that share one file, each a process of its own.
 
     `mqe export` writes such a file with `--per-robot`.
 
@@ -159,7 +166,8 @@ def open_team(file: str | Path, seed: limits.Seed = 0) -> Iterator[RobotTeam]:
 
     Raises:
         InputError: if onnxruntime is missing, or for a file that is not the graph of a robot.
-        ConnectionError: at the end, if a process ended before.
+        ConnectionError: at the end, if a process ended before, took longer than
+            `mqe_jax.export.robot.ANSWER` or answered with numbers that are not finite.
     """
     team = _read(Path(file), seed)
     logger = logging.getLogger("jax._src.callback")  # prints the traceback of a callback's error
@@ -167,7 +175,7 @@ def open_team(file: str | Path, seed: limits.Seed = 0) -> Iterator[RobotTeam]:
     logger.setLevel(logging.CRITICAL)
     try:
         yield team
-    except jax.errors.JaxRuntimeError:
+    except (jax.errors.JaxRuntimeError, ValueError):  # by where the policy was called
         if not team.failure:
             raise
     finally:

@@ -25,7 +25,16 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, dataclass_transform
 from mqe_jax.core.blocks import Block
 from mqe_jax.core.errors import nearest
 from mqe_jax.core.lazy import load
-from mqe_jax.core.limits import Depth, Horizon, NonNegativeInt, Positive, PositiveInt, Width, Widths
+from mqe_jax.core.limits import (
+    Depth,
+    Horizon,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    Robots,
+    Width,
+    Widths,
+)
 from mqe_jax.core.settings import build, check, fail, name_settings, settings_class
 
 if TYPE_CHECKING:
@@ -38,7 +47,7 @@ if TYPE_CHECKING:
 class EnvDims(NamedTuple):
     """Sizes of the environment of one team and of its values (`ppo.value`)."""
 
-    agents: PositiveInt
+    agents: Robots
     observation: PositiveInt
     privileged: NonNegativeInt
     action: PositiveInt

@@ -76,7 +76,7 @@ def _draws(name: str) -> bool:
     environment.pop("PYOPENGL_PLATFORM", None)
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):
         done = subprocess.run(
-            [sys.executable, "-c", _PROBE],
+            [sys.executable, "-P", "-c", _PROBE],  # -P: no module of the current folder
             env=environment,
             timeout=60,
             stdout=subprocess.DEVNULL,
