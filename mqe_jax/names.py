@@ -97,6 +97,7 @@ def find(
 
 
 def _find(name: str, task: str, field: str) -> Found:
+    devices.platform()  # which will hold the weights
     member = population.find(name, task, field)
     if member is not None:
         return Named(member, usual=True) if isinstance(member, str) else member

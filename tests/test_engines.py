@@ -25,6 +25,7 @@ import pytest
 from mqe_jax.envs import TASKS, VectorEnv, make
 from mqe_jax.physics.engines import Engine, private
 from mqe_jax.physics.engines import host_call as host_calls
+from mqe_jax.physics.engines.c import _Stepper
 from mqe_jax.physics.engines.host_call import host_call
 from mqe_jax.physics.engines.mjx import WarpEngine
 from tests import engines as comparison
@@ -450,3 +451,16 @@ running = f(np.zeros((300, 300), np.float32))
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
     )
     assert ended.returncode == 0, ended.stderr
+
+
+def test_the_c_engine_has_as_many_threads_as_the_process_has_cores(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(5))
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
+    tasks = Path("/proc/self/task")
+    before = len(list(tasks.iterdir()))
+    stepper = _Stepper(model, None)
+    empty = np.zeros((64, 0))
+    stepper.call((), False, 1, empty, empty, empty, empty)
+    assert len(list(tasks.iterdir())) == before + 4  # and the calling one

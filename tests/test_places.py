@@ -92,6 +92,44 @@ def test_only_drawing_needs_a_gl_library(tmp_path: Path) -> None:
     assert (tmp_path / "clip.png").stat().st_size
 
 
+def test_child_processes_import_nothing_from_the_current_folder(tmp_path: Path) -> None:
+    for name in ("numpy", "mujoco", "tyro"):
+        code = f"open('imported', 'a').write({name!r})\nraise SystemExit(1)\n"
+        (tmp_path / f"{name}.py").write_text(code)
+    code = """
+import subprocess
+from pathlib import Path
+from mqe_jax.cli.launch import PROGRAM
+from mqe_jax.export.robot_team import _Process
+from mqe_jax.viz.render import _draws
+_draws("egl")
+_Process(Path("robot.onnx"), 0, 0).close()
+subprocess.run([*PROGRAM, "tasks"], check=True)
+"""
+    command = [sys.executable, "-P", "-c", code]
+    subprocess.run(command, cwd=tmp_path, check=True, stdout=subprocess.DEVNULL)
+    assert not (tmp_path / "imported").exists()
+
+
+def test_a_platform_without_devices_is_rejected_in_a_line(tmp_path: Path) -> None:
+    code = """
+import mqe_jax
+from mqe_jax.cli import main
+from mqe_jax.core.errors import InputError
+for words in ["zoo", "go1gate"], ["skill", "eval", "walk"]:
+    assert main(words) == 2
+for call in mqe_jax.make, mqe_jax.load_policy:
+    try:
+        call("go1gate")
+    except InputError as error:
+        print("mqe:", error)
+"""
+    done = run(code, tmp_path, env={**os.environ, "JAX_PLATFORMS": "rocm"})
+    lines = (done.stderr + done.stdout).splitlines()
+    assert len(lines) == 4
+    assert all(line.startswith("mqe: JAX_PLATFORMS: 'rocm' cannot be used") for line in lines)
+
+
 def test_help_needs_no_docstrings(tmp_path: Path) -> None:
     code = """
 from contextlib import suppress

@@ -95,6 +95,12 @@ def _run(command: Any) -> None:
         run = single(run)
     as_json = bool(getattr(command, "json", False))
     with standard_output(reserved=as_json) as out:
-        result = run()
+        try:
+            result = run()
+        except (AssertionError, RuntimeError):  # JAX's, without the devices of JAX_PLATFORMS
+            from mqe_jax.core.devices import platform
+
+            platform()
+            raise
         if as_json and result is not None:
             print(json.dumps(result), file=out, flush=True)

@@ -55,6 +55,13 @@ def platform() -> str:
         ) from None
 
 
+def cores() -> int:
+    """Returns the number of CPU cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def size() -> int:
     """Returns the number of processes among which the environments are split."""
     if _ALONE.get():

@@ -3,7 +3,6 @@
 It is that of whole steps with skill and resets, and that of physics only.
 """
 
-import os
 import time
 from collections.abc import Callable
 from statistics import median
@@ -13,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import names
+from mqe_jax.core.devices import cores
 from mqe_jax.core.limits import Environments, Horizon, Seed
 from mqe_jax.core.settings import Parameters, checked
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
@@ -134,5 +134,4 @@ def device_name() -> str:
     device = jax.devices()[0]
     if device.platform != "cpu":
         return device.device_kind
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{cores} CPU cores"
+    return f"{cores()} CPU cores"

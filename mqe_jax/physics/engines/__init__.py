@@ -12,6 +12,7 @@ from typing import Any
 
 import mujoco
 
+from mqe_jax.core.devices import platform
 from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.physics.engines.engine import STATE_FIELDS, Engine
 
@@ -32,6 +33,7 @@ def resolve(impl: str = "auto") -> str:
     `auto` is warp on an NVIDIA GPU, c on a CPU, and jax elsewhere. InputError for an unknown engine
     or one that cannot run here.
     """
+    platform()  # an InputError without the devices of JAX_PLATFORMS
     if known_name("impl: unknown engine", impl, ("auto", *ENGINES)) == "auto":
         return next(name for name in ENGINES if pkgutil.resolve_name(ENGINES[name]).is_preferred())
     obstacle = pkgutil.resolve_name(ENGINES[impl]).obstacle()

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from mqe_jax.core.devices import cores
 from mqe_jax.physics.engines import private
 from mqe_jax.physics.engines.engine import Engine
 from mqe_jax.physics.engines.host_call import host_call
@@ -138,7 +139,7 @@ class _Stepper:
             if idle:
                 batch, rows = idle.pop()
             else:
-                batch = Batch(self._model, nsim=count)
+                batch = Batch(self._model, nsim=count, nthread=cores())
                 rows = self._repeat(count)
         try:
             row = self._step_batch(batch, rows, names, forced, substeps, flat)
