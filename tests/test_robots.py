@@ -199,6 +199,7 @@ def test_a_robot_ends_with_its_parent_even_while_its_graph_computes(
     command = [sys.executable, str(hasty), str(damage(files["mean"], "endless"))]
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, **pipes) as process:
+        assert process.stdin is not None
         frame = np.ones((1, 1 + policy.dims.observation), np.float32)
         robot.write_frame(process.stdin, frame)
         process.stdin.close()  # as the end of its parent does
