@@ -1,10 +1,12 @@
 """A run folder: its files, and what is checked and locked before a training writes to it.
 
-config.yaml            settings metrics.csv            one row an update (`logs.CsvLog`);
-tensorboard/ and wandb/ by the other loggers policy.safetensors     the newest policy
-(`policy.save_policy`) checkpoints/           complete learner states (`checkpoint.save_checkpoint`)
-evaluations.json       evaluations during training, best/ the policy of the best one
-(`monitor.EvaluationLog`)
+| file | contents |
+|---|---|
+| config.yaml | settings |
+| metrics.csv | one row an update (`logs.CsvLog`); other loggers write tensorboard/ and wandb/ |
+| policy.safetensors | the newest policy (`policy.save_policy`) |
+| checkpoints/ | complete learner states (`checkpoint.save_checkpoint`) |
+| evaluations.json | evaluations during training (`monitor.EvaluationLog`); best/ has the best policy |
 """
 
 import contextlib
