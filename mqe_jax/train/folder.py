@@ -6,7 +6,7 @@
 | metrics.csv | one row an update (`logs.CsvLog`); other loggers write tensorboard/ and wandb/ |
 | policy.safetensors | the newest policy (`policy.save_policy`) |
 | checkpoints/ | complete learner states (`checkpoint.save_checkpoint`) |
-| evaluations.json | evaluations during training (`monitor.EvaluationLog`); best/ has the best policy |
+| evaluations.json | evaluations in training (`monitor.EvaluationLog`); best/ has the best policy |
 """
 
 import contextlib
