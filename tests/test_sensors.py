@@ -17,6 +17,8 @@ from mqe_jax.core.settings import override, settings_class, to_mapping
 from mqe_jax.envs import State, VectorEnv, make
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.observation import ObservationLayout, entities
+from mqe_jax.envs.randomization import Randomization
+from mqe_jax.envs.state import FINAL
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.robot import MIRROR
 from mqe_jax.sensors import Sensor, register
@@ -223,6 +225,33 @@ def test_senses_add_a_group_and_change_nothing_else() -> None:
         np.testing.assert_allclose(read["action"][0], 0.0 if count == 2 else 0.3)
         assert seeing.final_groups["onboard"].shape == (2, 2, env.group_sizes["onboard"])
     assert states[0].senses == () and "onboard" not in blind.layouts
+
+
+def test_noise_is_drawn_once_a_step() -> None:
+    """Where no episode ends, the final observation is the observation, noise and readings included.
+    The same numbers are drawn without final observations.
+    """
+    noise = Randomization(observation_noise=0.1)
+    options: Any = {"impl": "c", "control": "position", "num_envs": 2, "randomization": noise}
+    env = make("go1plane", **options, senses="onboard")
+    batches = [VectorEnv(env, 2, final=final).with_groups(["onboard"]) for final in (FINAL, ())]
+    states = [jax.jit(batch.reset)(jax.random.PRNGKey(0)) for batch in batches]
+    steps = [jax.jit(batch.step) for batch in batches]
+    action = np.zeros((2, 2, 12), np.float32)
+    for count in range(4):
+        if count == 3:
+            late = jnp.array([env.max_steps - 1, 0])
+            states = [dataclasses.replace(state, step=late) for state in states]
+        states = [step(state, action) for step, state in zip(steps, states, strict=True)]
+        both, lean = states
+        goes_on = ~np.asarray(both.truncated)
+        assert goes_on.tolist() == [count < 3, True]
+        for name in ("policy", "onboard"):
+            now = np.asarray(both.groups[name])
+            apart = np.abs(now - np.asarray(both.final_groups[name])).max((1, 2))
+            same = apart < 1e-5  # XLA may compute it twice
+            np.testing.assert_array_equal(same, goes_on)
+            np.testing.assert_allclose(now, lean.groups[name], atol=1e-5)
 
 
 def test_a_pipeline_delays_drops_and_keeps_readings() -> None:

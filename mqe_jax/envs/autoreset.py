@@ -43,19 +43,30 @@ Start = Callable[[jax.Array, jax.Array], State]
 
 
 def autoreset(
-    env: QuadrupedEnv, state: State, start: Start | None = None, groups: Sequence[str] = ()
+    env: QuadrupedEnv,
+    state: State,
+    start: Start | None = None,
+    groups: Sequence[str] = (),
+    *,
+    observed: bool = True,
 ) -> State:
-    """Replaces the state of one environment by a new one if its episode has ended, and observes it.
+    """Replaces the state of one environment by a new one if its episode has ended.
 
-    Resets the whole state, without a forward pass. The fields in `KEPT` still describe the step
-    that ended the episode, and `assistance` is kept. `start` samples the new state, by default the
-    task's reset. `groups` are observed in addition to the group `policy`.
+    Resets the whole state, without a forward pass, and observes the new one. The fields in `KEPT`
+    still describe the step that ended the episode, and `assistance` is kept. `start` samples the
+    new state, by default the task's reset. `groups` are observed in addition to the group `policy`.
+
+    The observations of an episode that goes on stay. If the step is not `observed`, they are made
+    here, with the same noise.
     """
     done = state.terminated | state.truncated
     with jax.named_scope("reset"):
         key, reset_key = jax.random.split(state.key)
         begin = start or env.begin
         fresh = begin(reset_key, state.assistance)
+        if observed:
+            fresh = env.with_observations(dataclasses.replace(fresh, key=key), groups)
+        left_out = ("data", "key", *KEPT) if observed else ("data", "key", *SEEN, *KEPT)
 
         def choose(new: jax.Array, old: jax.Array) -> jax.Array:
             return jnp.where(done, new, old)
@@ -63,10 +74,14 @@ def autoreset(
         merged = {}
         for field in dataclasses.fields(state):
             name = field.name
-            if name not in ("data", "key", *SEEN, *KEPT):
+            if name not in left_out:
                 merged[name] = jax.tree.map(choose, getattr(fresh, name), getattr(state, name))
         data = env.physics.merge(done, fresh.data, state.data)
-    return env.with_observations(dataclasses.replace(state, data=data, key=key, **merged), groups)
+        noise_key = choose(key, state.key)
+    state = dataclasses.replace(state, data=data, key=noise_key, **merged)
+    if not observed:
+        state = env.with_observations(state, groups)
+    return dataclasses.replace(state, key=key)
 
 
 class EnvBatch:
@@ -204,6 +219,5 @@ class VectorEnv(EnvBatch):
         """Advances one environment, and resets it to `start` if its episode ended (`autoreset`)."""
         state = self.env.advance(state, action)
         if self.final:
-            seen = with_final(self.env.with_observations(state, self.groups), self.final)
-            state = dataclasses.replace(seen, senses=state.senses)  # sensors observe once a step
-        return autoreset(self.env, state, start, self.groups)
+            state = with_final(self.env.with_observations(state, self.groups), self.final)
+        return autoreset(self.env, state, start, self.groups, observed=bool(self.final))
