@@ -372,6 +372,7 @@ class Plain:
         warm = self.progress < self.config.ppo.critic_warmup
         rate = float(state.learning_rate)
         seen = []
+        begun = False
         gradient_of = jax.jit(jax.grad(self.loss, has_aux=True))
         for _ in range(self.config.ppo.epochs):
             for minibatch in minibatches:
@@ -379,14 +380,16 @@ class Plain:
                 norm = math.sqrt(sum(float(np.sum(x**2)) for x in jax.tree.leaves(gradient)))
                 if optimizer.max_grad_norm is not None and norm > optimizer.max_grad_norm:
                     gradient = jax.tree.map(lambda x: x * optimizer.max_grad_norm / norm, gradient)  # noqa: B023
-                if optimizer.target_kl is not None:
+                if optimizer.target_kl is not None and begun:
                     kl = float(parts["kl"])
                     change = 1.0
                     if kl > 2 * optimizer.target_kl:
                         change = 1 / 1.5
                     elif kl < optimizer.target_kl / 2 and factor == 1.0 and not warm:
                         change = 1.5
-                    rate = min(max(rate * change, 1e-5), 1e-2)
+                    rates = 1e-5, 1e-2, optimizer.learning_rate
+                    rate = min(max(rate * change, min(rates)), max(rates))
+                begun = True
                 count += 1
                 moments[0] = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, moments[0], gradient)
                 moments[1] = jax.tree.map(
@@ -467,15 +470,20 @@ def test_an_update_is_that_of_a_plain_implementation(
 
 
 def test_the_learning_rate_follows_the_kl_divergence_within_its_bounds() -> None:
+    def adapted(kl: float, before: float, initial: float) -> float:
+        return float(stages._adapt(jnp.float32(before), jnp.float32(kl), 0.01, initial))
+
     rows = (
         (0.0201, 1e-3, 1e-3 / 1.5),
         (0.0199, 1e-3, 1e-3),
         (0.0051, 1e-3, 1e-3),
         (0.0049, 1e-3, 1.5e-3),
     )
-    for kl, before, after in (*rows, (1.0, 1.2e-5, 1e-5), (0.0, 9e-3, 1e-2)):
-        rate = stages._adapt(jnp.float32(before), jnp.float32(kl), 0.01)
-        assert float(rate) == pytest.approx(after), (kl, before)
+    edges = (1.0, 1.2e-5, 1e-5), (0.0, 9e-3, 1e-2)
+    for kl, before, after in (*rows, *edges):
+        assert adapted(kl, before, 1e-3) == pytest.approx(after), (kl, before)
+    for kl, before, after in ((1.0, 1e-6, 1e-6), (1.0, 2e-2, 2e-2 / 1.5), (0.0, 2e-2, 2e-2)):
+        assert adapted(kl, before, before) == pytest.approx(after), (kl, before)
 
 
 @pytest.mark.parametrize("name", [*SETTINGS, "mat"])

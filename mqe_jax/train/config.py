@@ -90,8 +90,9 @@ class OptimizerSettings:
     anneal: Annotated[float, Gt(0), Le(1)] = 1.0
     """Final fraction of the run over which the linear schedule falls."""
     target_kl: Positive | None = None
-    """KL divergence per minibatch to which the learning rate adapts; it does not rise while the
-    schedule falls. None: only the schedule."""
+    """KL divergence per minibatch to which the learning rate adapts, from 1e-5 to 1e-2 or as far as
+    `learning_rate`. It does not rise while the schedule falls, and stays before an update's first
+    gradient step, when the policy has not changed. None: only the schedule."""
     eps: Positive = 1e-5
     """Adam's epsilon."""
     max_grad_norm: Positive | None = 10.0

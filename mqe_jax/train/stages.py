@@ -145,15 +145,21 @@ class Stages:
         """
         config = self.config
         parts = config.rollout_steps // batch.is_first.shape[0]
+        begun = carry[1].updates
 
         def step(carry: Carry, minibatch: Batch) -> tuple[Carry, Metrics]:
             params, optimizer_state, learning_rate = carry
             own = jax.grad(self.loss, has_aux=True)(params, minibatch, now)
             gradient, metrics = devices.mean(own)
-            if config.optimizer.target_kl is not None:
-                adapted = _adapt(learning_rate, metrics["approx_kl"], config.optimizer.target_kl)
+            target_kl = config.optimizer.target_kl
+            if target_kl is not None:
+                initial = config.optimizer.learning_rate
+                adapted = _adapt(learning_rate, metrics["approx_kl"], target_kl, initial)
                 falls_only = (now.learning_rate_factor < 1.0) | (jnp.float32(now.actor_coef) < 1.0)
-                learning_rate = jnp.where(falls_only, jnp.minimum(adapted, learning_rate), adapted)
+                adapted = jnp.where(falls_only, jnp.minimum(adapted, learning_rate), adapted)
+                # The first gradient step starts from the policy that acted.
+                first = optimizer_state.updates == begun
+                learning_rate = jnp.where(first, learning_rate, adapted)
             params, optimizer_state, grad_norm = self.optimizer.update(
                 gradient, optimizer_state, params, learning_rate * now.learning_rate_factor
             )
@@ -182,12 +188,14 @@ def _mean(x: jax.Array, learners: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(count, 1.0)
 
 
-def _adapt(learning_rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
+def _adapt(learning_rate: jax.Array, kl: jax.Array, target_kl: float, initial: float) -> jax.Array:
     """Returns a learning rate that keeps the KL divergence near its target.
 
-    It falls if the divergence is above twice the target, and rises if below half of it.
+    It falls if the divergence is above twice the target, and rises if below half of it. Its range
+    includes the `initial` rate.
     """
     factor = jnp.where(
         kl > 2.0 * target_kl, 1.0 / _ADAPTATION, jnp.where(kl < 0.5 * target_kl, _ADAPTATION, 1.0)
     )
-    return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
+    rates = *_LEARNING_RATE_RANGE, initial
+    return jnp.clip(learning_rate * factor, min(rates), max(rates))
