@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.core.errors import InputError, NonFiniteError
-from mqe_jax.core.settings import to_mapping
+from mqe_jax.core.settings import override, to_mapping
 from mqe_jax.core.types import Cast
 from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
@@ -24,6 +24,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train, train_seeds
+from mqe_jax.train.schedules import check_ended
 from mqe_jax.train.start import check_same
 from tests import training as probes
 from tests.inputs import refuses
@@ -92,6 +93,31 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(
         r"total_steps: 16 .* at least", train, PROBE, settings(total_steps=16), run_dir, resume=True
     )
     assert load_run_config(run_dir) == settings()
+
+
+def test_a_longer_run_brings_back_nothing_that_has_ended(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    warmed = settings(ppo__critic_warmup=0.4)
+    train(PROBE, dataclasses.replace(warmed, total_steps=32), run_dir)
+    longer = dataclasses.replace(warmed, total_steps=96)
+    said = r"total_steps: 96 .* at most 80, beyond which ppo.critic_warmup, which has ended"
+    refuses(said, train, PROBE, longer, run_dir, resume=True)
+    assert int(train(PROBE, warmed, run_dir, resume=True).updates) == 5
+
+
+def test_schedules_that_have_ended_bound_the_total_of_a_run() -> None:
+    changes: dict[str, dict[str, Any]] = {
+        "curriculum.assistance": {"curriculum": {"assistance": 0.5, "assistance_until": 0.4}},
+        "curriculum.failure_bootstrap": {
+            "curriculum": {"failure_bootstrap": 0.5, "failure_bootstrap_until": 0.4}
+        },
+        "imitation": {"imitation": {"teacher": "scripted", "until": 0.4}},
+    }
+    for name, change in changes.items():
+        before = override(settings(), change)  # the schedule ends with the second of five updates
+        longer = override(before, {"total_steps": 96})
+        check_ended(longer, before, 1)
+        refuses(f"at most 80, .*{name}", check_ended, longer, before, 2)
 
 
 @pytest.mark.parametrize("before", [{"width": 0.7}, {"width": 0.7, "other": 1}])

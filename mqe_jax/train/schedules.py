@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.core.settings import fail
 from mqe_jax.train.config import TrainConfig
 
 
@@ -49,3 +50,27 @@ def current_values(config: TrainConfig, updates: jax.Array) -> Scheduled:
         actor_begins=warm & (before < ppo.critic_warmup) if ppo.critic_warmup else False,
         learning_rate_factor=factor,
     )
+
+
+def check_ended(config: TrainConfig, before: TrainConfig, updates: int) -> None:
+    """Raises an InputError if the total of a resumed run brings back what has ended.
+
+    The run had the settings `before` and has done a number of updates.
+    """
+    curriculum = config.curriculum
+    spans = (
+        ("ppo.critic_warmup", config.ppo.critic_warmup, config.ppo.critic_warmup),
+        ("curriculum.assistance", curriculum.assistance, curriculum.assistance_until),
+        (
+            "curriculum.failure_bootstrap",
+            curriculum.failure_bootstrap,
+            curriculum.failure_bootstrap_until,
+        ),
+        ("imitation", config.imitation.teacher, config.imitation.until),
+    )
+    for name, used, until in spans:
+        ended = used and updates >= until * before.num_updates
+        if ended and updates < until * config.num_updates:
+            most = int(updates / until) * config.steps_per_update
+            allowed = f"at most {most}, beyond which {name}, which has ended, would return"
+            fail("total_steps", config.total_steps, allowed)

@@ -16,13 +16,14 @@ import jax.numpy as jnp
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import fail, leaves, to_mapping
+from mqe_jax.core.settings import fail, leaves, override, to_mapping
 from mqe_jax.core.types import Cast, Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, read_file
 from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import TrainedPolicy
+from mqe_jax.train.schedules import check_ended
 from mqe_jax.train.seeds import with_shared, without_shared
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
@@ -108,6 +109,9 @@ def first_state(
     check_same(run, without_retired(before), config)
     if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
         fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
+    totals = {name: value for name, value in before.items() if name == "total_steps"}
+    done = steps // config.steps_per_update
+    check_ended(config, override(config, totals), done)
     whole = metadata.get("environments", True)
     template = processes.whole
     saved = (
