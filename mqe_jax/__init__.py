@@ -18,6 +18,7 @@ from mqe_jax.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from mqe_jax.acting.results import Result
+    from mqe_jax.core.errors import InputError
     from mqe_jax.envs import QuadrupedEnv, Randomization, State, VectorEnv, make, tasks
     from mqe_jax.names import load_policy, versus
     from mqe_jax.runs.cast import make_learner
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Clip",
+    "InputError",
     "QuadrupedEnv",
     "Randomization",
     "Result",
@@ -61,6 +63,7 @@ _PLAYING = dict.fromkeys(("Clip", "evaluate", "render", "tournament"), "runs.pla
 _HOMES = {
     **_LEARNING,
     **_PLAYING,
+    "InputError": "core.errors",
     "Result": "acting.results",
     "TrainConfig": "train.config",
     "bench": "runs.throughput",

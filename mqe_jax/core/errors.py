@@ -23,6 +23,14 @@ class InputError(ValueError):
     The command line prints it as one line, exit code 2.
 
     Any other exception is a defect of the program and keeps its traceback.
+
+    Example:
+        ```python
+        try:
+            mqe_jax.make("go1gate", gate_width=9.0)
+        except mqe_jax.InputError as error:
+            print(error)  # gate_width: 9.0 is not allowed; ...
+        ```
     """
 
     def __init__(self, message: object) -> None:
