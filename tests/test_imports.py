@@ -33,6 +33,7 @@ CHECKING = {
     "selfplay.league.crossplay",
     "selfplay.league.tournament",
     "selfplay.opponents",
+    "testing",
     "train.algorithms",
     "train.policy",
     "walk.evaluation",

@@ -1,8 +1,9 @@
-"""Checks of what methods of tasks and sensors return.
+"""Checks of the methods of tasks and sensors: what they take, and what they return.
 
 A ValueError names the method, the value and what is expected.
 """
 
+import inspect
 from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
 
@@ -21,6 +22,20 @@ def weights_of(params: Any) -> Any:
             "one, the weights of the reward terms",
         )
     return params.rewards
+
+
+def check_signatures(kind: type, base: type) -> None:
+    """Checks that the methods that a class overrides take the arguments of those of its base."""
+    for name, own in inspect.getmembers(kind, inspect.isfunction):
+        usual = getattr(base, name, own)
+        if own is usual or name == "__init__":
+            continue
+        expected = inspect.signature(usual)
+        found = inspect.signature(own)
+        try:
+            found.bind(*expected.parameters)
+        except TypeError:
+            _fail(f"{kind.__name__}.{name}", found, f"({', '.join(expected.parameters)})")
 
 
 def check_names(method: str, values: Any, names: Iterable[str]) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
-from mqe_jax.core.returned import alike, check_shape, results, weights_of
+from mqe_jax.core.returned import alike, check_shape, check_signatures, results, weights_of
 from mqe_jax.core.settings import Parameters, check, checked, differences, fail, override
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.assembly import make_controller, make_scene
@@ -87,6 +87,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         control: str = "command",
         num_envs: Environments = 4096,
     ) -> None:
+        check_signatures(type(self), Task)
         self.params = self.Params() if params is None else params
         self.weights = weights_of(self.params)
         offset = self.params.randomization.motor_offset

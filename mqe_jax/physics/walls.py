@@ -62,7 +62,16 @@ class Anchor:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Contribution of one block to the track; positions in the environment frame, m."""
+    """Contribution of one block to the track; positions in the environment frame, m.
+
+    Example:
+        ```python
+        from mqe_jax.terrain import Gate, Track
+
+        layout = Track((Gate(3.0),)).layout()
+        print([wall.name for wall in layout.walls])  # ['gate0_right', 'gate0_left']
+        ```
+    """
 
     walls: tuple[Wall, ...] = ()
     """Fixed and moving walls; `anchor` is an index into this layout's anchors."""

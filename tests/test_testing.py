@@ -1,0 +1,47 @@
+"""`check_task` finds the faults of a task, and names the method."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+
+from mqe_jax.envs.gate import Go1Gate
+from mqe_jax.envs.tug import Go1Tug
+from mqe_jax.testing import check_task
+
+
+def spawn_in_wall(env: Any) -> Any:
+    return [(x, y - 1.4, yaw) for x, y, yaw in env.compiled.layout.spawn]
+
+
+def infinite_reward(env: Any, before: Any, after: Any, collision: Any) -> Any:
+    return Go1Gate.rewards(env, before, after, collision) | {"approach": jnp.inf}
+
+
+def unfair_score(env: Any, before: Any, after: Any, collision: Any) -> Any:
+    reward, logged = Go1Tug.score(env, before, after, collision)
+    return reward + 1.0, logged
+
+
+@pytest.mark.parametrize(
+    ("base", "method", "fault", "said"),
+    [
+        (Go1Gate, "spawn_poses", spawn_in_wall, "robot0/.* starts .* m inside barrier/side_right"),
+        (Go1Gate, "rewards", infinite_reward, "rewards: a number is NaN or infinite"),
+        (Go1Gate, "outcome", lambda *_: {"success": 2.0}, "success is not between 0 and 1"),
+        (Go1Gate, "acting", lambda *_: jnp.zeros(2, bool), "actions do not change the robots"),
+        (Go1Gate, "step_task", lambda *_: jnp.zeros(()), r"step_task: \(\) float32; expected as"),
+        (
+            Go1Gate,
+            "reset_task",
+            lambda env, key: None,
+            r"Faulty.reset_task: .*; expected \(self, k",
+        ),
+        (Go1Tug, "score", unfair_score, "rewards: those of the teams do not add up to 0"),
+        (Go1Tug, "wins", lambda *_: jnp.ones(2, bool), "outcome: not one of win, draw and loss"),
+    ],
+)
+def test_faults_are_named(base: Any, method: str, fault: Any, said: str) -> None:
+    faulty: Any = type("Faulty", (base,), {method: fault})
+    with pytest.raises((AssertionError, ValueError), match=said):
+        check_task(faulty(impl="c", num_envs=2), num_envs=2, steps=3)
