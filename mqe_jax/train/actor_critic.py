@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.core import devices
+from mqe_jax.core import devices, keys
 from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.train import nn
@@ -42,7 +42,8 @@ def _trunk_init(
     if settings.recurrent:
         params["gru"] = nn.gru_init(gru_key, width, settings.gru_size)
     if settings.openrl_layers:
-        params["linear"] = nn.dense_init(jax.random.fold_in(hidden_key, 1), width, width)
+        linear_key = jax.random.fold_in(hidden_key, keys.LINEAR)
+        params["linear"] = nn.dense_init(linear_key, width, width)
         widths = (
             *settings.hidden_sizes,
             width,
