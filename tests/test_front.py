@@ -402,6 +402,8 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
             InputError, match=f"{next(iter(wrong))}: . is not allowed; it must be even"
         ):
             evaluate("go1tug", "forward", **(options | wrong))
+    with pytest.raises(InputError, match=r"sides: 'both' .* go1plane is not a match"):
+        evaluate("go1plane", "idle", **options)
     for measured in (lambda: evaluate("go1tug", "forward", impl="c"), lambda: cli.main(words)):
         measured()
         assert not isinstance(played["batch"], BothSides)

@@ -224,6 +224,12 @@ def test_each_environment_is_made_once(monkeypatch: Any, own: Bonus) -> None:
         assert len(made) == times, name
 
 
+def test_settings_of_opponents_are_named_without_any() -> None:
+    for name, value in {"both_sides": True, "draw_reward": -1.0}.items():
+        config = {"num_envs": 4, "opponents": [], name: value}
+        refuses(f"{name}: {value} .* without opponents", prepare, "go1tug", config, impl="c")
+
+
 # -- a batch of environments
 
 

@@ -125,6 +125,26 @@ def act(team: RobotTeam) -> None:
     jax.block_until_ready(team.act(seen, team.initial_memory(2), jax.random.PRNGKey(0)))
 
 
+def test_readings_of_a_robot_are_checked(policy: TrainedPolicy, files: Any) -> None:
+    own = robot.Robot(str(files["mean"]))
+    size = policy.dims.observation
+    starts = np.ones(2)
+    readings = np.linspace(-1.0, 1.0, 2 * size, dtype=np.float32).reshape(2, size)
+    expected = own.act(readings, np.ones(2, np.float32))
+    for alike in (readings.astype(float), readings.tolist()):
+        np.testing.assert_array_equal(own.act(alike, starts), expected)
+    wrong: dict[str, tuple[Any, Any]] = {
+        f"readings: .*{size + 3}.* must be numbers": (np.zeros((2, size + 3)), starts),
+        "readings: .* must be numbers": (readings[0], starts),
+        "readings: no numbers": ([["x"] * size] * 2, starts),
+        "readings: contain NaN": (np.full((2, size), np.nan), starts),
+        "starts: 3 .* must be 2": (readings, np.ones(3)),
+    }
+    for said, (given, first) in wrong.items():
+        with pytest.raises(ValueError, match=said):
+            own.act(given, first)
+
+
 def test_a_process_that_ends_is_reported_in_a_line(files: Any) -> None:
     with pytest.raises(
         ConnectionError,

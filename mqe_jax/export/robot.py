@@ -11,6 +11,7 @@ numbers with which a graph samples. The program ends if an answer takes longer t
 """
 
 import contextlib
+import math
 import os
 import struct
 import sys
@@ -19,6 +20,7 @@ from collections.abc import Iterator, Mapping
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 ANSWER = 10.0
 """Time in which a robot answers, s."""
@@ -43,12 +45,17 @@ class Robot:
         # metadata of the graph
         self.properties: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
 
-    def act(self, readings: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    def act(self, readings: ArrayLike, starts: ArrayLike) -> np.ndarray:
         """Returns the actions (N, D) for readings (N, O).
 
-        `starts` (N,) is 1 where an episode starts, else 0.
+        `starts` (N,) is 1 where an episode starts, else 0. ValueError for anything else than finite
+        numbers of these shapes.
         """
+        readings = _finite("readings", readings, math.prod(self._shapes["obs"]))
+        starts = _finite("starts", starts)
         count = len(readings)
+        if len(starts) != count:
+            raise ValueError(f"starts: {len(starts)} are not allowed; they must be {count}")
         inputs = {"obs": readings.reshape(count, *self._shapes["obs"])}
         if "noise" in self._shapes:
             inputs["noise"] = self._random.standard_normal(
@@ -63,6 +70,20 @@ class Robot:
         action = found.pop("action").reshape(count, -1)
         self._memory = {name.removeprefix("next_"): x for name, x in found.items()}
         return action
+
+
+def _finite(name: str, numbers: Any, *widths: int) -> np.ndarray:
+    """Returns numbers (N, *widths) as float32; ValueError for others, or if one is not finite."""
+    found = None
+    with contextlib.suppress(TypeError, ValueError), np.errstate(over="ignore"):
+        found = np.asarray(numbers).astype(np.float32, casting="same_kind")
+    if found is None or not found.shape or found.shape[1:] != widths:
+        given = "no numbers" if found is None else found.shape
+        expected = ", ".join(["N", *map(str, widths)])
+        raise ValueError(f"{name}: {given} are not allowed; they must be numbers ({expected})")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name}: contain NaN or infinity; they must be finite")
+    return found
 
 
 def write_frame(stream: IO[bytes], numbers: np.ndarray) -> None:

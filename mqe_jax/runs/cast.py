@@ -285,6 +285,8 @@ def _check_teams(env: QuadrupedEnv, config: TrainConfig) -> None:
         fail("opponents", list(config.opponents), allowed)
     if config.both_sides and not config.opponents:
         fail("both_sides", True, "false without opponents")
+    if config.draw_reward and not config.opponents:
+        fail("draw_reward", config.draw_reward, "0 without opponents")
     if len(env.teams) > 1 and config.num_envs % 2 and not config.opponents:
         fail("num_envs", config.num_envs, "even: both teams of a match are environments")
 

@@ -115,7 +115,9 @@ def _measure(
     """Returns the result of those who sit at a table."""
     batch = playing.batch
     about = {**playing.about, "seed": seed}
-    if len(playing.env.teams) > 1 and sides == "both":
+    if sides == "both":
+        if len(playing.env.teams) < 2:
+            fail("sides", sides, f"first: {playing.env.name} is not a match; it has one team")
         for name, count in {"episodes": episodes, "num_envs": batch.num_envs}.items():
             if count % 2:
                 allowed = "even: the policy plays half of the episodes on each side (sides: both)"
