@@ -121,19 +121,22 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
     the task's default skill. Policies of different skills get parameters with which they can meet.
     """
     found = list(found)
-    every = [getattr(each, "needs", None) for each in found]
-    needed = [x for x in every if isinstance(x, Needs) and x.task == task and x.control]
+    trained = [each for each in found if isinstance(getattr(each, "needs", None), Needs)]
+    trained = [each for each in trained if each.needs.task == task and each.needs.control]
     params: dict[str, Any] = {}
-    for needs in needed:
+    for policy in trained:
+        needs = policy.needs
         usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
         own = {name: getattr(needs, name) for name in usual}
         own = {name: value for name, value in own.items() if value != usual[name]}
         if needs.senses:
             own["senses"] = needs.senses
+        if needs.skill_weights:
+            own["skill_weights"] = policy.config.env.get("skill_weights")
         params = own | {name: value for name, value in params.items() if value is not None}
-    skills = [needs.by_name() for needs in needed]
+    skills = [policy.needs.by_name() for policy in trained]
     usual = any(isinstance(each, Named) and each.usual for each in found)
-    if usual and all(needs.control == "command" for needs in needed):
+    if usual and all(policy.needs.control == "command" for policy in trained):
         skills.append(TASKS[task].Params().actions("command"))
     return params | together(skills)
 

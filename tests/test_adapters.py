@@ -2,10 +2,13 @@
 opponent.
 """
 
+import dataclasses
 import importlib
+import shutil
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -26,6 +29,7 @@ from mqe_jax.envs import tasks
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.names import versus
 from mqe_jax.policies.simple import SimplePolicy
+from mqe_jax.skills.weights import ASSETS
 from tests.inputs import refuses
 from tests.test_opponents import new_policy
 
@@ -289,7 +293,7 @@ def test_an_opponent_may_see_another_group() -> None:
 
 
 def test_opponents_of_one_form_share_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As do opponents of one name in tasks with equal parameters."""
+    """As do opponents of one name."""
     traced = []
     step = TeamEnv.step
 
@@ -298,17 +302,40 @@ def test_opponents_of_one_form_share_a_program(monkeypatch: pytest.MonkeyPatch) 
         return step(env, state, action)
 
     monkeypatch.setattr(TeamEnv, "step", counted)
-    batch = mqe_jax.VectorEnv(match("go1tug"), 2)
-    policies = [new_policy(versus(batch, ["idle"]), seed) for seed in (0, 1)]
+    env = match("go1tug")
+    policies = [new_policy(versus(mqe_jax.VectorEnv(env, 2), ["idle"]), seed) for seed in (0, 1)]
     ended = []
     for opponent in (*policies, "forward", "forward"):
-        host: Any = HostEnvs(TeamEnv(match("go1tug"), opponent), 2)
+        host: Any = HostEnvs(TeamEnv(env, opponent), 2)
         host.reset([0, 1], np.random.default_rng(0))
         host.step(np.zeros((2, 1, 12)))
         ended.append(np.asarray(host.state.rival_groups["policy"]))
     assert len(traced) == 2
     assert np.any(ended[0] != ended[1])
     np.testing.assert_array_equal(ended[2], ended[3])
+
+
+def test_environments_share_a_program_only_if_they_act_alike(tmp_path: Path) -> None:
+    """Those of an id do unless a weights file has changed; a passed one has its own."""
+    file = tmp_path / "walk.safetensors"
+    shutil.copy(ASSETS / "walk_go1.safetensors", file)
+    named: dict[str, Any] = {"impl": "c", "num_envs": 1, "skill_weights": str(file)}
+
+    def program(task: Any, **settings: Any) -> Any:
+        begin, _ = SingleEnv(task, **settings)._host._programs
+        return begin.func  # pyright: ignore[reportFunctionMemberAccess]
+
+    first = program("go1tug", **named)
+    assert program("go1tug", **named) is first
+    assert program("go1tug", **{**named, "impl": "jax"}) is not first
+    env = mqe_jax.make("go1tug", **named)
+    assert program(env) is program(env) is not first
+    assert program(mqe_jax.make("go1tug", **named)) is not program(env)
+    file.write_bytes((ASSETS / "walk_go2.safetensors").read_bytes())
+    assert program("go1tug", **named) is not first
+    changed: Any = SingleEnv("go1tug", impl="c", num_envs=1)
+    changed.env.weights = dataclasses.replace(changed.env.weights, push=9.0)
+    assert changed._host._programs[0].func is not program("go1tug", impl="c", num_envs=1)
 
 
 def test_a_shipped_opponent_adds_its_memory_to_the_state() -> None:

@@ -1,6 +1,7 @@
 """Skills: command ranges and which policies fit them; the choice between several skills."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from mqe_jax import VectorEnv, cli, evaluate, learn, make, names
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import observations
+from mqe_jax.export.policy import skill_of
 from mqe_jax.export.task import TaskFunctions, readings_function
 from mqe_jax.names import load_policy, table, versus
 from mqe_jax.physics.robots.go1 import GO1
@@ -24,11 +26,16 @@ from mqe_jax.skills import agile
 from mqe_jax.skills import make as make_skill
 from mqe_jax.skills.choice import HOLD
 from mqe_jax.skills.control import Commander
+from mqe_jax.train.checkpoint import read_file
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import EnvDims
-from mqe_jax.train.policy import TrainedPolicy, save_policy
+from mqe_jax.train.normalize import running_init
+from mqe_jax.train.policy import TrainedPolicy, policy_in, save_policy
 from mqe_jax.view.session import Session
 from mqe_jax.walk_policy import WalkPolicy
 from tests.inputs import refuses
+from tests.training import random_params
 
 WALKING = population.FOLDER / "1-go1football-1vs1-late.safetensors"  # a policy of the skill `walk`
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
@@ -223,6 +230,32 @@ def test_policies_of_other_needs_are_refused(
     policy = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **own))
     for source in (policy, *([] if own else ["population/1/late", str(WALKING)])):
         refuses(rf"{field}: .* needs {said}", names.seat, source, env, field)
+
+
+def test_a_policy_needs_the_contents_of_its_skill_weights(weights: str, tmp_path: Path) -> None:
+    file = tmp_path / "agile.safetensors"
+    shutil.copy(weights, file)
+    params = {"skill": "agile", "skill_weights": str(file)}
+    env = make("go1gate", impl="c", num_envs=1, **params)
+    config = TrainConfig(task="go1gate", env=params)
+    needs = needs_of(env, config)
+    network = config.network.build(needs.dims)
+    learned = network.policy_params(random_params(network))
+    policy = TrainedPolicy(learned, running_init(needs.dims.observation), needs, config, {})
+    path = save_policy(tmp_path / "run", policy)
+    assert load_policy(path).needs == needs
+    assert table("go1gate", path, impl="c").env.params.skill_weights == str(file)
+    shipped = make("go1gate", impl="c", num_envs=1, skill="agile")
+    refuses(r"needs skill_weights '\w{64}'; the environment has None", load_policy, path, shipped)
+    needless = dataclasses.replace(needs, skill_weights=None)
+    other = dataclasses.replace(policy, needs=needless)
+    refuses("needs skill_weights None; the environment has", names.seat, other, env)
+    stored = read_file(path, kind="policy")
+    del stored.metadata["needs"]["skill_weights"]  # as version 0.3 writes it
+    assert policy_in(stored).needs == needs
+    agile.NETWORKS.save(agile.NETWORKS.init(jax.random.PRNGKey(1)), file)
+    refuses("policy: .* needs skill_weights", table, path, impl="c")
+    refuses("skill_weights: .* has changed", skill_of, env)
 
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:

@@ -74,10 +74,13 @@ def test_a_killed_training_resumes_as_if_never_stopped(
 
 
 def test_a_finished_run_is_neither_repeated_nor_overwritten(
-    straight: tuple[Path, TrainState],
+    straight: tuple[Path, TrainState], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_dir, expected = straight
     assert_same(train(PROBE, settings(), run_dir, resume=True), expected)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(PROBE), "digests", {"skill_weights": "other"}, raising=False)
+        refuses("skill_weights: has changed", train, PROBE, settings(), run_dir, resume=True)
     refuses("already holds a run", train, PROBE, settings(), run_dir)
     refuses(
         r"ppo.gamma: 0\.5 differs from the run",

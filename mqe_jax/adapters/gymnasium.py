@@ -65,7 +65,8 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.env = task_env(task, **overrides)
         self.action_space = self.env.action_space
         self.observation_space = self.env.observation_space
-        self._host = HostEnvs(self.env, 1, render_mode, render_size)
+        named = not isinstance(task, QuadrupedEnv)
+        self._host = HostEnvs(self.env, 1, render_mode, render_size, named=named)
 
     @checked
     def reset(
@@ -131,7 +132,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space = self.env.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._host = HostEnvs(self.env, num_envs, render_mode, render_size)
+        named = not isinstance(task, QuadrupedEnv)
+        self._host = HostEnvs(self.env, num_envs, render_mode, render_size, named=named)
         self._ended = np.zeros(num_envs, bool)  # environments that the next step resets
 
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]

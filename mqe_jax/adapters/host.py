@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -47,7 +47,7 @@ class Step(NamedTuple):
 class _Kind:
     """Environments that share compiled functions."""
 
-    key: Any
+    key: Hashable
     env: Any = dataclasses.field(compare=False)
 
 
@@ -66,12 +66,20 @@ class HostEnvs:
         num_envs: int,
         render_mode: str | None = None,
         render_size: tuple[int, int] = RENDER_SIZE,
+        *,
+        named: bool = False,
     ) -> None:
+        """Creates N environments; `named` says whether `env` was just made from a task's id.
+
+        Such environments share compiled functions if they act alike. A passed one has its own, as
+        anything in it may have been changed.
+        """
         self.env = env.with_num_envs(num_envs)
         self.num_envs = num_envs
         self.state: State | None = None
         self._mode = render_mode
         self._size = render_size
+        self._named = named
         self._camera: Camera | None = None
         self._task = self.env.match if isinstance(self.env, TeamEnv) else self.env
         self._seats = self.env.seats if isinstance(self.env, TeamEnv) else None
@@ -82,9 +90,8 @@ class HostEnvs:
 
     @functools.cached_property
     def _programs(self) -> tuple[Callable[..., State], Callable[..., tuple[State, Step]]]:
-        task = self._task
-        made = (type(task), task.params, task.impl, task.control, task.physics.num_envs)
-        begin, step = _compile(_Kind((type(self.env), *made), self.env))
+        key = self._task.identity if self._named else id(self._task)
+        begin, step = _compile(_Kind((type(self.env), key), self.env))
         return functools.partial(begin, self._seats), functools.partial(step, self._seats)
 
     def reset(

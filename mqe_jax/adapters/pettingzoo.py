@@ -106,7 +106,8 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         size = (self.task.privileged_observation_size,)
         self.state_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)
         self._generator = np.random.default_rng()
-        self._host = HostEnvs(self.task, 1, render_mode, render_size)
+        named = not isinstance(task, QuadrupedEnv)
+        self._host = HostEnvs(self.task, 1, render_mode, render_size, named=named)
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Box:
         """Returns the space of an agent's observation (O,)."""

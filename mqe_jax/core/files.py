@@ -5,6 +5,7 @@ The bounds are in `mqe_jax.core.limits`.
 
 import contextlib
 import csv
+import hashlib
 import json
 import os
 import re
@@ -107,6 +108,12 @@ def check_locks(path: Path) -> None:
 
 
 # -- readers: every failure of a parser is an InputError that names the file
+
+
+def digest(path: str | os.PathLike[str]) -> str:
+    """Returns the SHA-256 of a file's content."""
+    with open(path, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 def check_file(path: Path, limit: int) -> None:

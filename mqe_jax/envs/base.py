@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import jax
@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import digest
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, check_signatures, results, weights_of
@@ -31,6 +32,7 @@ from mqe_jax.envs.observation import ObservationLayout, finite
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
+from mqe_jax.envs.registry import SHIPPED, TASKS
 from mqe_jax.envs.sizes import Sizes, check_sizes, hide
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
@@ -131,6 +133,10 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
         self.controller = make_controller(self, scene, self.physics.num_substeps)
+        reads = {"actuator_network": bool(self.actuators)}
+        reads["skill_weights"] = self.controller.skill_params is not None
+        files = {name: getattr(self.params, name) for name, read in reads.items() if read}
+        self.digests = {name: digest(file) for name, file in files.items() if file}
         self.sizes = Sizes(self)
         self.randomizer = Randomizer(
             self.params.randomization, self.compiled.model, self.index, self.params.friction
@@ -144,6 +150,18 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             clock_size=clock.shape[1],
             contact_forces=self.params.privileged_contact_forces,
         )
+
+    @property
+    def identity(self) -> Hashable:
+        """A value that is equal for environments that act alike.
+
+        Those of the package's tasks do if parameters, engine and the contents of weights files are
+        equal, and no attribute was set later. Any other one is alike only to itself.
+        """
+        if self.name not in SHIPPED or type(self) is not TASKS[self.name] or self._later:
+            return id(self)
+        made = (self.params, self.impl, self.control, self.physics.num_envs)
+        return type(self), *made, *sorted(self.digests.items())
 
     def __setattr__(self, name: str, value: Any) -> None:
         if "_arguments" in vars(self):

@@ -79,6 +79,8 @@ class Task(Sensing, Generic[S, P]):
     """Index tables of the robots."""
     objects: Mapping[str, ObjectIndex]
     """Index tables of the objects by name."""
+    digests: Mapping[str, str]
+    """SHA-256 of the weights files that the environment has read, by parameter."""
 
     def scene(self) -> Scene:
         """Returns the scene: track, robots and objects."""
@@ -231,9 +233,11 @@ class Task(Sensing, Generic[S, P]):
         layout = self.layouts[group]
         blocks = tuple(dataclasses.replace(block, meaning="") for block in layout.blocks)
         sensors = self.params.senses if group == ONBOARD else ()
+        weights = self.digests.get("skill_weights") if self.control == "command" else None
         return {
             "version": self.version,
             **self.params.actions(self.control),
+            "skill_weights": weights,
             "senses": tuple(to_mapping(sensor) for sensor in sensors),
             "layout": str(layout),
             "blocks": blocks,

@@ -28,6 +28,8 @@ import onnx
 import mqe_jax
 from mqe_jax import skills
 from mqe_jax.acting.seats import check_policy
+from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import digest
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.index import Proprioception
@@ -107,8 +109,14 @@ def policy_step(
 
 
 def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
-    """Returns the skill of a task's robots for any commands, and its parameters as in the file."""
+    """Returns the skill of a task's robots for any commands, and its parameters as in the file.
+
+    InputError if the file has changed since the environment read it.
+    """
     skill = skills.make(env.params.skill, env.robot)
+    file = env.params.skill_weights
+    if file and digest(file) != env.digests["skill_weights"]:
+        raise InputError(f"skill_weights: {file} has changed since the environment read it")
     return skill, skill.load_params(env.params.skill_weights)
 
 

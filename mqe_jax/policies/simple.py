@@ -74,9 +74,7 @@ def named(name: str, env: QuadrupedEnv, field: str = "policy") -> SimplePolicy:
     else:
         _check_scripted(name, env, field)
         plan = functools.partial(_act_scripted, env, name)
-    identity = None
-    if isinstance(env, QuadrupedEnv):
-        identity = (name, type(env), env.params, env.control)
+    identity = (name, env.identity) if isinstance(env, QuadrupedEnv) else None
     return SimplePolicy(env.name, agents, plan, name, identity)
 
 

@@ -1,13 +1,12 @@
 """What kept results come from: the version, what was passed, and the contents of its files."""
 
-import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mqe_jax.core import version
+from mqe_jax.core import files, version
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import read_json, write_atomically
 from mqe_jax.core.settings import leaves, to_mapping
@@ -38,10 +37,7 @@ def digest(path: str | Path) -> str | None:
     """Returns the SHA-256 of a file, or of the policy of a run folder; None without one."""
     # of os.path, which take texts that cannot be paths
     file = os.path.join(path, POLICY_FILE) if os.path.isdir(path) else path
-    if not os.path.isfile(file):
-        return None
-    with open(file, "rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
+    return files.digest(file) if os.path.isfile(file) else None
 
 
 def _texts(values: Any) -> Iterator[str]:

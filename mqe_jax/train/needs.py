@@ -42,6 +42,8 @@ class Needs:
     """Action mode."""
     skill: str | tuple[str, ...] | None = None
     """Skill that carries out the actions, or those between which they choose."""
+    skill_weights: str | None = None
+    """SHA-256 of the skill's weights file; None for the shipped one."""
     gait: str | None = None
     """Named default commands of the skill."""
     commands: tuple[str, ...] | None = None
@@ -64,7 +66,7 @@ class Needs:
 
         These include each setting of the sensors, and any known form of entities and images.
         """
-        names = ("version", *ACTIONS, "group")
+        names = ("version", *ACTIONS, "skill_weights", "group")
         needs = {
             "task": self.task,
             "agents": self.dims.agents,

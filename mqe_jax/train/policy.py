@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from annotated_types import Ge
 
 from mqe_jax.core.errors import InputError, NonFiniteError
-from mqe_jax.core.files import check_folder, check_locks
+from mqe_jax.core.files import check_folder, check_locks, digest
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import build, check, checked, fail, to_mapping
 from mqe_jax.core.types import (
@@ -321,8 +321,13 @@ def policy_in(stored: Stored) -> TrainedPolicy:
             f"{stored.path}: holds a mixture of policies, which version 0.4 does not read"
         )
     try:
-        needs = build(Needs, metadata.pop("needs"))
+        needed = metadata.pop("needs")
+        needs = build(Needs, needed)
         config = build(TrainConfig, without_retired(metadata.pop("config")))
+        weights = config.env.get("skill_weights")
+        if weights and needs.control == "command" and "skill_weights" not in needed:  # before 0.4
+            known = digest(weights) if Path(weights).is_file() else "unknown"
+            needs = dataclasses.replace(needs, skill_weights=known)
         deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, AttributeError, InputError) as error:

@@ -24,6 +24,7 @@ from mqe_jax.train.monitor import ABSOLUTE_FACTOR, EvaluationLog, Monitor
 from mqe_jax.train.policy import TrainedPolicy, policy_of, save_policy
 from mqe_jax.train.seeds import SeedBatch, without_shared
 from mqe_jax.train.start import (
+    digests_of,
     first_state,
     learned_state,
     own_learner,
@@ -252,7 +253,8 @@ class Training:
         kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
         for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
             metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
-            metadata |= {"generator": generator(), "environments": config.checkpoint.environments}
+            metadata |= {"generator": generator(), "digests": digests_of(self._env)}
+            metadata["environments"] = config.checkpoint.environments
             if config.checkpoint.environments:
                 tree = self._processes.join(without_shared(state, self._seeds.shared))
             else:

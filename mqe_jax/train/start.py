@@ -107,6 +107,9 @@ def first_state(
     ):
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
     check_same(run, without_retired(before), config)
+    if metadata.get("digests", digests_of(env)) != digests_of(env):
+        names = ", ".join(digests_of(env))
+        raise InputError(f"{names}: has changed since the run in {run} read it")
     if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
         fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
     totals = {name: value for name, value in before.items() if name == "total_steps"}
@@ -199,3 +202,8 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
                 f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in "
                 f"{path / CONFIG_FILE}"
             )
+
+
+def digests_of(env: VectorEnv) -> dict[str, str]:
+    """Returns the SHA-256 of the weights files that a task or a batch of it has read, by name."""
+    return dict(getattr(getattr(env, "env", env), "digests", {}))
