@@ -27,6 +27,7 @@ from mqe_jax.core.settings import (
     merge,
     nested,
     override,
+    path_text,
 )
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.registry import SCRIPTED, TASKS, find_task, task_id
@@ -89,11 +90,11 @@ def find(
         if isinstance(source, type) or not (callable(source) or hasattr(source, "act")):
             fail(field, source, "a policy, its function act(obs, memory, key), a name or a path")
         return source
-    check(field, source, PathText)
+    source = path_text(check(field, source, PathText))
     known = {} if read is None else read
-    if str(source) not in known:
-        known[str(source)] = _find(str(source), task, field)
-    return known[str(source)]
+    if source not in known:
+        known[source] = _find(source, task, field)
+    return known[source]
 
 
 def _find(name: str, task: str, field: str) -> Found:
@@ -289,7 +290,7 @@ def target(task: str | Path | QuadrupedEnv, read: Read | None = None) -> Target:
     """
     if isinstance(task, QuadrupedEnv):
         return Target(task.name, own_parameters(task))
-    source = str(check("task", task, PathText))
+    source = path_text(check("task", task, PathText))
     name = find_task(source)
     if name is not None:
         return Target(name, {})

@@ -20,6 +20,7 @@ from mqe_jax.core.settings import (
     merge,
     nested,
     override,
+    path_text,
 )
 from mqe_jax.envs.registry import ALIASES, SHIPPED, TASKS
 from mqe_jax.train.config import TrainConfig, read_settings
@@ -140,7 +141,7 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     shipped = ["demo", "league", "sizes"]
     for file in ("paper", "tuned"):
         shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
-    name = str(check("config", config, PathText))
+    name = path_text(check("config", config, PathText))
     if name == "demo":
         return [_Layer.of("", _parts(name))]
     if name in shipped:

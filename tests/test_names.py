@@ -1,5 +1,6 @@
 """The front door: names, files and objects become environments and policies, each once."""
 
+import dataclasses
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,10 @@ from mqe_jax.envs import QuadrupedEnv, make
 from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.wrappers import Deadline
 from mqe_jax.physics import engines
+from mqe_jax.policies import zoo
+from mqe_jax.presets import resolve
 from mqe_jax.runs.cast import prepare
+from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from tests.inputs import refuses
 from tests.states import made
@@ -252,3 +256,21 @@ def test_settings_that_a_batch_ignores_are_named(own: Bonus) -> None:
     (config,), cast = prepare(batch, {"num_envs": 4, "time_limit_ends": True}, impl="c")
     assert isinstance(cast.env, Deadline) and cast.env.inner is batch and config.num_envs == 4
     assert prepare(batch)[1].env is batch
+
+
+def test_a_path_is_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    place: Any = Path("go1gate")
+    save_policy(place, zoo.load("go1tug"))
+    config = TrainConfig(start=place, opponents=[place], imitation={"teacher": place})
+    for named in (place, config.start, config.opponents[0], config.imitation.teacher):
+        assert mqe_jax.load_policy(named).task == names.target(named).task == "go1tug"
+    assert mqe_jax.load_policy("go1gate").task == "go1gate"
+    refuses("config: unknown name './demo'", resolve, "go1gate", Path("demo"))
+
+
+def test_the_run_of_a_task_that_this_process_does_not_know_is_refused(tmp_path: Path) -> None:
+    policy = zoo.load("go1gate")
+    unknown = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, task="own"))
+    run = save_policy(tmp_path, unknown)
+    refuses("task: unknown id 'own'.*or one that register_task adds", mqe_jax.evaluate, run)

@@ -141,6 +141,12 @@ def _path(value: Any) -> Any:
     return _expand_home(value)
 
 
+def path_text(value: str | Path) -> str:
+    """Returns a text, or that of a path, which no name equals: ./go1gate for Path("go1gate")."""
+    text = str(value)
+    return os.path.join(os.curdir, text) if isinstance(value, Path) and os.sep not in text else text
+
+
 def _expand_home(value: Any) -> Any:
     """Returns a text or path with the home folder in place of a `~` at its beginning."""
     if not isinstance(value, str | Path) or not str(value).startswith("~"):
@@ -433,7 +439,8 @@ def _text(value: Any) -> Any:
     unprintable = isinstance(value, str | Path) and not is_text(str(value))
     if unprintable or isinstance(value, bytes | bytearray):
         raise ValueError(f"a text, {TEXT}")
-    return _expand_home(value)
+    value = _expand_home(value)
+    return path_text(value) if isinstance(value, Path) else value
 
 
 def _boolean(value: Any) -> bool:

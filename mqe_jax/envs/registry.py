@@ -222,7 +222,8 @@ def task_id(name: str) -> str:
         print(task_id("go1bridgewrestling"))  # go1wrestling
         ```
     """
-    return known_name("task: unknown id", ALIASES.get(name, name), TASKS)
+    own = "or one that register_task adds in this process"
+    return known_name("task: unknown id", ALIASES.get(name, name), (*TASKS, own))
 
 
 def find_task(target: str) -> str | None:
