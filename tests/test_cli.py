@@ -171,11 +171,11 @@ def test_the_best_of_several_episodes_is_rendered(
         "render_episode",
         lambda env, episode, path, **named: rendered.append(episode) or "egl",
     )
-    assert (
-        cli.main(["render", "fake", "-o", str(tmp_path / "clip.png"), "--best-of", "3", "--json"])
-        == 0
-    )
-    said = json.loads(capfd.readouterr().out)
+    words = ["-o", str(tmp_path / "clip.png"), "--best-of", "3", "--policy", "random", "--json"]
+    assert cli.main(["render", "fake", *words]) == 0
+    out, err = capfd.readouterr()
+    assert err.endswith("clip.png (egl); it shows random\n")
+    said = json.loads(out)
     assert [len(episode) for episode in rendered] == [5] and said["rendered"] == 2
     assert said["episodes"][1] == {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3}
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 from viewer import Driven, session
 
 from mqe_jax import cli
@@ -19,7 +20,7 @@ from mqe_jax.sensors import marks as sensed
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.view.menu import Entry, Menu, find_runs
 from mqe_jax.view.session import HOLD_TIME, Drive
-from mqe_jax.viz import cameras, framing, geometry, recording, render
+from mqe_jax.viz import cameras, clips, framing, geometry, recording, render
 from mqe_jax.viz.framing import Camera
 from mqe_jax.viz.recording import Episode
 from tests.fake_env import FakeEnv
@@ -107,6 +108,30 @@ def test_an_image_from_above_is_of_the_time_that_the_caller_names(
         file = tmp_path / f"{at}.png"
         render.render_episode(env, episode, file, size=(160, 90), at=at, backend=None)
     assert (tmp_path / "0.0.png").read_bytes() != (tmp_path / "1.0.png").read_bytes()
+
+
+def test_a_line_says_what_is_rounded(
+    env: Any, episode: Episode, tmp_path: Path, capsys: Any
+) -> None:
+    def lines(file: str, **options: Any) -> list[str]:
+        path = tmp_path / file
+        render.render_episode(env, episode, path, size=(160, 90), backend=None, **options)
+        return [line for line in capsys.readouterr().err.splitlines() if "GL" not in line]
+
+    assert lines("clip.gif", fps=12.5) == lines("image.png", at=0.1) == []
+    (line,) = lines("clip.gif", fps=29.97)
+    assert line.startswith("mqe: fps: 25, not 29.97")
+    (line,) = lines("image.png", at=1000.0)
+    assert line.startswith(f"mqe: at: the episode ends after {(len(episode) - 1) * episode.dt:g} s")
+
+
+def test_a_gif_lasts_as_long_as_its_episode(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 255, (30, 16, 16, 3), np.uint8)
+    clips.write_clip(tmp_path / "clip.gif", frames, 35.0)  # 28.6 ms a frame, of tens of ms
+    with Image.open(tmp_path / "clip.gif") as clip:
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(clip)]
+    assert sum(durations) == pytest.approx(30 * 1000 / 35, abs=10)
 
 
 def test_gl_draws_robots_walls_and_floor(env: Any, episode: recording.Episode) -> None:

@@ -21,7 +21,6 @@ from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import policy_of
 from mqe_jax.train.start import initial_key
-from mqe_jax.viz import curves
 from mqe_jax.viz.clips import check_output
 
 DEMO_TASK = "go1gate"
@@ -58,8 +57,6 @@ def demo(run_dir: Path, settings: str, episodes: int, impl: str) -> None:
     echo("mqe demo: evaluating the trained policy")
     table["after"] = evaluate(DEMO_TASK, run.policy, **measure).to_dict()
     write_atomically(run_dir / "evaluation.json", (json.dumps(table, indent=2) + "\n").encode())
-    figure = curves.plot_curves([run.metrics], "Narrow Gate, trained on the CPU")
-    curves.save_figure(figure, run_dir / "curve.png")
     video = run_dir / "video.mp4"
     try:
         check_output(video)

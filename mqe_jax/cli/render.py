@@ -50,7 +50,12 @@ class Render(PolicyOptions):
         }
         clip = render(**self.playing, episodes=self.best_of, **look)
         renderer = clip.save(self.output, at=self.at)
-        echo(f"mqe: wrote {self.output} ({renderer})")
+        shown = clip.about["policy"]
+        if "actions" in clip.about:
+            shown += f", {clip.about['actions']} actions"
+        if "opponent" in clip.about:
+            shown += f", against {clip.about['opponent']}"
+        echo(f"mqe: wrote {self.output} ({renderer}); it shows {shown}")
         episodes = [
             {
                 "success": episode.success,

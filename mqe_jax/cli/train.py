@@ -82,7 +82,6 @@ class Train(TaskOptions):
         import jax
 
         from mqe_jax.runs.learning import learn, learn_seeds
-        from mqe_jax.viz import curves
 
         run_dir = self.run_dir or Path("runs") / self.target
         seed = self.settings.seed
@@ -103,8 +102,6 @@ class Train(TaskOptions):
             raise interrupts.Interrupted(HINT.format(run_dir))
         if jax.process_index() > 0:  # one process writes the files
             return
-        figure = curves.plot_curves([run.metrics for run in runs], self.target)
-        curves.save_figure(figure, run_dir / "curve.png")
         for folder in folders:
             echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
         echo(f"mqe: {run_dir / 'curve.png'} has the curve")

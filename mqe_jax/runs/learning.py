@@ -23,6 +23,7 @@ from mqe_jax.train.logs import CSV_FILE, CsvLog, read_metrics
 from mqe_jax.train.monitor import read_evaluations, write_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import Training, open_training
+from mqe_jax.viz import curves
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,9 +72,7 @@ class Run:
 
     def plot(self) -> "Figure":
         """Returns a figure of reward and success over environment steps."""
-        from mqe_jax.viz.curves import plot_curves
-
-        return plot_curves([self.metrics], self.policy.task)
+        return curves.plot_curves([self.metrics], self.policy.task)
 
     @checked
     def save(self, folder: str | Path) -> None:
@@ -153,7 +152,7 @@ def learn(
         env: task parameters.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         seed: random seed. Default: that of the settings, 0 unless they name one.
-        run_dir: run folder. Default: nothing is written.
+        run_dir: run folder, which gets a curve.png at the end. Default: nothing is written.
         resume: whether to continue the run in the folder from its newest checkpoint, if there is
             one.
         dump_diverged: folder for recordings of environments whose physics diverges (see `mqe
@@ -165,9 +164,8 @@ def learn(
         NonFiniteError: after the first update with a loss or weight that is not finite.
     """
     configs, cast = prepare(task, config, env, impl=impl, seeds=None if seed is None else [seed])
-    return _train(
-        configs, cast, [None if run_dir is None else Path(run_dir)], resume, dump_diverged
-    )[0]
+    folder = None if run_dir is None else Path(run_dir)
+    return _train(configs, cast, [folder], folder, resume, dump_diverged)[0]
 
 
 @checked
@@ -195,20 +193,24 @@ def learn_seeds(
     Args:
         task: as `learn`, and so are config, env, impl, resume and dump_diverged.
         seeds: random seeds.
-        run_dir: folder of the run folders seed0, seed1, ... Default: nothing is written.
+        run_dir: folder of the run folders seed0, seed1, ... and, at the end, of a curve.png of
+            all seeds. Default: nothing is written.
     """
     configs, cast = prepare(task, config, env, impl=impl, seeds=seeds)
-    folders = [None if run_dir is None else Path(run_dir) / f"seed{seed}" for seed in seeds]
-    return _train(configs, cast, folders, resume, dump_diverged)
+    folder = None if run_dir is None else Path(run_dir)
+    folders = [None if folder is None else folder / f"seed{seed}" for seed in seeds]
+    return _train(configs, cast, folders, folder, resume, dump_diverged)
 
 
 def _train(
     configs: Sequence[TrainConfig],
     cast: Cast,
     folders: Sequence[Path | None],
+    folder: Path | None,
     resume: bool,
     dump_diverged: str | Path | None,
 ) -> list[Run]:
+    """Trains seeds into their folders; `folder` gets the curve of them all."""
     with (
         guard(cast.env, dump_diverged) as env,
         open_training(cast._replace(env=env), configs, folders, resume) as training,
@@ -221,10 +223,14 @@ def _train(
         except KeyboardInterrupt:
             if not interrupts.installed:
                 echo(f"mqe: interrupted after {training.env_steps:,} environment steps")
-        written = [folder for folder in folders if folder is not None]
-        if written and jax.process_index() == 0:  # one process writes the files
-            return [load_run(folder) for folder in written]
-        return list(_runs(training))
+        written = [place for place in folders if place is not None]
+        if not written or jax.process_index() > 0:  # one process writes the files
+            return list(_runs(training))
+        runs = [load_run(place) for place in written]
+    if folder is not None and all(run.finished for run in runs):
+        figure = curves.plot_curves([run.metrics for run in runs], runs[0].policy.task)
+        curves.save_figure(figure, folder / "curve.png")
+    return runs
 
 
 def _runs(training: Training) -> Iterator[Run]:

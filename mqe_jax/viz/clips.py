@@ -93,6 +93,7 @@ def _write_images(path: Path, images: list[Image.Image], suffix: str, fps: float
         palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
         images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
         options = {"optimize": True}
-    images[0].save(
-        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, **options
-    )
+    unit = 10 if suffix == ".gif" else 1  # of a duration, ms
+    ends = unit * np.rint(np.arange(len(images) + 1) * 1000 / fps / unit)
+    options["duration"] = np.diff(ends).astype(int).tolist()  # right in total
+    images[0].save(path, save_all=True, append_images=images[1:], loop=0, **options)

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import math
 import os
 import subprocess
 import sys
@@ -208,7 +209,8 @@ def render_episode(
 
     The renderer is `egl`, `osmesa` or `matplotlib`. Defaults: .mp4 960 x 540 at 25 frames/s, .gif
     and .webp 480 x 270 at 12.5 frames/s, .png 1280 x 720; view `follow` for a clip, `scene` for an
-    image. `speed` below 1 is slow motion. `at` is the time of an image, s (default: the middle). A
+    image. `speed` below 1 is slow motion. `at` is the time of an image, s (default: the middle).
+    Frames are a whole number of environment steps apart; a line says if `fps` differs for it. A
     legend names the teams' colours. Without GL, standard error names the packages that 3-D
     rendering needs.
 
@@ -229,19 +231,25 @@ def render_episode(
     _check_fits(env, episode)
     suffix = path.suffix.lower()
     size = size or {".mp4": (960, 540), ".png": (1280, 720)}.get(suffix, (480, 270))
-    fps = fps or (25.0 if suffix == ".mp4" else 12.5)
+    asked = fps or (25.0 if suffix == ".mp4" else 12.5)
     chosen = gl_backend() if backend == "auto" else backend
     if chosen is None:
         echo(
             f"mqe: no GL library, rendered from above instead; for 3-D images install {GL_PACKAGES}"
         )
     shown = slice(None)
+    last = len(episode) - 1
     if suffix == ".png":
-        index = len(episode) // 2 if at is None else min(round(at / episode.dt), len(episode) - 1)
+        index = len(episode) // 2 if at is None else min(round(at / episode.dt), last)
+        if at is not None and at > (last + 0.5) * episode.dt:
+            echo(f"mqe: at: the episode ends after {last * episode.dt:g} s, which the image shows")
         shown = slice(index, index + 1)
+        rate = asked
     else:
-        episode = episode.cut(slice(None, None, max(1, round(speed / (fps * episode.dt)))))
-        fps = speed / episode.dt
+        episode = episode.cut(slice(None, None, max(1, round(speed / (asked * episode.dt)))))
+        rate = speed / episode.dt
+        if fps is not None and not math.isclose(rate, fps, rel_tol=1e-3):
+            echo(f"mqe: fps: {rate:g}, not {fps:g}: frames are a whole number of steps apart")
         if suffix != ".mp4" and 3 * len(episode) * size[0] * size[1] > CLIP_BYTES:
             frames = f"{len(episode)} frames of {size[0]} x {size[1]} pixels"
             raise InputError(
@@ -256,5 +264,5 @@ def render_episode(
         frames = draw_top(model, episode, size, shown)
     else:
         frames = _draw_gl(model, episode.cut(shown), views[shown], size, chosen)
-    write_clip(path, map(legend(env, size, episode.marks), frames), fps)
+    write_clip(path, map(legend(env, size, episode.marks), frames), rate)
     return chosen or "matplotlib"
