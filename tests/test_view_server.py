@@ -149,6 +149,17 @@ def test_a_foreign_origin_or_host_is_answered_with_403_and_a_line(
     )
 
 
+def test_other_requests_than_get_print_nothing(said: Any) -> None:
+    server = open_server("127.0.0.1", free_port(), "test")
+    for method in "HEAD", "POST":
+        connection = http.client.HTTPConnection("127.0.0.1", server.get_port())
+        connection.request(method, "/")
+        with pytest.raises(http.client.RemoteDisconnected):
+            connection.getresponse()
+    server.stop()
+    assert said() == []
+
+
 def test_rewinding_pauses_and_shows_an_earlier_step(shown: SimpleNamespace) -> None:
     run = shown.session
     panel = shown.panel

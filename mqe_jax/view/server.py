@@ -16,6 +16,7 @@ import functools
 import http
 import io
 import ipaddress
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,6 +27,10 @@ from websockets.http11 import Request, Response
 
 from mqe_jax.core.errors import InputError, brief
 from mqe_jax.core.literal import echo
+
+_LOGGER = logging.getLogger(__name__)
+# websockets prints the traceback of requests that it cannot answer, such as HEAD.
+_LOGGER.addFilter(lambda record: record.msg != "opening handshake failed")
 
 
 def open_server(host: str, port: int, label: str) -> viser.ViserServer:
@@ -57,6 +62,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
         nonlocal serving
         serving = True
         restricted = functools.partial(answer, process_request)
+        options["logger"] = _LOGGER
         return original(*arguments, process_request=restricted, **options)
 
     websockets_server.serve = serve  # type: ignore[misc]
