@@ -10,7 +10,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax import names
-from mqe_jax.core.settings import override
+from mqe_jax.core.settings import build, override
 from mqe_jax.envs import QuadrupedEnv, make
 from mqe_jax.envs.gate import Go1Gate
 from mqe_jax.envs.wrappers import Deadline
@@ -262,7 +262,9 @@ def test_a_path_is_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.chdir(tmp_path)
     place: Any = Path("go1gate")
     save_policy(place, zoo.load("go1tug"))
-    config = TrainConfig(start=place, opponents=[place], imitation={"teacher": place})
+    passed = {"start": place, "opponents": [place], "imitation.teacher": place}
+    config = build(TrainConfig, passed)
+    named: Any
     for named in (place, config.start, config.opponents[0], config.imitation.teacher):
         assert mqe_jax.load_policy(named).task == names.target(named).task == "go1tug"
     assert mqe_jax.load_policy("go1gate").task == "go1gate"
