@@ -14,7 +14,6 @@ import pytest
 from mqe_jax import cli
 from mqe_jax.acting.results import Rate
 from mqe_jax.acting.seats import Seat, Seats, exchangeable
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import Observations
 from mqe_jax.envs import make
 from mqe_jax.names import load_policy
@@ -24,6 +23,7 @@ from mqe_jax.selfplay.league.crossplay import CrossPlay, cross_play
 from mqe_jax.selfplay.league.games import Estimate
 from mqe_jax.selfplay.league.tournament import Standings, rate
 from tests import fake_env
+from tests.inputs import refuses
 
 KEY = jax.random.PRNGKey(0)
 OTHER = Path(__file__).parents[1] / "results" / "cooperative" / "go1gate-seed10.safetensors"
@@ -147,5 +147,11 @@ def test_a_cooperative_task_is_played_by_mixed_teams(tmp_path: Path, capfd: Any)
 def test_a_task_of_one_agent_has_no_mates() -> None:
     batch: Any = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 2)
     batch.num_agents = 1
-    with pytest.raises(InputError, match=r"task: 'fake' .* one of a team of several agents"):
-        cross_play(batch, {"a": dataclasses.replace(simple(1), agents=1)}, 2, KEY)
+    refuses(
+        r"task: 'fake' .* one of a team of several agents",
+        cross_play,
+        batch,
+        {"a": dataclasses.replace(simple(1), agents=1)},
+        2,
+        KEY,
+    )

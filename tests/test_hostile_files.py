@@ -361,11 +361,13 @@ def test_a_pool_of_impossible_numbers(name: str, tmp_path: Path) -> None:
 
 def test_weights_that_no_network_has() -> None:
     layers = {"0.weight": np.full((32, 6), 1e20, np.float32), "0.bias": np.zeros(32, np.float32)}
-    with pytest.raises(
-        InputError,
-        match=r"^weights: 0\.weight holds magnitudes to 1e\+20; at most 10000 is allowed",
-    ):
-        linear_layers("weights", layers, {"0": (6, 32)})
+    refuses(
+        r"^weights: 0\.weight holds magnitudes to 1e\+20; at most 10000 is allowed",
+        linear_layers,
+        "weights",
+        layers,
+        {"0": (6, 32)},
+    )
 
 
 @pytest.mark.parametrize("steps", ["16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16"])

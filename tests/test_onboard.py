@@ -16,7 +16,6 @@ import pytest
 from mqe_jax import make, names
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.cli.train import parse_train
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import Batch, Cast, Observations
 from mqe_jax.policies import zoo
@@ -180,8 +179,7 @@ def test_other_sensors_are_named_with_both_values() -> None:
             "needs senses.detections.range 6.0; the environment has 4.0",
         ),
     ):
-        with pytest.raises(InputError, match=message):
-            check_policy(policy, make("go1gate", impl="c", num_envs=1, senses=senses))
+        refuses(message, check_policy, policy, make("go1gate", impl="c", num_envs=1, senses=senses))
     forged = override(needs, {"dims": needs.dims._replace(blocks=needs.dims.blocks[::-1])})
     assert (
         forged.mismatches(needs) == {} != Needs(task="go1gate", dims=needs.dims).mismatches(needs)

@@ -14,7 +14,6 @@ import pytest
 
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.seats import Seats
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Observations, observations
 from mqe_jax.envs import VectorEnv, make
@@ -216,16 +215,18 @@ def test_an_opponents_memory_starts_anew_with_its_episode(
 
 def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: VectorEnv) -> None:
     refuses("opponents: 3 is not allowed", versus, door, ["idle"] * 3)
-    with pytest.raises(
-        InputError, match=r"opponents: 4 is not allowed; it must be a divisor .* of a process, 2"
-    ):
-        versus(door, ["idle"] * 4).share(2)
+    refuses(
+        r"opponents: 4 is not allowed; it must be a divisor .* of a process, 2",
+        versus(door, ["idle"] * 4).share,
+        2,
+    )
     refuses("go1plane is not a match", versus, matches("go1plane"), ["idle"])
-    with pytest.raises(
-        InputError,
-        match=r"opponents: .* needs task 'go1revolvingdoor'; the environment has 'go1tug'",
-    ):
-        versus(matches("go1tug"), [policies[0]])
+    refuses(
+        r"opponents: .* needs task 'go1revolvingdoor'; the environment has 'go1tug'",
+        versus,
+        matches("go1tug"),
+        [policies[0]],
+    )
     env = versus(door, ["idle", policies[0]])
     refuses("block 0 is fixed", env.change, env.reset(KEY), 0, policies[0])
     other = new_policy(versus(door, ["idle"]), network={"hidden_sizes": [16]})

@@ -17,7 +17,7 @@ import mqe_jax
 from mqe_jax import cli, skills
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.cli.commands import Eval
-from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.core.settings import override
 from mqe_jax.envs import SCRIPTED, TASKS, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_SCRIPTED, register_scripted
@@ -164,10 +164,14 @@ def test_parameters_are_those_that_policies_need_beyond_the_defaults(
 
 def test_a_batch_evaluates_only_policies_that_fit() -> None:
     batch = VectorEnv(make("go1gate", impl="c", num_envs=1, skill="agile"), 1)
-    with pytest.raises(
-        InputError, match="policy: policy needs skill 'walk'; the environment has 'agile'"
-    ):
-        evaluate_batch(batch, zoo.load("go1gate"), 1, jax.random.PRNGKey(0))
+    refuses(
+        "policy: policy needs skill 'walk'; the environment has 'agile'",
+        evaluate_batch,
+        batch,
+        zoo.load("go1gate"),
+        1,
+        jax.random.PRNGKey(0),
+    )
 
 
 def test_commands_apply_what_a_shipped_policy_needs(capfd: Any) -> None:
@@ -300,10 +304,12 @@ def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(
     env = make("go1wrestling", impl="c", num_envs=1)
     action, _ = load_policy("ahead", env).act(jnp.zeros((2, 1, 12)), (), jax.random.PRNGKey(0))
     np.testing.assert_allclose(action[:, 0], [[0.7, 0, 0]] * 2, atol=1e-6)
-    with pytest.raises(
-        InputError, match=r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge"
-    ):
-        load_policy("ahead", make("go1tug", impl="c", num_envs=1))
+    refuses(
+        r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge",
+        load_policy,
+        "ahead",
+        make("go1tug", impl="c", num_envs=1),
+    )
     refuses(
         "already registered for go1wrestling",
         register_scripted,

@@ -96,29 +96,38 @@ def test_a_population_has_named_and_trained_members(fake: Path) -> None:
 
 def test_a_published_version_does_not_change(fake: Path) -> None:
     policy = new_policy(versus(matches(), ["idle"]), 1)
-    with pytest.raises(
-        InputError, match=r"member: 'early' .* a new one, of at most 5: idle, early"
-    ):
-        ship.add_member("1", TASK, "early", policy)
+    refuses(
+        r"member: 'early' .* a new one, of at most 5: idle, early",
+        ship.add_member,
+        "1",
+        TASK,
+        "early",
+        policy,
+    )
     for name in ("scripted", "random", "forward"):
         ship.add_member("1", TASK, name)
-    with pytest.raises(InputError, match="member: 'sixth' "):
-        ship.add_member("1", TASK, "sixth", policy)
+    refuses("member: 'sixth' ", ship.add_member, "1", TASK, "sixth", policy)
     (file,) = fake.glob("*.safetensors")
     file.write_bytes(file.read_bytes() + b" ")
-    with pytest.raises(
-        InputError, match=r"early\.safetensors: is missing, or not the file of population/1"
-    ):
-        population.find("population/1/early", TASK)
+    refuses(
+        r"early\.safetensors: is missing, or not the file of population/1",
+        population.find,
+        "population/1/early",
+        TASK,
+    )
 
 
 def test_a_member_that_is_too_large_is_refused(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ship, "BYTES", 1000)
     before = sorted(fake.iterdir())
-    with pytest.raises(
-        InputError, match=r"policy: '[0-9]+ bytes' is not allowed; it must be at most 1000"
-    ):
-        ship.add_member("1", TASK, "late", new_policy(versus(matches(), ["idle"]), 2))
+    refuses(
+        r"policy: '[0-9]+ bytes' is not allowed; it must be at most 1000",
+        ship.add_member,
+        "1",
+        TASK,
+        "late",
+        new_policy(versus(matches(), ["idle"]), 2),
+    )
     assert sorted(fake.iterdir()) == before
 
 
@@ -144,8 +153,12 @@ def test_an_unknown_member_is_named(name: str, said: str, fake: Path) -> None:
     with pytest.raises(InputError) as error:
         load_policy(name, matches().env)
     assert said in str(error.value)
-    with pytest.raises(InputError, match="population: population/1 has no members for 'go1tug'"):
-        load_policy("population/1/early", matches("go1tug").env)
+    refuses(
+        "population: population/1 has no members for 'go1tug'",
+        load_policy,
+        "population/1/early",
+        matches("go1tug").env,
+    )
 
 
 def test_an_evaluation_has_the_mean_and_the_worst_case(

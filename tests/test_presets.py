@@ -14,7 +14,6 @@ import pytest
 import mqe_jax
 from mqe_jax import names
 from mqe_jax.cli.train import parse_train
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import differences, load_yaml, override, to_mapping
 from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.presets import CONFIG_FOLDER, resolve
@@ -199,8 +198,12 @@ def test_a_parameter_that_is_given_counts_in_training_too() -> None:
 
 
 def test_settings_of_a_mapping_are_checked() -> None:
-    with pytest.raises(InputError, match=r"config: .* is not allowed; it must be a shipped name"):
-        names.settings("go1gate", {"config": 3})  # pyright: ignore[reportArgumentType]
+    refuses(
+        r"config: .* is not allowed; it must be a shipped name",
+        names.settings,
+        "go1gate",
+        {"config": 3},
+    )  # pyright: ignore[reportArgumentType]
 
 
 if __name__ == "__main__":

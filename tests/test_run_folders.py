@@ -55,10 +55,14 @@ def test_a_training_stops_when_its_folder_is_lost(how: str, tmp_path: Path) -> N
         if row["updates"] == (2 if how == "replaced" else 1):
             LOST[how](folder)
 
-    with pytest.raises(
-        InputError, match=f"run_dir: {folder} was removed, renamed or replaced; nothing more is"
-    ):
-        train(PROBE, SETTINGS, folder, on_update=lose)
+    refuses(
+        f"run_dir: {folder} was removed, renamed or replaced; nothing more is",
+        train,
+        PROBE,
+        SETTINGS,
+        folder,
+        on_update=lose,
+    )
     assert not folder.exists() or list(folder.iterdir()) == []
     moved = next(tmp_path.rglob("moved"), tmp_path / "other" / "run")
     if how != "removed":

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
-from mqe_jax.core.errors import InputError
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.plane import Go1Plane
 from mqe_jax.physics import robots
@@ -211,8 +210,12 @@ def test_wrong_data_is_refused_by_name() -> None:
         torque_limit=np.ones(3),
     )
     refuses(r"Robot\.default_joints", dataclasses.replace, GO1, default_joints=np.zeros(12))
-    with pytest.raises(InputError, match=r"Robot\.collision: duplicate names foot"):
-        dataclasses.replace(GO1, collision=(*GO1.collision, GO1.collision[-1]))
+    refuses(
+        r"Robot\.collision: duplicate names foot",
+        dataclasses.replace,
+        GO1,
+        collision=(*GO1.collision, GO1.collision[-1]),
+    )
     refuses(r"unknown part 'tail'", CollisionShape, "tail", sphere(0.02))
 
 

@@ -19,6 +19,7 @@ from mqe_jax.sensors.marks import Marks
 from mqe_jax.sensors.messages import Messages
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.viz import render
+from tests.inputs import refuses
 from tests.sensing import EXACT, SENSING, readings, scattered
 from tests.states import made, placed
 
@@ -153,8 +154,7 @@ def test_teammates_in_range_receive_messages_one_step_later() -> None:
     )
     heard = step(dataclasses.replace(state, step=late), said).groups["onboard"]
     assert not np.any(heard[0]) and np.all(heard[1, :, 2] == 1)
-    with pytest.raises(InputError, match=r"action: shape .*expected \(2, 2, 14\)"):
-        batch.step(state, said[..., :12])
+    refuses(r"action: shape .*expected \(2, 2, 14\)", batch.step, state, said[..., :12])
 
 
 def test_messages_get_lost_and_do_not_reach_far() -> None:
@@ -208,10 +208,11 @@ def test_sensors_that_cannot_work_are_named(task: str, senses: Any, message: str
 
 
 def test_a_group_without_its_sensors_is_named() -> None:
-    with pytest.raises(
-        InputError, match=r"group: 'onboard' .*the task parameter senses adds onboard"
-    ):
-        VectorEnv(made("go1gate"), 2).with_groups(["onboard"])
+    refuses(
+        r"group: 'onboard' .*the task parameter senses adds onboard",
+        VectorEnv(made("go1gate"), 2).with_groups,
+        ["onboard"],
+    )
 
 
 @pytest.mark.gpu

@@ -27,6 +27,7 @@ from mqe_jax.sensors.lidar import Lidar
 from mqe_jax.sensors.pipeline import Pipeline
 from mqe_jax.sensors.suite import Suite
 from mqe_jax.viz import recording
+from tests.inputs import refuses
 from tests.sensing import EXACT, RANGE, SENSING, Shapes, rays, readings, scattered, sense
 from tests.states import initial, made, placed
 
@@ -409,7 +410,5 @@ def test_a_sensor_needs_a_name_and_both_decorators() -> None:
     class Bare(Sensor):
         pass
 
-    with pytest.raises(InputError, match=r"^sensor: .*Bare.* below @register and @settings_class"):
-        register(Bare)
-    with pytest.raises(InputError, match=r"^sensor Bare: the field name has no default"):
-        register(settings_class(Bare))
+    refuses(r"^sensor: .*Bare.* below @register and @settings_class", register, Bare)
+    refuses(r"^sensor Bare: the field name has no default", register, settings_class(Bare))

@@ -12,7 +12,6 @@ import pytest
 
 from mqe_jax import VectorEnv, cli, evaluate, learn, make, names
 from mqe_jax.adapters.opponent import TeamEnv
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import observations
 from mqe_jax.export.policy import skill_of
 from mqe_jax.export.task import TaskFunctions, readings_function
@@ -271,10 +270,12 @@ def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
     policy = learn(batch, small).policy
     assert policy.config.env == {"control": "position", "position_scale": 2.0}
     names.seat(policy, batch.env)
-    with pytest.raises(
-        InputError, match=r"policy: .* needs position_scale 2.0; the environment has 1.0"
-    ):
-        names.seat(policy, make("go1plane", impl="c", num_envs=1, control="position"))
+    refuses(
+        r"policy: .* needs position_scale 2.0; the environment has 1.0",
+        names.seat,
+        policy,
+        make("go1plane", impl="c", num_envs=1, control="position"),
+    )
 
 
 BOTH = ("walk", "agile")
@@ -509,5 +510,10 @@ def test_ranges_for_which_no_skill_is_trained_warn() -> None:
 def test_policies_that_the_actions_do_not_admit_are_refused(
     policies: Any, parameters: Any, said: str
 ) -> None:
-    with pytest.raises(InputError, match=f"opponent: .* {said}"):
-        names.seat(policies["walk"], make(TASK, impl="c", num_envs=1, **parameters), "opponent")
+    refuses(
+        f"opponent: .* {said}",
+        names.seat,
+        policies["walk"],
+        make(TASK, impl="c", num_envs=1, **parameters),
+        "opponent",
+    )

@@ -109,10 +109,15 @@ def test_seeds_and_names_of_tasks(tmp_path: Path) -> None:
         jobs[0].configs[0].opponents == ("go1gate", "idle")
         and jobs[0].configs[0].start == "go1gate.safetensors"
     )
-    with pytest.raises(
-        InputError, match="seeds: 7 is not allowed; it must be one of the sweep's: 0, 1"
-    ):
-        sweeps.plan(load(tmp_path), tmp_path, config_of, (), [1, 7])
+    refuses(
+        "seeds: 7 is not allowed; it must be one of the sweep's: 0, 1",
+        sweeps.plan,
+        load(tmp_path),
+        tmp_path,
+        config_of,
+        (),
+        [1, 7],
+    )
 
 
 def test_seeds_that_stopped_at_other_steps_are_trained_alone(tmp_path: Path) -> None:
@@ -155,8 +160,12 @@ def test_files_and_folders_that_cannot_be_used_are_named_once(tmp_path: Path) ->
     refuses(
         rf"^{tmp_path}/none\.yaml: cannot be read \(", sweeps.load_sweep, tmp_path / "none.yaml"
     )
-    with pytest.raises(InputError, match="folder: /proc/none cannot be written"):
-        sweeps.prepare(build(Sweep, {"tasks": ["go1gate"]}), Path("/proc/none"))
+    refuses(
+        "folder: /proc/none cannot be written",
+        sweeps.prepare,
+        build(Sweep, {"tasks": ["go1gate"]}),
+        Path("/proc/none"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -301,11 +310,12 @@ def test_cells_are_selected_by_name_or_pattern(tmp_path: Path) -> None:
     ]
     assert names("go1gate/jrpo") == ["go1gate/jrpo"]
     assert names("go1gate/jrpo+scratch", "*/mappo") == ["go1gate/mappo", "go1gate/jrpo+scratch"]
-    with pytest.raises(
-        InputError,
-        match=r"cells: 'go1gate/mapo' matches no cell \(did you mean 'go1gate/mappo'\?\)",
-    ):
-        names("*/mappo", "go1gate/mapo")
+    refuses(
+        r"cells: 'go1gate/mapo' matches no cell \(did you mean 'go1gate/mappo'\?\)",
+        names,
+        "*/mappo",
+        "go1gate/mapo",
+    )
 
 
 def test_the_commands_say_what_is_left_and_report(

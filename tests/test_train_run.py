@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from mqe_jax.acting.evaluate import evaluate_batch
-from mqe_jax.core.errors import InputError, NonFiniteError
+from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.core.settings import override, to_mapping
 from mqe_jax.core.types import Cast
 from mqe_jax.train import checkpoint as checkpoints
@@ -307,10 +307,13 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
     assert len(same) > 5
     for name in same:
         np.testing.assert_array_equal(first[name], last[name])
-    with pytest.raises(
-        InputError, match=r"action_scale: 0\.25 differs from that of the policy in .*straight, "
-    ):
-        train_seeds(cast, [settings(start=start, action_scale=0.25)], [tmp_path / "b"])
+    refuses(
+        r"action_scale: 0\.25 differs from that of the policy in .*straight, ",
+        train_seeds,
+        cast,
+        [settings(start=start, action_scale=0.25)],
+        [tmp_path / "b"],
+    )
     other = settings(start=start, network__hidden_sizes=(8,))
     said = r"start: .*straight.* is not allowed; it must be a policy with this run's network"
     refuses(said, train_seeds, cast, [other], [tmp_path / "b"])

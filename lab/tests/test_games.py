@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from lab import games
-from mqe_jax.core.errors import InputError
 from mqe_jax.selfplay.league import games as league
 from mqe_jax.selfplay.league.crossplay import CrossPlay
 from mqe_jax.selfplay.league.tournament import Standings, rate
+from tests.inputs import refuses
 from tests.test_games import check, payoff_of, results_of
 
 Array = NDArray[np.float64]
@@ -237,5 +237,4 @@ def test_the_table_of_mixed_teams_gives_means(tmp_path: Path) -> None:
         ["idle", "25.0"],
     ]
     (tmp_path / "tournament.csv").write_text("agent0,others\na,b\n")
-    with pytest.raises(InputError, match="is not a tournament's table"):
-        games.describe(tmp_path / "tournament.csv")
+    refuses("is not a tournament's table", games.describe, tmp_path / "tournament.csv")

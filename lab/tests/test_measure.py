@@ -14,10 +14,10 @@ import pytest
 import yaml
 
 from lab import measure as measuring
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.runs import exploiting, playing, sweeping
 from mqe_jax.study import sweep as sweeps
+from tests.inputs import refuses
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "lab" / "strength.yaml"
@@ -85,13 +85,16 @@ def test_unknown_cells_and_parts_are_named(tmp_path: Path) -> None:
     file = tmp_path / "strength.yaml"
     file.write_text(MEASURES)
     part = measuring.load(file, "rates")
-    with pytest.raises(InputError, match=r"'go1tug/heavi' matches no cell \(did you mean"):
-        measuring.measure(part, tmp_path, cells=["go1tug/heavi"])
-    with pytest.raises(InputError, match="has no part 'rate'"):
-        measuring.load(file, "rate")
+    refuses(
+        r"'go1tug/heavi' matches no cell \(did you mean",
+        measuring.measure,
+        part,
+        tmp_path,
+        cells=["go1tug/heavi"],
+    )
+    refuses("has no part 'rate'", measuring.load, file, "rate")
     file.write_text("tasks: [go1gate]")
-    with pytest.raises(InputError, match=r"strength\.yaml: measure: "):
-        measuring.load(file)
+    refuses(r"strength\.yaml: measure: ", measuring.load, file)
 
 
 @pytest.mark.parametrize(
@@ -124,8 +127,7 @@ def test_measurements_that_cannot_be_made_are_named(
     tmp_path: Path, change: str, message: str
 ) -> None:
     part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
-    with pytest.raises(InputError, match=re.escape(message)):
-        measuring.plan(build(measuring.Measurement, part), tmp_path)
+    refuses(re.escape(message), measuring.plan, build(measuring.Measurement, part), tmp_path)
 
 
 def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(

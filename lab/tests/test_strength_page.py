@@ -15,8 +15,8 @@ from PIL import Image
 
 from lab import strength_page
 from mqe_jax.acting.results import Rate
-from mqe_jax.core.errors import InputError
 from mqe_jax.policies import zoo
+from tests.inputs import refuses
 
 
 @pytest.fixture
@@ -173,11 +173,11 @@ def save(folder: Path, part: str, task: str, result: Any) -> None:
 
 def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
     """Those of other tasks stay."""
-    with pytest.raises(
-        InputError,
-        match=r"--rates: .* has no results of a part: cooperative, matches, .*, crossplay",
-    ):
-        strength_page.copy_rates(tmp_path)
+    refuses(
+        r"--rates: .* has no results of a part: cooperative, matches, .*, crossplay",
+        strength_page.copy_rates,
+        tmp_path,
+    )
     before = {file.name: file.read_bytes() for file in data.iterdir()}
     responses = strength_page.rows("exploitability")
     write(tmp_path / "population" / "rates.csv", {("go1tug", "plain", "win_rate"): 0.5})
