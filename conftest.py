@@ -8,7 +8,7 @@ import importlib.util
 import os
 import signal
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +100,21 @@ def _kept_programs() -> tuple[dict[Any, Any], Any, Any]:
     from mqe_jax.train.seeds import SeedBatch
 
     return {}, functools.cache(SeedBatch), functools.cache(SeedBatch.map)
+
+
+@pytest.fixture
+def mqe(capfd: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """Runs `mqe` with the words of a line and further ones; returns its `out` and `err`."""
+    from mqe_jax import cli
+
+    def run(line: str, *more: object, code: int = 0) -> Any:
+        capfd.readouterr()
+        found = cli.main([*line.split(), *map(str, more)])
+        said = capfd.readouterr()
+        assert found == code, said
+        return said
+
+    return run
 
 
 @pytest.fixture(scope="module")

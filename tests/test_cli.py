@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,6 @@ from mqe_jax.core.settings import override
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.presets import resolve
-from mqe_jax.train import checkpoint
 from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import SETTINGS
@@ -41,14 +39,10 @@ def run_folder(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) 
     return folder
 
 
-def test_alone_it_says_what_to_do_first_and_its_version_on_request(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    assert cli.main([]) == 0
-    out = capfd.readouterr().out
+def test_alone_it_says_what_to_do_first_and_its_version_on_request(mqe: Any) -> None:
+    out = mqe("").out
     assert "mqe train go1gate" in out and "mqe render" in out
-    assert cli.main(["--version"]) == 0
-    assert capfd.readouterr().out == f"mqe {mqe_jax.__version__}\n"
+    assert mqe("--version").out == f"mqe {mqe_jax.__version__}\n"
 
 
 @pytest.mark.parametrize("command", [[], *(name.split() for name in arguments.COMMANDS), ["walk"]])
@@ -59,105 +53,63 @@ def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFi
     assert "usage: mqe" in capfd.readouterr().out
 
 
-def test_a_checkpoint_with_environments_of_an_earlier_version_is_rejected_by_name(
-    run_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Version 0.3 stored the observations as `obs`."""
-    run = Path(shutil.copytree(run_folder, tmp_path / "run"))
-    path = checkpoint.list_checkpoints(run)[-1]
-    _, arrays, about = checkpoint.read_file(path, kind="checkpoint")
-    own = "rollout/env_state/groups/policy"
-    arrays["rollout/env_state/obs"] = arrays.pop(own)
-    checkpoint.save_tree(path, arrays, about, kind="checkpoint")
-    words = ["train", "fake", "--run-dir", str(run), *SMALL, "--resume", "--total-steps", "128"]
-    assert cli.main(words) == 2
-    assert f"{path}: {own} is missing; the file has other settings or is of another version" in (
-        capfd.readouterr().err
-    )
-
-
-def test_eval_prints_one_object_and_nothing_else(
-    run_folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["eval", str(run_folder), "--json", "--episodes", "6", "--num-envs", "4"]) == 0
-    lines = capfd.readouterr().out.splitlines()
-    assert len(lines) == 1
-    result = json.loads(lines[0])
+def test_eval_prints_one_object_and_nothing_else(run_folder: Path, mqe: Any) -> None:
+    (line,) = mqe(f"eval {run_folder} --json --episodes 6 --num-envs 4").out.splitlines()
+    result = json.loads(line)
     assert result["task"] == "fake" and result["episodes"] == 6
     assert (result["policy"], result["actions"], result["seed"]) == (str(run_folder), "sampled", 0)
     assert {"success_rate", "average_step_reward", "terms"} <= set(result)
 
 
-def test_a_simple_policy_is_measured_and_dropped_contacts_are_counted(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    command = ["eval", "fake", "--json", "--episodes", "2", "--policy"]
-    assert cli.main([*command, "forward"]) == 0  # two steps of each episode beyond x = 1.21 m
-    out, err = capfd.readouterr()
-    result = json.loads(out)
-    assert (
-        result["success_rate"] == 1.0
-        and result["policy"] == "forward"
-        and not {"actions", "opponent"} & set(result)
-    )
+def test_a_simple_policy_is_measured_and_dropped_contacts_are_counted(mqe: Any) -> None:
+    command = "eval fake --json --episodes 2 --policy"
+    said = mqe(f"{command} forward")  # two steps of each episode beyond x = 1.21 m
+    result = json.loads(said.out)
+    assert result["success_rate"] == 1.0 and result["policy"] == "forward"
+    assert not {"actions", "opponent"} & set(result)
     assert result["average_step_reward"] == pytest.approx(0.05) and result["overflow"] == 4
-    assert [line for line in err.splitlines() if "dropped contacts in 4 environment steps" in line]
-    assert cli.main([*command, "idle"]) == 0
-    out, err = capfd.readouterr()
-    assert json.loads(out)["overflow"] == 0 and "dropped" not in err
+    assert said.err.count("dropped contacts in 4 environment steps") == 1
+    still = mqe(f"{command} idle")
+    assert json.loads(still.out)["overflow"] == 0 and "dropped" not in still.err
 
 
-def test_a_divergence_is_recorded_and_replayed(
-    tmp_path: Path, monkeypatch: Any, capfd: Any
-) -> None:
+def test_a_divergence_is_recorded_and_replayed(mqe: Any, monkeypatch: Any) -> None:
     # in the tenth step of 0.02 s
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.19)
     monkeypatch.setattr("mqe_jax.viz.render.gl_backend", lambda: None)
-    task = ["go1gate", "--impl", "c", "--control", "position", "--policy", "random", "--json"]
-    folder = ["--dump-diverged", str(tmp_path / "dump")]
-    assert cli.main(["eval", *task, "--episodes", "2", "--num-envs", "2", *folder]) == 0
-    out, err = capfd.readouterr()
-    files = sorted((tmp_path / "dump").iterdir())
-    assert json.loads(out)["diverged"] == 2 and "mqe replay" in err
-    assert files[0].name == "diverged_0000.npz"
-    assert cli.main(["replay", str(files[0]), "-o", "clip.png", "--json"]) == 0
-    result = json.loads(capfd.readouterr().out)
+    task = "go1gate --impl c --control position --policy random --json"
+    said = mqe(f"eval {task} --episodes 2 --num-envs 2 --dump-diverged dump")
+    assert json.loads(said.out)["diverged"] == 2 and "mqe replay" in said.err
+    assert min(Path("dump").iterdir()).name == "diverged_0000.npz"
+    result = json.loads(mqe("replay dump/diverged_0000.npz -o clip.png --json").out)
     assert result["steps"] == result["diverged_after"] == 10 and result["first_step"] == 0
     assert Path("clip.png").stat().st_size > 500
 
 
-def test_a_divergence_in_training_is_recorded(tmp_path: Path, monkeypatch: Any, capfd: Any) -> None:
+def test_a_divergence_in_training_is_recorded(mqe: Any, monkeypatch: Any) -> None:
     # in the second step
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)
-    (tmp_path / "small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
-    command = (
-        "train go1revolvingdoor --impl c --control position --run-dir run --config "
-        "small.yaml --num-envs 4"
-    )
-    command += " --rollout-steps 2 --total-steps 4 --ppo.minibatches 1 --dump-diverged dump"
-    assert cli.main(command.split()) == 0
-    assert "recorded 2 divergences" in capfd.readouterr().err
+    Path("small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
+    task = "go1revolvingdoor --impl c --control position --config small.yaml --num-envs 4"
+    few = "--rollout-steps 2 --total-steps 4 --ppo.minibatches 1"
+    said = mqe(f"train {task} {few} --run-dir run --dump-diverged dump").err
+    assert "recorded 2 divergences" in said
     for file in ("diverged_0000.npz", "diverged_0001.npz"):
-        recording = load_recording(tmp_path / "dump" / file)
+        recording = load_recording(Path("dump", file))
         assert recording.task == "go1revolvingdoor" and recording.states["step"].tolist() == [0, 1]
         assert recording.actions.shape == (2, 2, 12)
 
 
-def test_bench_prints_its_figures(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_bench_prints_its_figures(monkeypatch: pytest.MonkeyPatch, mqe: Any) -> None:
     monkeypatch.setattr(FakeEnv, "overflow_x", -100.0)
-    assert cli.main(["bench", "fake", "--json", "--num-envs", "2", "--steps", "3"]) == 0
-    result = json.loads(capfd.readouterr().out)
+    result = json.loads(mqe("bench fake --json --num-envs 2 --steps 3").out)
     rates = ["env_steps_per_s", "slowest", "fastest", "bare_env_steps_per_s"]
     assert list(result)[:7] == ["task", "impl", "num_envs", *rates]
     assert result["overflow"] == 2 * 3  # every step of both
     assert result["slowest"] <= result["env_steps_per_s"] <= result["fastest"]
 
 
-def test_the_best_of_several_episodes_is_rendered(
-    tmp_path: Path, monkeypatch: Any, capfd: Any
-) -> None:
+def test_the_best_of_several_episodes_is_rendered(mqe: Any, monkeypatch: Any) -> None:
     recorded = [
         recording.Episode(
             np.zeros((n, 1)), np.zeros((n, 0, 3)), np.zeros((n, 0, 4)), 0.1, success, reward
@@ -171,18 +123,16 @@ def test_the_best_of_several_episodes_is_rendered(
         "render_episode",
         lambda env, episode, path, **named: rendered.append(episode) or "egl",
     )
-    words = ["-o", str(tmp_path / "clip.png"), "--best-of", "3", "--policy", "random", "--json"]
-    assert cli.main(["render", "fake", *words]) == 0
-    out, err = capfd.readouterr()
-    assert err.endswith("clip.png (egl); it shows random\n")
-    said = json.loads(out)
-    assert [len(episode) for episode in rendered] == [5] and said["rendered"] == 2
-    assert said["episodes"][1] == {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3}
+    said = mqe("render fake -o clip.png --best-of 3 --policy random --json")
+    assert said.err.endswith("clip.png (egl); it shows random\n")
+    result = json.loads(said.out)
+    assert [len(episode) for episode in rendered] == [5] and result["rendered"] == 2
+    assert result["episodes"][1] == {"success": 1.0, "average_step_reward": 0.5, "seconds": 0.3}
 
 
 @pytest.mark.parametrize("command", ["eval", "render", "view"])
 def test_evaluation_clip_and_viewer_run_the_same_policy(
-    command: str, run_folder: Path, monkeypatch: Any
+    command: str, run_folder: Path, mqe: Any, monkeypatch: Any
 ) -> None:
     played: list[tuple[str, bool]] = []
 
@@ -192,16 +142,16 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
 
     monkeypatch.setattr(names, "seat", seat)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: True)  # for the viewer's packages
-    flags = {"render": ["-o", "clip.png"], "view": ["--port", "49876"]}.get(command, [])
-    for target in (str(run_folder), "go1gate", "fake"):
-        for more in ([], ["--deterministic"]):
-            assert cli.main([command, target, *flags, *more]) == 2
+    flags = {"render": "-o clip.png", "view": "--port 49876"}.get(command, "")
+    for target in (run_folder, "go1gate", "fake"):
+        for more in ("", "--deterministic"):
+            mqe(f"{command} {target} {flags} {more}", code=2)
     assert [deterministic for _, deterministic in played] == [False, True] * 3
     assert [policy for policy, _ in played[::2]] == [str(run_folder), "go1gate", "forward"]
 
 
 def test_set_keeps_the_other_parameters_of_a_run(
-    run_folder: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path, mqe: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
     run = names.load_policy(run_folder)
@@ -215,32 +165,18 @@ def test_set_keeps_the_other_parameters_of_a_run(
         raise InputError("stop")
 
     monkeypatch.setattr(names, "environment", environment)
-    assert (
-        cli.main(
-            [
-                "eval",
-                str(run_folder),
-                "--set",
-                "rewards={success: 9}",
-                "--set",
-                "rewards={approach: 1}",
-            ]
-        )
-        == 2
-    )
+    words = "--set", "rewards={success: 9}", "--set", "rewards={approach: 1}"
+    mqe(f"eval {run_folder}", *words, code=2)
     assert made == [{"rewards": {"collision": -5.0, "success": 9, "approach": 1}}]
 
 
+@pytest.mark.parametrize("field", ["policy", "opponent"])
 def test_a_policy_of_another_task_is_refused_by_name(
-    run_folder: Path, capfd: pytest.CaptureFixture[str]
+    field: str, run_folder: Path, mqe: Any
 ) -> None:
-    for flag in ("--policy", "--opponent"):
-        assert cli.main(["eval", "go1tug", flag, str(run_folder)]) == 2
-        err = capfd.readouterr().err
-        assert (
-            err.startswith(f"mqe: {flag[2:]}: ")
-            and "needs task 'fake'; the environment has 'go1tug'" in err
-        )
+    said = mqe(f"eval go1tug --{field} {run_folder}", code=2).err
+    assert said.startswith(f"mqe: {field}: ")
+    assert "needs task 'fake'; the environment has 'go1tug'" in said
 
 
 def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
@@ -274,15 +210,13 @@ def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> Non
 @pytest.mark.parametrize(
     "words", ["--run-dir go1tug", "--no-both-sides --run_dir go1tug", "--start go1tug"]
 )
-def test_the_task_comes_first(words: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_task_comes_first(words: str, mqe: Any) -> None:
     parsed = parse_train(["go1gate", *words.split()])
     alone = parse_train(["go1gate"]).settings
     assert parsed.target == "go1gate"
     assert override(parsed.settings, {"start": None, "both_sides": alone.both_sides}) == alone
-    assert cli.main(["train", *words.split(), "go1gate"]) == 2
-    assert capfd.readouterr().err.startswith(
-        "mqe: task: is missing; it comes first: mqe train TASK --"
-    )
+    said = mqe(f"train {words} go1gate", code=2).err
+    assert said.startswith("mqe: task: is missing; it comes first: mqe train TASK --")
 
 
 START = """
@@ -346,17 +280,12 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     assert all(f"--{flag}" in done.stderr for flag in ("seed", "ppo.epochs", "network.heads"))
 
 
-def test_the_demo_resumes_only_what_has_begun(
-    capfd: pytest.CaptureFixture[str], monkeypatch: Any
-) -> None:
+def test_the_demo_resumes_only_what_has_begun(mqe: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr(demo, "DEMO_TASK", "fake")
     small = "task: fake, num_envs: 4, rollout_steps: 8, total_steps: 64, checkpoint: {every: 1}"
     Path("small.yaml").write_text(f"{{{small}, network: {{recurrent: false}}}}")
     for _ in range(2):
-        assert (
-            cli.main(["demo", "--run-dir", "run", "--config", "small.yaml", "--episodes", "4"]) == 0
-        )
-        said = capfd.readouterr()
+        said = mqe("demo --run-dir run --config small.yaml --episodes 4")
         assert "no checkpoint" not in said.err
         assert re.search(
             r"after training:  both robots through [\d.]+% \([\d.]+ to [\d.]+%\)", said.out

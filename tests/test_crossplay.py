@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import cli
 from mqe_jax.acting.results import Rate
 from mqe_jax.acting.seats import Seat, Seats, exchangeable
 from mqe_jax.core.types import Observations
@@ -120,25 +119,11 @@ def test_tables_are_80_columns_wide_and_have_intervals(monkeypatch: pytest.Monke
     assert "\n 1 +100 (+" in repr(standings)
 
 
-def test_a_cooperative_task_is_played_by_mixed_teams(tmp_path: Path, capfd: Any) -> None:
-    words = [
-        "--impl",
-        "c",
-        "--set",
-        "episode_length=0.1",
-        "--control",
-        "position",
-        "--episodes",
-        "2",
-    ]
-    assert cli.main(["tournament", "go1gate", "random", *words, "-o", str(tmp_path), "--json"]) == 0
-    found = json.loads(capfd.readouterr().out)
-    assert (
-        found["policies"] == ["random"]
-        and found["references"] == ["idle"]
-        and found["worst"] is None
-    )
-    assert np.shape(found["success"]["value"]) == (2, 2)
+def test_a_cooperative_task_is_played_by_mixed_teams(tmp_path: Path, mqe: Any) -> None:
+    words = "go1gate random --impl c --set episode_length=0.1 --control position --episodes 2"
+    found = json.loads(mqe(f"tournament {words} --json -o", tmp_path).out)
+    assert found["policies"] == ["random"] and found["references"] == ["idle"]
+    assert found["worst"] is None and np.shape(found["success"]["value"]) == (2, 2)
     rows = (tmp_path / "tournament.csv").read_text().splitlines()
     assert rows[2].startswith("random,idle,2,0.0000,0.0000,0.6") and len(rows) == 5
     assert (tmp_path / "tournament.png").stat().st_size > 3000

@@ -231,6 +231,49 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ),
     ("go1plane", {"skill": BOTH, "gait": "canter"}, r"gait: unknown name 'canter'.*pace"),
     *(("go1revolvingdoor", {"command_ranges": ranges}, said) for ranges, said in RANGES),
+    ("go1gate", {"num_agents": 65}, "num_agents: 65 .* less than or equal to 64"),
+    (
+        "go1football-1vs1",
+        {"num_agents": 5},
+        "num_agents: 5 .* even, .* at most 64 with field_width 9",
+    ),
+    (
+        "go1football-1vs1",
+        {"num_agents": 26, "field_width": 3.0},
+        "num_agents: 26 .* at most 24 with field_width 3",
+    ),
+    (
+        "go1wrestling",
+        {"num_agents": 12},
+        r"num_agents: 12 .* at most 10 with ring_radius 1.7 and platform.size \(4.37",
+    ),
+    (
+        "go1wrestling",
+        {"num_agents": 16, "ring_radius": 2.5},
+        "num_agents: 16 .* at most 14 with ring_radius 2.5",
+    ),
+    (
+        "go1sheep-easy",
+        {"num_sheep": 29},
+        "num_sheep: 29 .* at most 28, for which there is room before the gate",
+    ),
+    ("go1tug", {"fewest_agents": 1}, "fewest_agents: 1 .* must be 2, the size of go1tug"),
+    (
+        "go1football-1vs1",
+        {"num_agents": 6, "fewest_agents": 3},
+        "fewest_agents: 3 .* at most num_agents, 6, and even",
+    ),
+    ("go1gate", {"fewest_agents": 3}, "fewest_agents: 3 .* at most num_agents, 2"),
+    (
+        "go1sheep-hard",
+        {"fewest_sheep": 10},
+        "fewest_sheep: 10 .* at most 9, the number of sheep",
+    ),
+    (
+        "go1sheep-hard",
+        {"fewest_sheep": 5, "senses": "onboard"},
+        "senses: .* empty if teams or flocks vary",
+    ),
 ]
 
 
@@ -394,15 +437,6 @@ def test_a_block_of_an_image_has_its_shape() -> None:
         layout.image(packed, "own")
 
 
-def trajectory(env: QuadrupedEnv, start: State, actions: jax.Array) -> State:
-    """The states (T, ...) of one environment before each action (T, A, D), with automatic reset."""
-
-    def advance(state: State, action: jax.Array) -> tuple[State, State]:
-        return autoreset(env, env.step(state, action)), state
-
-    return jax.jit(lambda start, actions: jax.lax.scan(advance, start, actions)[1])(start, actions)
-
-
 MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     "width": (
         {"observe": lambda *_: {**BLOCKS, "base": jnp.zeros((2, 5))}},
@@ -457,7 +491,7 @@ def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: An
     refuses(r"none.npz: cannot be read", replay.load_recording, tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("nothing")
     refuses(r"text.npz: damaged, or not a recording", replay.load_recording, tmp_path / "text.npz")
-    states = trajectory(gate, fresh, jnp.zeros((2, 2, 12)))
+    states = jax.tree.map(lambda x: jnp.stack([x, x]), fresh)
     states = dataclasses.replace(states, data=states.data.replace(qpos=states.data.qpos + 0.5))
     replay.save_recording(tmp_path / "gate.npz", gate, states, jnp.zeros((2, 2, 12)))
     recording = replay.load_recording(tmp_path / "gate.npz")

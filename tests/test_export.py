@@ -63,11 +63,9 @@ def new_policy(
     return TrainedPolicy(params, statistics, needs, config, {})
 
 
-def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, capfd: Any) -> None:
-    run = zoo.file_of("go1pushbox")
+def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: Any) -> None:
     file = tmp_path / "box.onnx"
-    assert cli.main(["export", str(run), "--onnx", str(file), "--json"]) == 0
-    said = json.loads(capfd.readouterr().out)
+    said = json.loads(mqe(f"export {zoo.file_of('go1pushbox')} --onnx {file} --json").out)
     assert 0.0 < said["largest_error"] < 6e-5
     model = onnx.load(file)
     sizes = shapes(model)

@@ -9,18 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mqe_jax
 from mqe_jax import cli, names
-from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.results import Rate, Result
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.core.settings import to_mapping
-from mqe_jax.core.types import Outcome
 from mqe_jax.runs import playing
 from mqe_jax.runs.cast import prepare
 from mqe_jax.selfplay.league.sides import BothSides
@@ -53,6 +50,11 @@ FEW |= {"ppo.minibatches": 1, "network.recurrent": False}
             {"control": "position"},
         ),
         ("go1gate --config file.yaml", Path("file.yaml"), {}),
+        (
+            "go1gate --senses onboard --imitation.teacher go1gate",
+            {"imitation.teacher": "go1gate"},
+            {"senses": "onboard"},
+        ),
         ("go1tug --config paper/mappo --seed 3", TrainConfig(seed=3), {}),
     ],
 )
@@ -75,9 +77,9 @@ def fake() -> Any:
     return FakeVectorEnv(FakeEnv(), 4)
 
 
-def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path: Path) -> None:
+def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, mqe: Any) -> None:
     assert run.finished and run.env_steps == 64 and list(Path.cwd().iterdir()) == []
-    assert cli.main(["train", "fake", "--seed", "2", "--run-dir", "run", *SMALL]) == 0
+    mqe("train fake --seed 2 --run-dir run", *SMALL)
     written = mqe_jax.load_run("run")
     assert_same(run.policy.actor, written.policy.actor)
     assert run.metrics.keys() == written.metrics.keys() and len(run.metrics["success"]) == 2
@@ -87,7 +89,7 @@ def test_a_training_in_memory_is_that_of_the_command(run: mqe_jax.Run, tmp_path:
         )
 
 
-def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, mqe: Any) -> None:
     run.save("saved")
     again = mqe_jax.load_run("saved")
     assert_same(run.policy.actor, again.policy.actor)
@@ -103,8 +105,8 @@ def test_a_run_is_saved_and_loaded(run: mqe_jax.Run, capfd: pytest.CaptureFixtur
         resume=True,
     )
     assert mqe_jax.learn("fake", FEW | {"start": "saved"}).finished
-    assert cli.main(["eval", "fake", "--policy", "saved", "--episodes", "2", "--json"]) == 0
-    assert json.loads(capfd.readouterr().out)["policy"] == "saved"
+    said = mqe("eval fake --policy saved --episodes 2 --json").out
+    assert json.loads(said)["policy"] == "saved"
 
 
 def test_evaluations_come_with_the_run() -> None:
@@ -121,7 +123,7 @@ def test_evaluations_come_with_the_run() -> None:
         assert (other.evaluations, other.absolute) == (alone.evaluations, alone.absolute)
 
 
-def test_an_interrupt_returns_the_run_so_far(monkeypatch: Any, capfd: Any) -> None:
+def test_an_interrupt_returns_the_run_so_far(monkeypatch: Any, mqe: Any, capfd: Any) -> None:
     step = Training._step
 
     def interrupt(self: Training, files: Any) -> Any:
@@ -135,9 +137,8 @@ def test_an_interrupt_returns_the_run_so_far(monkeypatch: Any, capfd: Any) -> No
             run = mqe_jax.learn("fake", FEW, run_dir=folder)
             assert run.env_steps == len(run.metrics["success"]) * 32 == 32 and not run.finished
         assert "interrupted after 32 environment steps" in capfd.readouterr().err
-        assert cli.main(["train", "fake", "--run-dir", "other", *SMALL]) == 130
+        mqe("train fake --run-dir other", *SMALL, code=130)
         assert not Path("other", "curve.png").exists()
-    capfd.readouterr()
     refuses(
         r"ppo\.clip: 0\.1 differs from the run in run",
         mqe_jax.learn,
@@ -242,66 +243,6 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
     assert figure._repr_png_().startswith(b"\x89PNG")  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize(
-    ("task", "arguments", "said"),
-    [
-        ("go1gat", {}, r"task: unknown id 'go1gat' \(did you mean 'go1gate'\?\)"),
-        (None, {}, "task: None is not allowed; it must be a task's id, an environment"),
-        ("fak", {"config": "demo"}, "task: unknown id 'fak'"),
-        ("fake", {"config": 5}, "config: 5 is not allowed; it must be a shipped name"),
-        ("fake", {"config": {"ppo.clp": 1}}, r"ppo.clp: unknown name .*did you mean 'clip'"),
-        ("fake", {"seed": -1}, "seed: -1 is not allowed"),
-        (
-            "fake",
-            {"resume": True},
-            "resume: True is not allowed; it must be false without a run_dir",
-        ),
-        ("fake", {"env": "x"}, "env: 'x' is not allowed"),
-        (
-            "fake",
-            {"resume": "perhaps"},
-            "resume: 'perhaps' is not allowed; it must be true or false",
-        ),
-        ("fake", {"dump_diverged": 5}, "dump_diverged: 5 is not allowed"),
-        (
-            fake(),
-            {"env": {"gate_width": 1}},
-            "env: .* is not allowed; it must be left out for a batch",
-        ),
-        (
-            fake(),
-            {"config": {"opponents": ["idle"]}},
-            r"opponents: \['idle'\] .* left out for a batch",
-        ),
-    ],
-)
-def test_what_cannot_be_trained_is_named(
-    task: Any, arguments: dict[str, Any], said: str, capfd: Any
-) -> None:
-    refuses(said, mqe_jax.learn, task, **arguments)
-    assert "".join(capfd.readouterr()) == ""
-
-
-@pytest.mark.parametrize("seeds", [5, [], [1.5], "ab", range(65), [1, 1]])
-def test_seeds_that_cannot_be_trained_are_named(seeds: Any) -> None:
-    refuses(r"seeds.* is not allowed", mqe_jax.learn_seeds, "fake", FEW, seeds=seeds)
-    refuses(
-        r"seeds: .* is not allowed",
-        mqe_jax.make_learner,
-        "fake",
-        FEW,
-        seeds=0 if seeds == 5 else seeds,
-    )
-
-
-def test_what_cannot_be_evaluated_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/nowhere")
-    refuses("task: None is not allowed", mqe_jax.evaluate, None, "idle")
-    refuses("env: 'x' is not allowed", mqe_jax.evaluate, "fake", "idle", env="x")
-    refuses("env: 5 is not allowed", mqe_jax.evaluate, "fake", "idle", env=5)
-    refuses("run: '/nowhere/none' has no policy", mqe_jax.evaluate, "~/none", "idle")
-
-
 def test_a_run_whose_weights_are_not_finite_is_not_saved(run: mqe_jax.Run) -> None:
     weights = jax.tree.map(lambda x: x * np.nan, run.policy.params)
     with pytest.raises(NonFiniteError, match="params"):
@@ -333,7 +274,7 @@ def test_intervals_are_wilsons(wins: int, episodes: int, low: float, high: float
     )
 
 
-def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_result_is_readable(mqe: Any) -> None:
     result = mqe_jax.evaluate("fake", "forward", episodes=4)
     assert result.success == Rate.of(1.0, 4) and result.win is None
     assert "success               100.0   51.0 to 100.0" in str(result).splitlines()
@@ -341,10 +282,7 @@ def test_a_result_is_readable(capfd: pytest.CaptureFixture[str]) -> None:
     assert "<tr><td>success_rate</td><td>100.0% (51.0 to 100.0%)</td></tr>" in result._repr_html_()
     shown = {"": str(result), "--long": result.details(), "--json": json.dumps(result.to_dict())}
     for more, text in shown.items():
-        assert (
-            cli.main(["eval", "fake", "--policy", "forward", "--episodes", "4", *more.split()]) == 0
-        )
-        assert capfd.readouterr().out == f"{text}\n"
+        assert mqe(f"eval fake --policy forward --episodes 4 {more}").out == f"{text}\n"
         assert more == "--json" or max(map(len, text.splitlines())) <= 80
 
 
@@ -434,18 +372,6 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
     for measured in (lambda: evaluate("go1tug", "forward", impl="c"), lambda: cli.main(words)):
         measured()
         assert not isinstance(played["batch"], BothSides)
-
-
-def test_halves_of_the_environments_play_equally_many_episodes() -> None:
-    class Halves(FakeVectorEnv):
-        def step(self, state: Any, action: jax.Array) -> Any:
-            after = super().step(state, action)
-            return dataclasses.replace(after, outcome=Outcome(1.0 * (jnp.arange(4) >= 2)[:, None]))
-
-    policy = mqe_jax.load_policy("idle", FakeEnv())  # pyright: ignore[reportArgumentType, reportCallIssue]
-    assert (
-        evaluate_batch(Halves(FakeEnv(), 4), policy, 6, jax.random.PRNGKey(0)).success_rate == 0.5
-    )
 
 
 def test_a_clip_shows_itself_and_is_saved(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import mqe_jax
 from mqe_jax import load_policy, skills
 from mqe_jax.acting.evaluate import evaluate_batch
-from mqe_jax.adapters import gymnasium
+from mqe_jax.adapters import gymnasium, task_env
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.cli.arguments import parse
 from mqe_jax.cli.options import parse_overrides
@@ -124,8 +124,13 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     (
         "policy: ",
-        lambda x, v: _evaluate(x, env=x["matches"], act=mqe_jax.load_policy(v, x["match"])),
-        ("idle",),
+        lambda x, v: _evaluate(x, env=x["matches"], act=load_policy(v)),
+        ("go1tug",),
+    ),
+    (
+        "policy: 'one of go1gate' is not allowed; it must be one of go1tug",
+        lambda x, v: _evaluate(x, env=x["matches"], act=load_policy(v)),
+        ("go1gate",),
     ),
     (
         "source: ",
@@ -142,6 +147,19 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         "state: ",
         lambda x, v: x["team"].step(x.get(v, v), np.zeros((2, 1, 12))),
         (None, 3, "state", "states"),
+    ),
+    (
+        "needs task 'go1gate'; the environment has 'go1tug'",
+        lambda x, v: v(x),
+        (
+            lambda x: mqe_jax.evaluate(x["match"], "go1gate"),
+            lambda x: mqe_jax.evaluate(x["match"], "idle", "go1gate"),
+            lambda x: mqe_jax.tournament("go1tug", ["go1gate"]),
+            lambda x: mqe_jax.exploitability("go1tug", "go1gate", "a"),
+            lambda x: mqe_jax.learn("go1tug", {"imitation.teacher": "go1gate"}),
+            lambda x: versus(x["matches"], ["go1gate"]),
+            lambda x: task_env(x["match"], opponent="go1gate"),
+        ),
     ),
     ("block: ", lambda x, v: x["team"].change(x["teams"], v, None), (None, -1, "x", 1.5)),
     (
@@ -191,18 +209,23 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: mqe_jax.evaluate(x["match"], "idle", load_policy("idle", x[v])),
         ("task", "sumo"),
     ),
+    ("task: ", lambda x, v: mqe_jax.learn(v), (None, "fak", "go1gat")),
+    ("config: ", lambda x, v: mqe_jax.learn("go1plane", v), (5, {"config": 3})),
+    ("ppo.clp: unknown name", lambda x, v: mqe_jax.learn("go1plane", v), ({"ppo.clp": 1},)),
+    ("seed: ", lambda x, v: mqe_jax.learn("go1plane", "demo", seed=v), (-1, 1.5, "x")),
     ("env", lambda x, v: mqe_jax.learn("go1plane", "demo", env=v), (3, "x", [], {1: 2})),
-    ("resume: ", lambda x, v: mqe_jax.learn("go1plane", "demo", resume=v), (None, 0, "x")),
+    ("resume: ", lambda x, v: mqe_jax.learn("go1gate", "demo", resume=v), (True, 0, "x")),
+    ("dump_diverged: ", lambda x, v: mqe_jax.learn("go1plane", "demo", dump_diverged=v), (5, "")),
     ("start: ", lambda x, v: mqe_jax.learn("go1plane", {"start": v}), ("x" * 300, "")),
     (
         "seeds",
         lambda x, v: mqe_jax.learn_seeds("go1plane", "demo", seeds=v),
-        (None, 3, [], [-1], range(65), "ab"),
+        (None, 3, [], [-1], [1.5], [1, 1], range(65), "ab"),
     ),
     (
         "seeds: ",
         lambda x, v: mqe_jax.make_learner("go1plane", "demo", seeds=v),
-        (None, 0, True, 10**12),
+        (None, 0, True, 10**12, [], [1.5], [1, 1], range(65), "ab"),
     ),
     (
         "actions: ",

@@ -6,7 +6,6 @@ Each is refused in one line, within the limits.
 import functools
 import json
 import math
-import os
 import resource
 import shutil
 import struct
@@ -19,7 +18,6 @@ import pytest
 from safetensors.numpy import save
 
 from mqe_jax.core import limits
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import linear_layers, parse_json, read_rows, read_tensors
 from mqe_jax.core.settings import override
 from mqe_jax.envs.replay import load_recording
@@ -62,57 +60,6 @@ YAMLS = {
 }
 
 
-@pytest.mark.parametrize("case", YAMLS)
-def test_bad_yaml(case: str, tmp_path: Path) -> None:
-    path = tmp_path / "bad.yaml"
-    path.write_text(YAMLS[case], errors="surrogateescape")
-    with pytest.raises(InputError) as error:
-        load_config(path)
-    assert str(error.value).startswith(str(path)) and len(str(error.value)) < 500
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, "{", '{"a": 1} x', ""])
-def test_bad_json(text: str) -> None:
-    refuses(r"^x: damaged, or not JSON", parse_json, text, "x")
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"evaluations": 3},
-        [],
-        {"evaluations": [{}], "absolute": None},
-        {"evaluations": [], "absolute": {"env_steps": "x"}},
-        {
-            "evaluations": [{"env_steps": 1, "sampled": {"x": math.nan}, "deterministic": {}}],
-            "absolute": None,
-        },
-    ],
-    ids=str,
-)
-def test_evaluations_of_another_form(content: Any, tmp_path: Path) -> None:
-    (tmp_path / "evaluations.json").write_text(json.dumps(content))
-    refuses(r"evaluations\.json", read_evaluations, tmp_path)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        os.urandom(2000),
-        b"\0" * 100,
-        b"env_steps,average_step_reward\n1",
-        b"a,b\n" + b"x" * 200_000,
-        b'"',
-        b"",
-    ],
-    ids=["random", "zeros", "short row", "long field", "quote", "empty"],
-)
-def test_bad_metrics(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "metrics.csv"
-    path.write_bytes(content)
-    refuses(r"metrics\.csv", read_curve, path)
-
-
 def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
     before = peak()
     for read, limit in (
@@ -129,23 +76,18 @@ def test_a_file_beyond_its_limit_is_not_read(tmp_path: Path) -> None:
     assert peak() < before + 2**27
 
 
-def tensors(dtype: str, size: int, metadata: dict[str, str] | None = None) -> bytes:
-    about: dict[str, Any] = {"a": {"dtype": dtype, "shape": [1], "data_offsets": [0, size]}}
-    header = json.dumps(about | ({} if metadata is None else {"__metadata__": metadata})).encode()
+def read_stored(path: Path) -> Any:
+    return read_evaluations(path.rename(path.with_name("evaluations.json")).parent)
+
+
+def read_weights(path: Path) -> Any:
+    return read_tensors(path, "weights")
+
+
+def tensors(dtype: str, size: int) -> bytes:
+    about = {"a": {"dtype": dtype, "shape": [1], "data_offsets": [0, size]}}
+    header = json.dumps(about).encode()
     return struct.pack("<Q", len(header)) + header + bytes(size)
-
-
-@pytest.mark.parametrize(
-    ("dtype", "size"),
-    [("F8_E4M3", 1), ("F4", 1), ("X", 4), ("F32", 3), ("C64", 8), ("I64", 8), ("BOOL", 1)],
-)
-def test_weights_of_types_that_are_not_floating_point(
-    dtype: str, size: int, tmp_path: Path
-) -> None:
-    path = tmp_path / "w.safetensors"
-    path.write_bytes(tensors(dtype, size))
-    refuses(rf"^weights {path}: damaged, or not a safetensors file", read_tensors, path, "weights")
-    refuses(r"w\.safetensors", read_policy, path)
 
 
 SIZES = {"agents": 1, "observation": 1, "privileged": 1, "action": 1, "values": 1}
@@ -167,14 +109,71 @@ METADATA = [
 ]
 
 
-@pytest.mark.parametrize("metadata", METADATA)
-def test_policies_with_metadata_of_another_type(metadata: str, tmp_path: Path) -> None:
-    path = tmp_path / "policy.safetensors"
+def described(metadata: str) -> bytes:
+    """A policy's file with some metadata."""
     arrays = {"a": np.zeros(1, np.float32)}
     header = {"kind": "policy", "version": str(checkpoint.VERSION), "metadata": metadata}
     header["checksum"] = checkpoint._checksum(arrays, metadata)  # pyright: ignore[reportPrivateUsage]
-    path.write_bytes(save(arrays, {checkpoint.FORMAT: json.dumps(header)}))
-    refuses(r"policy\.safetensors: ", read_policy, path)
+    return save(arrays, {checkpoint.FORMAT: json.dumps(header)})
+
+
+NO_EVALUATIONS = [
+    {"evaluations": 3},
+    [],
+    {"evaluations": [{}], "absolute": None},
+    {"evaluations": [], "absolute": {"env_steps": "x"}},
+    {
+        "evaluations": [{"env_steps": 1, "sampled": {"x": math.nan}, "deterministic": {}}],
+        "absolute": None,
+    },
+]
+NO_METRICS = [
+    np.random.default_rng(0).bytes(2000),
+    b"\0" * 100,
+    b"env_steps,average_step_reward\n1",
+    b"a,b\n" + b"x" * 200_000,
+    b'"',
+    b"",
+]
+NO_STEPS = ("16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16")
+NO_WEIGHTS = (("F8_E4M3", 1), ("F4", 1), ("X", 4), ("F32", 3), ("C64", 8), ("I64", 8), ("BOOL", 1))
+BAD: list[tuple[Callable[[Path], Any], bytes, str]] = [
+    *(
+        (load_config, text.encode(errors="surrogateescape"), "^/.*/bad: ")
+        for text in YAMLS.values()
+    ),
+    *(
+        (lambda path: parse_json(path.read_text(), "x"), text, "^x: damaged, or not JSON")
+        for text in (b"[" * 100_000, b"9" * 5000, b"{", b'{"a": 1} x', b"")
+    ),
+    *((read_stored, json.dumps(each).encode(), r"evaluations\.json") for each in NO_EVALUATIONS),
+    *((read_curve, each, "^/.*/bad: ") for each in NO_METRICS),
+    *(
+        (
+            read_curve,
+            f"env_steps,average_step_reward\n{steps},1\n".encode(),
+            "must be positive and increase",
+        )
+        for steps in (each.replace("\n", ",1\n") for each in NO_STEPS)
+    ),
+    *(
+        (read, tensors(*each), said)
+        for each in NO_WEIGHTS
+        for read, said in (
+            (read_weights, "^weights .*: damaged, or not a safetensors file"),
+            (read_policy, "^/.*/bad: "),
+        )
+    ),
+    *((read_policy, described(each), "^/.*/bad: ") for each in METADATA),
+]
+
+
+@pytest.mark.parametrize(
+    ("read", "content", "said"), BAD, ids=lambda value: getattr(value, "__name__", "")
+)
+def test_bad_files(read: Any, content: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / "bad").write_bytes(content)
+    refuses(said, read, tmp_path / "bad")
 
 
 def archived(data: bytes, storage: bytes = bytes(4)) -> bytes:
@@ -367,18 +366,6 @@ def test_weights_that_no_network_has() -> None:
         "weights",
         layers,
         {"0": (6, 32)},
-    )
-
-
-@pytest.mark.parametrize("steps", ["16\n16", "32\n16", "-16\n16", "nan\n16", "0\n16"])
-def test_steps_that_do_not_increase(steps: str, tmp_path: Path) -> None:
-    (tmp_path / "metrics.csv").write_text(
-        "env_steps,average_step_reward\n" + steps.replace("\n", ",1\n") + ",1\n"
-    )
-    refuses(
-        r"metrics\.csv: its env_steps must be positive and increase",
-        read_curve,
-        tmp_path / "metrics.csv",
     )
 
 

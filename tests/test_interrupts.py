@@ -22,31 +22,17 @@ pytestmark = pytest.mark.skipif(
 )
 ENDS = {signal.SIGINT: (130, "mqe: interrupted"), signal.SIGTERM: (143, "mqe: terminated")}
 SIGNALS = pytest.mark.parametrize("number", list(ENDS), ids=lambda number: number.name)
-FAKE = ["train", "fake", "--num-envs", "4", "--rollout-steps", "4", "--total-steps", str(300 * 16)]
-FAKE += [
-    "--ppo.minibatches",
-    "1",
-    "--ppo.epochs",
-    "1",
-    "--network.hidden-sizes",
-    "4",
-    "--checkpoint.every",
-    "100000",
-]
-FAKE += ["--network.no-recurrent"]
+FAKE = (
+    "train fake --num-envs 4 --rollout-steps 4 --ppo.minibatches 1 --ppo.epochs 1"
+    " --network.hidden-sizes 4 --network.no-recurrent --checkpoint.every 100000"
+    f" --total-steps {300 * 16}"
+).split()
 PROGRAM = [sys.executable, str(Path(__file__).with_name("fake_env.py"))]
-GATE = [sys.executable, "-m", "mqe_jax.cli", "train", "go1gate", "--impl", "c", "--config", "demo"]
-GATE += [
-    "--num-envs",
-    "4",
-    "--rollout-steps",
-    "8",
-    "--ppo.minibatches",
-    "2",
-    "--checkpoint.every",
-    "100000",
-]
-GATE += ["--total-steps", str(100 * 32)]
+GATE = [sys.executable, "-m", "mqe_jax.cli"]
+GATE += (
+    "train go1gate --impl c --config demo --num-envs 4 --rollout-steps 8 --ppo.minibatches 2"
+    f" --checkpoint.every 100000 --total-steps {100 * 32}"
+).split()
 
 
 def start(command: list[str]) -> subprocess.Popen[str]:

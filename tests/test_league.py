@@ -171,44 +171,13 @@ def test_a_league_has_more_members_than_blocks_and_environments_of_its_own_proce
 
 def training(steps: int, *more: str) -> list[str]:
     """Arguments of a training of `go1tug` in a league, with a snapshot every update of 16 steps."""
-    arguments = [
-        "train",
-        "go1tug",
-        "--impl",
-        "c",
-        "--set",
-        "control=position",
-        "--set",
-        "episode_length=0.1",
-    ]
-    arguments += [
-        "--num-envs",
-        "4",
-        "--rollout-steps",
-        "4",
-        "--ppo.minibatches",
-        "1",
-        "--ppo.epochs",
-        "1",
-    ]
-    arguments += [
-        "--network.hidden-sizes",
-        "8",
-        "--config",
-        "paper/mappo",
-        "--total-steps",
-        str(steps),
-    ]
-    arguments += [
-        "--league.snapshot-steps",
-        "16",
-        "--league.episodes",
-        "1",
-        "--league.members",
-        "3",
-        *more,
-    ]
-    return arguments + [word for source in SOURCES for word in ("--opponent", source)]
+    words = (
+        "train go1tug --impl c --set control=position --set episode_length=0.1 --num-envs 4"
+        " --rollout-steps 4 --ppo.minibatches 1 --ppo.epochs 1 --network.hidden-sizes 8 --config"
+        " paper/mappo --league.snapshot-steps 16 --league.episodes 1 --league.members 3"
+        f" --total-steps {steps}"
+    ).split()
+    return [*words, *more, *(word for source in SOURCES for word in ("--opponent", source))]
 
 
 @pytest.mark.soak
@@ -289,7 +258,7 @@ def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(
 
 
 def test_a_tournament_meets_every_pair_on_both_sides(
-    tmp_path: Path, monkeypatch: Any, capfd: Any
+    tmp_path: Path, monkeypatch: Any, mqe: Any
 ) -> None:
     assert cast.reference_opponents(make("go1revolvingdoor", impl="c", num_envs=1)) == [
         "scripted",
@@ -297,19 +266,8 @@ def test_a_tournament_meets_every_pair_on_both_sides(
         "random",
     ]
     monkeypatch.setattr(playing, "reference_opponents", lambda env: ["scripted", "idle"])
-    capfd.readouterr()
-    arguments = [
-        "go1revolvingdoor",
-        "forward",
-        "--impl",
-        "c",
-        "--set",
-        "line_x=0.8",
-        "--episodes",
-        "4",
-    ]
-    assert cli.main(["tournament", *arguments, "-o", str(tmp_path), "--json"]) == 0
-    result = json.loads(capfd.readouterr().out)
+    words = "tournament go1revolvingdoor forward --impl c --set line_x=0.8 --episodes 4 -o"
+    result = json.loads(mqe(words, tmp_path, "--json").out)
     assert result["policies"] == ["forward", "scripted", "idle"]
     won = np.array(result["results"])[..., 0]
     assert np.array(result["results"]).sum(axis=-1).tolist() == [[4] * 3] * 3
@@ -333,5 +291,4 @@ def test_a_tournament_meets_every_pair_on_both_sides(
         .startswith("policy,rating,rating_low,rating_high,mean,")
     )
     monkeypatch.setattr(tournament, "round_robin", lambda *arguments: pytest.fail("played"))
-    assert cli.main(["tournament", *arguments, "-o", str(tmp_path / "tournament.csv")]) == 2
-    assert "output: " in capfd.readouterr().err
+    assert "output: " in mqe(words, tmp_path / "tournament.csv", code=2).err

@@ -246,20 +246,6 @@ def test_wrestling_has_terms_for_pushing_and_approach_that_only_training_weighs(
     np.testing.assert_allclose(terms["approach"], [1.1 - 0.9] * 2, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("task", "name", "size"),
-    [
-        ("go1wrestling", "platform", (4.37, 4.37, 0.5)),
-        ("go1bridge", "platform0", (1.3, 2.5, 1.02)),
-        ("go1bridge", "deck", (4.0, 0.7)),
-    ],
-)
-def test_platforms_are_as_large_as_listed(task: str, name: str, size: Any) -> None:
-    env = made(task)
-    found = 2 * env.compiled.model.geom(env.objects[name].geom).size
-    np.testing.assert_allclose(found[: len(size)], size)
-
-
 def test_bridge_rewards_result_and_end() -> None:
     env = made("go1bridge")
     facing = [[0, 0, 0], [0, 0, PI]]

@@ -18,7 +18,16 @@ from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.terrain import Plane, SpawnArea, Track
 from tests.inputs import refuses
-from tests.states import angles, initial, made, observation, placed, terms_of, with_object
+from tests.states import (
+    angles,
+    initial,
+    made,
+    observation,
+    placed,
+    still,
+    terms_of,
+    with_object,
+)
 
 STEP = 0.02
 
@@ -73,27 +82,19 @@ def test_sheep_walk_in_the_physics_as_the_law_says_and_stop_at_walls() -> None:
     env: Any = make(
         "go1sheep-easy", impl="c", control="position", restlessness=0.0, end_on_collision=False
     )
-    state = initial(env)
-    state = with_object(env, state, "sheep0", [2.0, 1.0])
-    index = env.index.base_qpos
-    qpos = (
-        state.data.qpos.at[index[0, :2]]
-        .set(jnp.array([1.2, 1.0]))
-        .at[index[1, :2]]
-        .set(jnp.array([0.5, -1.5]))
-    )
-    state = dataclasses.replace(state, data=state.data.replace(qpos=qpos))
     step = jax.jit(env.step)
-    after = step(state, jnp.zeros((2, 12)))
+
+    def after(steps: int, robot: Any, sheep: Any) -> Any:
+        places = [[*robot, 0.42], [0.5, -1.5, 0.42]]
+        state = with_object(env, placed(env, places), "sheep0", sheep)
+        for _ in range(steps):
+            state = step(state, still(env))
+        return env.sheep(state.data)[0]
+
     speed = 0.2 * 0.8 / 0.64**1.4 - 0.0981
-    assert float(env.sheep(after.data)[0, 0]) == pytest.approx(2.0 + STEP * speed, abs=1e-3)
-    cornered = with_object(env, state, "sheep0", [2.0, 1.75])
-    qpos = cornered.data.qpos.at[index[0, :2]].set(jnp.array([2.0, 1.2]))
-    cornered = dataclasses.replace(cornered, data=cornered.data.replace(qpos=qpos))
-    for _ in range(50):
-        cornered = step(cornered, jnp.zeros((2, 12)))
+    assert after(1, [1.2, 1.0], [2.0, 1.0])[0] == pytest.approx(2.0 + STEP * speed, abs=1e-3)
     # the side wall is at 2.0, the sheep's radius 0.2
-    assert float(env.sheep(cornered.data)[0, 1]) < 1.85
+    assert after(50, [2.0, 1.2], [2.0, 1.75])[1] < 1.85
 
 
 def test_pushbox_rewards_and_success(box_env: Any) -> None:

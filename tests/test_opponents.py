@@ -15,7 +15,7 @@ import pytest
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.seats import Seats
 from mqe_jax.core.settings import build, override
-from mqe_jax.core.types import Observations, observations
+from mqe_jax.core.types import observations
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.wrestling import WrestlingRewards
 from mqe_jax.names import load_policy, versus
@@ -118,14 +118,6 @@ door = pytest.fixture(scope="module")(lambda: matches())
 policies = pytest.fixture(scope="module")(
     lambda door: [new_policy(versus(door, ["idle"]), seed) for seed in (0, 1)]
 )
-
-
-def test_a_policy_acts_for_one_team_and_both_teams_act_together(door: VectorEnv) -> None:
-    assert all(load_policy(name, door.env).agents == 1 for name in ("random", "idle", "forward"))
-    seats = Seats.of_teams(door, *(load_policy(name, door.env) for name in ("forward", "idle")))
-    seen = Observations.at(jnp.zeros((3, 2, 12)))
-    action, _ = seats.act(seen, seats.initial_memory(3), KEY, jnp.ones((3, 2, 12)))
-    np.testing.assert_allclose(action[:, :, 0], jnp.tile(jnp.array([0.25, 0.0]), (3, 1)))
 
 
 def test_every_block_has_its_own_opponent(door: VectorEnv) -> None:

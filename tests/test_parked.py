@@ -407,26 +407,6 @@ def test_with_assistance_teams_are_small_if_they_grow() -> None:
     assert [{*row.tolist()} for row in sheep] == [{3, 4, 5}, {3, 4}, {3}]
 
 
-REFUSED = [
-    ("go1tug", {"fewest_agents": 1}, "fewest_agents: 1 .* must be 2, the size of go1tug"),
-    (
-        BALL,
-        {"num_agents": 6, "fewest_agents": 3},
-        "fewest_agents: 3 .* at most num_agents, 6, and even",
-    ),
-    ("go1gate", {"fewest_agents": 3}, "fewest_agents: 3 .* at most num_agents, 2"),
-    (SHEEP, {"fewest_sheep": 10}, "fewest_sheep: 10 .* at most 9, the number of sheep"),
-    (SHEEP, {"fewest_sheep": 5, "senses": "onboard"}, "senses: .* empty if teams or flocks vary"),
-]
-
-
-@pytest.mark.parametrize(("task", "settings", "said"), REFUSED, ids=str)
-def test_a_range_of_sizes_that_does_not_fit_is_refused_by_name(
-    task: str, settings: dict[str, Any], said: str
-) -> None:
-    refuses(said, make, task, impl="c", **settings)
-
-
 def test_a_policy_with_a_size_is_refused_at_another_one(tmp_path: Path) -> None:
     small = sized(BALL, False)
     large = sized(BALL, True)

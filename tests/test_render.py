@@ -12,7 +12,6 @@ import pytest
 from PIL import Image, ImageSequence
 from viewer import Driven, session
 
-from mqe_jax import cli
 from mqe_jax.envs import TASKS
 from mqe_jax.names import load_policy
 from mqe_jax.physics.robots.index import trunk_bodies
@@ -411,19 +410,3 @@ def test_matches_are_counted_by_outcome() -> None:
     run._count(np.array([True, False]), np.array([[False, False, True], [True, False, False]]))
     run._count(np.array([True, True]), np.array([[True, False, False], [False, True, False]]))
     assert run.counts.tolist() == [1, 1, 1] and run.last == ["win", "draw"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--host", "192.0.2.1"], ("host", "192.0.2.1", "an address of this machine")),
-        (["--host", "no such host"], ("host", "no such host", "an address of this machine")),
-        (["--policy", "scriptd"], ("policy", "scriptd", "scripted")),
-    ],
-)
-def test_bad_arguments_are_refused_in_a_line(
-    arguments: list[str], words: tuple[str, ...], capsys: Any
-) -> None:
-    assert cli.main(["view", "go1gate", *arguments]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and all(word in said for word in words)

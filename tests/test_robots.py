@@ -95,17 +95,13 @@ def test_a_team_of_processes_acts_as_the_policy(
             memory = memory.at[1].set(0.0)
 
 
-def test_an_evaluation_with_processes_gives_what_the_policy_reaches(files: Any, capfd: Any) -> None:
-    words = [str(files["run"]), "--episodes", "4", "--num-envs", "2", "--impl", "c", "--json"]
-    assert cli.main(["eval", *words, "--deterministic"]) == 0
-    expected = json.loads(capfd.readouterr().out)
-    assert cli.main(["eval", *words, "--export", str(files["mean"])]) == 0
-    found = json.loads(capfd.readouterr().out)
+def test_an_evaluation_with_processes_gives_what_the_policy_reaches(files: Any, mqe: Any) -> None:
+    words = f"eval {files['run']} --episodes 4 --num-envs 2 --impl c --json"
+    expected = json.loads(mqe(f"{words} --deterministic").out)
+    found = json.loads(mqe(f"{words} --export {files['mean']}").out)
     assert (found["policy"], found["actions"]) == (str(files["mean"]), "mean")
-    assert (
-        found["terms"] == pytest.approx(expected["terms"], rel=1e-4)
-        and expected["terms"]["approach"] != 0.0
-    )
+    assert found["terms"] == pytest.approx(expected["terms"], rel=1e-4)
+    assert expected["terms"]["approach"] != 0.0
 
 
 def test_a_robot_imports_nothing_of_the_simulation(policy: TrainedPolicy, files: Any) -> None:
@@ -301,7 +297,6 @@ def test_what_is_no_file_of_a_robot_is_refused(
         ),
     ],
 )
-def test_commands_refuse_in_a_line(words: list[str], said: str, files: Any, capfd: Any) -> None:
-    assert cli.main([word.format(**files) for word in words]) == 2
-    err = capfd.readouterr().err
+def test_commands_refuse_in_a_line(words: list[str], said: str, files: Any, mqe: Any) -> None:
+    err = mqe("", *(word.format(**files) for word in words), code=2).err
     assert said in err and err.count("\n") == 1

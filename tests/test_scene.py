@@ -21,7 +21,6 @@ from mqe_jax.physics.engines import c
 from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import foot_positions, knee_positions
-from mqe_jax.physics.robots.motors import leg_response
 from mqe_jax.physics.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
@@ -351,16 +350,6 @@ def test_the_clamp_keeps_angle_and_speed_consistent() -> None:
         position[2] == pytest.approx(-0.005 * (3.0 - 1.09) * motors.speed[2])
         and np.count_nonzero(position) == 1
     )
-
-
-def test_the_response_is_that_of_a_leg() -> None:
-    response = leg_response(robots.get("go1"))
-    assert (
-        response.shape == (3, 3)
-        and np.all(np.diff(np.diag(response)[1:]) > 0)
-        and response[1, 2] > 20.0
-    )
-    np.testing.assert_allclose(response, response.T, rtol=1e-6)
 
 
 def test_joints_in_the_air_start_along_their_torque_line() -> None:

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.core.errors import InputError
 from mqe_jax.envs import State, VectorEnv, make
 from mqe_jax.names import load_policy
 from mqe_jax.sensors.depth import Depth
@@ -192,19 +191,6 @@ def test_scripted_robots_are_silent() -> None:
         policy.act, jnp.zeros((3, 2, env.observation_size)), (), jax.random.PRNGKey(0)
     )[0]
     assert action.shape == (3, 2, env.action_size) == (3, 2, 5)
-
-
-@pytest.mark.parametrize(
-    ("task", "senses", "message"),
-    [
-        ("go1tug", ["messages"], r"senses: 'messages' .*no robot has teammates"),
-        ("go1gate", [{"name": "messages", "numbers": 0}], r"senses.*numbers: 0 .*greater than 0"),
-        ("go1gate", ["depth"], r"senses: 'depth' needs impl warp; the engine here is c"),
-    ],
-)
-def test_sensors_that_cannot_work_are_named(task: str, senses: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        _ = make(task, impl="c", senses=senses).layouts
 
 
 def test_a_group_without_its_sensors_is_named() -> None:

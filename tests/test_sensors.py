@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from mqe_jax.core.blocks import Block, Entities, image
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override, settings_class, to_mapping
 from mqe_jax.envs import State, VectorEnv, make
 from mqe_jax.envs.gate import GateParams
@@ -343,23 +342,26 @@ def test_senses_are_settings() -> None:
 
 
 @pytest.mark.parametrize(
-    ("senses", "message"),
+    ("task", "senses", "message"),
     [
-        ("onbord", r"^senses: 'onbord' .*full, onboard.*did you mean 'onboard'"),
-        (["lidr"], r"^senses: 'lidr' .*lidar.*did you mean 'lidar'"),
-        ([{"name": "lidar", "rays": 0}], r"^senses\.lidar\.rays: 0 .*greater than 0"),
-        ([{"name": "lidar", "beams": 8}], r"^senses\.lidar\.beams: unknown name"),
-        (["lidar", "lidar"], r"^senses: .*sensors of different names"),
-        (3, r"^senses: 3 .*full, onboard"),
+        ("go1gate", "onbord", r"^senses: 'onbord' .*full, onboard.*did you mean 'onboard'"),
+        ("go1gate", ["lidr"], r"^senses: 'lidr' .*lidar.*did you mean 'lidar'"),
+        ("go1gate", [{"name": "lidar", "rays": 0}], r"^senses\.lidar\.rays: 0 .*greater than 0"),
+        ("go1gate", [{"name": "lidar", "beams": 8}], r"^senses\.lidar\.beams: unknown name"),
+        ("go1gate", ["lidar", "lidar"], r"^senses: .*sensors of different names"),
+        ("go1gate", 3, r"^senses: 3 .*full, onboard"),
         (
+            "go1gate",
             [{"name": "lidar", "pipeline": {"lida": {}}}],
             r"senses.lidar.pipeline: 'lida' .*one of all, lidar",
         ),
+        ("go1tug", ["messages"], r"senses: 'messages' .*no robot has teammates"),
+        ("go1gate", [{"name": "messages", "numbers": 0}], r"senses.*numbers: 0 .*greater than 0"),
+        ("go1gate", ["depth"], r"senses: 'depth' needs impl warp; the engine here is c"),
     ],
 )
-def test_bad_senses_are_named(senses: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        _ = make("go1gate", impl="c", senses=senses).layouts
+def test_bad_senses_are_named(task: str, senses: Any, message: str) -> None:
+    refuses(message, lambda: make(task, impl="c", senses=senses).layouts)
 
 
 @settings_class

@@ -11,16 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax.acting.seats import check_policy
 from mqe_jax.envs import Moment, VectorEnv, make
-from mqe_jax.names import load_policy
 from mqe_jax.physics.appearance import ROBOT_COLORS, UNNUMBERED
 from mqe_jax.physics.collision import MAX_ROBOTS, robot_bits
 from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.scripted.cooperative import plan_sheep_hard
 from mqe_jax.viz.geometry import robot_color
-from tests.inputs import refuses
 from tests.states import initial, observation, placed, terms_of, with_object
 
 GATE, EASY, HARD, BOX, FOOTBALL, SUMO = (
@@ -129,44 +126,6 @@ def test_robots_collide_with_all_but_themselves() -> None:
     np.testing.assert_array_equal(touch == 0, np.eye(MAX_ROBOTS, dtype=bool))
 
 
-REFUSED = [
-    ("go1tug", {"num_agents": 4}, "num_agents: 4 .* must be 2, the size of go1tug"),
-    (GATE, {"num_agents": 65}, "num_agents: 65 .* less than or equal to 64"),
-    (FOOTBALL, {"num_agents": 5}, "num_agents: 5 .* even, .* at most 64 with field_width 9"),
-    (
-        FOOTBALL,
-        {"num_agents": 26, "field_width": 3.0},
-        "num_agents: 26 .* at most 24 with field_width 3",
-    ),
-    (
-        SUMO,
-        {"num_agents": 12},
-        r"num_agents: 12 .* at most 10 with ring_radius 1.7 and platform.size \(4.37",
-    ),
-    (
-        SUMO,
-        {"num_agents": 16, "ring_radius": 2.5},
-        "num_agents: 16 .* at most 14 with ring_radius 2.5",
-    ),
-    (
-        EASY,
-        {"num_sheep": 29},
-        "num_sheep: 29 .* at most 28, for which there is room before the gate",
-    ),
-]
-
-
-@pytest.mark.parametrize(("task", "settings", "said"), REFUSED, ids=str)
-def test_a_size_without_room_is_refused_by_name(
-    task: str, settings: dict[str, Any], said: str
-) -> None:
-    refuses(said, make, task, impl="c", **settings)
-
-
-def test_a_policy_of_another_size_is_refused_by_name() -> None:
-    refuses("agents", check_policy, load_policy(GATE), make(GATE, impl="c", num_agents=3))
-
-
 def test_the_mass_of_the_box_grows_with_the_robots() -> None:
     masses = [sized(BOX, size).compiled.model.body("object/box").mass[0] for size in (1, 2, 8)]
     assert masses == [3.0, 6.0, 24.0]
@@ -187,15 +146,6 @@ def played(env: Any, steps: int) -> Any:
             own, other = np.split(np.asarray(state.reward), 2, axis=1)
             np.testing.assert_array_equal(own, -other)
     return state
-
-
-@pytest.mark.parametrize(
-    ("task", "size", "settings"), [(FOOTBALL, 6, {}), (HARD, 3, {"num_sheep": 5})]
-)
-def test_larger_teams_step(task: str, size: int, settings: dict[str, Any]) -> None:
-    env = sized(task, size, **settings)
-    state = played(env, 5)
-    assert state.obs.shape == (2, size, env.observation_size)
 
 
 @pytest.mark.soak

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mqe_jax import VectorEnv, cli, evaluate, learn, make, names
+from mqe_jax import VectorEnv, learn, make, names
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.types import observations
 from mqe_jax.export.policy import skill_of
@@ -31,7 +31,6 @@ from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, policy_in, save_policy
-from mqe_jax.view.session import Session
 from mqe_jax.walk_policy import WalkPolicy
 from tests.inputs import refuses
 from tests.training import random_params
@@ -180,11 +179,24 @@ def test_graphs_of_tasks_need_the_skill_of_npc_robots(weights: str) -> None:
     refuses("skill: 'agile' is not allowed", TaskFunctions, env)
 
 
-def test_ranges_beyond_training_warn() -> None:
-    with pytest.warns(
-        UserWarning, match=r"'walk' was not trained for vx \[-1.5, 2\] outside \[-1.2, 1.2\]$"
-    ) as found:
-        make("go1gate", impl="c", num_envs=1, command_ranges={"vx": (-1.5, 2), "vy": (-0.6, 0.6)})
+@pytest.mark.parametrize(
+    ("skill", "ranges", "said"),
+    [
+        (
+            "walk",
+            {"vx": (-1.5, 2), "vy": (-0.6, 0.6)},
+            r"'walk' .* vx \[-1.5, 2\] outside \[-1.2, 1.2\]$",
+        ),
+        (
+            ("walk", "agile"),
+            {"vx": (-1.0, 3.0)},
+            r"\('walk', 'agile'\) was not trained for vx \[-1, 3\] outside \[-1.5, 2.5\]",
+        ),
+    ],
+)
+def test_ranges_beyond_training_warn(skill: Any, ranges: Any, said: str) -> None:
+    with pytest.warns(UserWarning, match=said) as found:
+        make("go1gate", impl="c", num_envs=1, skill=skill, command_ranges=ranges)
     assert found[0].filename == __file__
 
 
@@ -203,6 +215,11 @@ def test_ranges_beyond_training_warn() -> None:
         ({"robot": "go2"}, "robot 'go1'; .* has 'go2'"),
         ({"control": "position"}, "control 'command'; .* has 'position'"),
         ({"skill": "agile"}, "skill 'walk'; .* has 'agile'"),
+        ({"skill": ("walk", "agile"), "robot": "go2"}, "robot 'go1'"),
+        (
+            {"skill": ("walk", "agile"), "command_ranges": {"vx": (-0.5, 0.5)}},
+            r"skill 'walk'; .* has \('walk', 'agile'\)",
+        ),
         ({"gait": "pace"}, "gait 'trot'; .* has 'pace'"),
         ({"needs.task": "go1tug"}, "task 'go1tug'; .* has 'go1football-1vs1'"),
         ({"needs.version": 7}, "version 7; .* has 1"),
@@ -222,7 +239,7 @@ def test_policies_of_other_needs_are_refused(
         if name.startswith("needs.")
     }
     others = {name: value for name, value in changes.items() if not name.startswith("needs.")}
-    if "skill" in others:
+    if others.get("skill") == "agile":
         others["skill_weights"] = weights
     env = make("go1football-1vs1", impl="c", num_envs=1, **others)
     policy = load_policy(WALKING)
@@ -416,13 +433,10 @@ def test_a_gait_is_of_the_skill_that_has_it(policies: Any) -> None:
     )
 
 
-@pytest.mark.parametrize("skill", ["walk", BOTH])
-def test_scripted_and_idle_policies_use_the_first_skill(skill: Any) -> None:
-    env = make(TASK, impl="c", num_envs=1, skill=skill)
-    obs = jax.random.normal(jax.random.PRNGKey(1), (8, 1, env.observation_size))
+def test_scripted_and_idle_policies_use_the_first_skill(match: Any) -> None:
+    obs = jax.random.normal(jax.random.PRNGKey(1), (8, 1, match.observation_size))
     for name in ("scripted", "idle"):
-        commands = skill_commands(env, load_policy(name, env), obs)
-        assert skill == "walk" or np.all(commands[:, -1] <= 0.0)
+        assert np.all(skill_commands(match, load_policy(name, match), obs)[:, -1] <= 0.0)
 
 
 def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
@@ -440,13 +454,6 @@ def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     np.testing.assert_array_equal(state.control.skill["acting"], [0, 1])
 
 
-def test_policies_of_two_skills_meet_in_the_viewer(policies: Any, match: Any) -> None:
-    playing = table(match, policies["agile"], policies["walk"], num_envs=4)
-    session = Session(match, playing.batch, playing.seats)
-    session.advance()
-    np.testing.assert_array_equal(session.state.control.skill["acting"], [[1, 0]] * 4)
-
-
 def test_policies_of_two_skills_meet_on_the_page(policies: Any, match: Any) -> None:
     chosen = []
     for name in BOTH:
@@ -456,64 +463,3 @@ def test_policies_of_two_skills_meet_on_the_page(policies: Any, match: Any) -> N
         ]
         chosen.append(float(action[-1]))
     assert chosen == [-0.5, 0.5]
-
-
-@pytest.mark.soak
-def test_commands_seat_them(policies: Any, tmp_path: Path) -> None:
-    walk = policies["walk"]
-    agile = policies["agile"]
-    result = evaluate(
-        agile,
-        opponent=walk,
-        episodes=2,
-        num_envs=2,
-        env={"episode_length": 0.2},
-        impl="c",
-        sides="both",
-    )
-    assert result.about["opponent"] == walk
-    words = [
-        "tournament",
-        TASK,
-        walk,
-        agile,
-        "--set",
-        "episode_length=0.1",
-        "--episodes",
-        "2",
-        "--impl",
-        "c",
-    ]
-    assert cli.main([*words, "-o", str(tmp_path / "t")]) == 0
-
-
-def test_ranges_for_which_no_skill_is_trained_warn() -> None:
-    make("go1plane", impl="c", num_envs=1, skill=BOTH, command_ranges={"vx": (-1.5, 2.5)})
-    with pytest.warns(
-        UserWarning,
-        match=r"skill \('walk', 'agile'\) was not trained for vx \[-1, 3\] outside \[-1.5, 2.5\]",
-    ):
-        make("go1plane", impl="c", num_envs=1, skill=BOTH, command_ranges={"vx": (-1.0, 3.0)})
-
-
-@pytest.mark.parametrize(
-    ("parameters", "said"),
-    [
-        ({"skill": "agile", "command_ranges": WIDE}, "needs skill 'walk'; .* has 'agile'"),
-        (
-            {"skill": BOTH, "command_ranges": {"vx": (-0.5, 0.5)}},
-            r"needs skill 'walk'; .* has \('walk', 'agile'\)",
-        ),
-        ({"skill": BOTH, "robot": "go2"}, "needs robot 'go1'"),
-    ],
-)
-def test_policies_that_the_actions_do_not_admit_are_refused(
-    policies: Any, parameters: Any, said: str
-) -> None:
-    refuses(
-        f"opponent: .* {said}",
-        names.seat,
-        policies["walk"],
-        make(TASK, impl="c", num_envs=1, **parameters),
-        "opponent",
-    )

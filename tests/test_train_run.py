@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,8 @@ from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.core.settings import override, to_mapping
 from mqe_jax.core.types import Cast
-from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import runner
-from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints, save_tree
+from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.folder import load_run_config
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import Monitor, read_evaluations
@@ -82,16 +80,8 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(
         patch.setattr(type(PROBE), "digests", {"skill_weights": "other"}, raising=False)
         refuses("skill_weights: has changed", train, PROBE, settings(), run_dir, resume=True)
     refuses("already holds a run", train, PROBE, settings(), run_dir)
-    refuses(
-        r"ppo.gamma: 0\.5 differs from the run",
-        train,
-        PROBE,
-        settings(ppo__gamma=0.5),
-        run_dir,
-        resume=True,
-    )
-    with pytest.raises(ValueError, match=f"its settings are in {run_dir / 'config.yaml'}"):
-        train(PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
+    said = rf"ppo.gamma: 0\.5 differs from the run.*its settings are in {run_dir}/config\.yaml"
+    refuses(said, train, PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
     refuses(
         r"total_steps: 16 .* at least", train, PROBE, settings(total_steps=16), run_dir, resume=True
     )
@@ -244,34 +234,6 @@ def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path)
     read_policy(tmp_path)
 
 
-def spoil(path: Path, kind: str) -> None:
-    _, arrays, metadata = checkpoints.read_file(path, kind=kind)
-    arrays[next(name for name in arrays if name.endswith("weight"))][0] = np.nan
-    save_tree(path, arrays, metadata, kind=kind)
-
-
-def test_weights_that_are_not_finite_are_refused(
-    straight: tuple[Path, TrainState], tmp_path: Path
-) -> None:
-    run_dir = tmp_path / "run"
-    shutil.copytree(straight[0], run_dir)
-    spoil(list_checkpoints(run_dir)[-1], "checkpoint")
-    spoil(run_dir / "policy.safetensors", "policy")
-    refuses(r"policy.safetensors: .*weight holds nan", read_policy, run_dir)
-    refuses(
-        r"step_000000000080.safetensors: .*weight holds nan",
-        train,
-        PROBE,
-        settings(),
-        run_dir,
-        resume=True,
-    )
-    policy = read_policy(straight[0])
-    broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * jnp.nan, policy.params))
-    with pytest.raises(NonFiniteError):
-        save_policy(tmp_path, broken)
-
-
 def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState]) -> None:
     run_dir, _ = straight
     policy = read_policy(run_dir)
@@ -286,6 +248,7 @@ def test_the_policy_acts_outside_the_training(straight: tuple[Path, TrainState])
     assert jax.tree.leaves(single_memory)[0].shape == (2, 4)
     assert policy.task == "probe"
     refuses(r"obs: shape \(3, 3, 2\)", policy.act, np.zeros((3, 3, 2)), memory)
+    refuses("holds a checkpoint; a policy is needed", read_policy, list_checkpoints(run_dir)[-1])
     result = evaluate_batch(PROBE, policy, 8, jax.random.PRNGKey(0))
     assert result.episodes == 8 and result.episode_length == 4.0
 
@@ -318,12 +281,3 @@ def test_a_run_starts_from_a_policy(straight: tuple[Path, TrainState], tmp_path:
     said = r"start: .*straight.* is not allowed; it must be a policy with this run's network"
     refuses(said, train_seeds, cast, [other], [tmp_path / "b"])
     refuses("start: .* `start` of the training's cast", train, PROBE, other, tmp_path / "b")
-
-
-def test_a_policy_that_is_missing_or_of_another_kind(
-    straight: tuple[Path, TrainState], tmp_path: Path
-) -> None:
-    refuses(r"policy.safetensors: no such file", read_policy, tmp_path)
-    refuses(
-        "holds a checkpoint; a policy is needed", read_policy, list_checkpoints(straight[0])[-1]
-    )

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from mqe_jax import cli, make, skills, walk_policy
+from mqe_jax import make, skills, walk_policy
 from mqe_jax.physics import actuators
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
@@ -89,25 +89,11 @@ def write_torchscript(
     path.write_bytes(inputs.zipped(b"\x80\x02" + whole + b".", files, code))
 
 
-def test_converted_checkpoints_compute_what_their_layers_say(tmp_path: pathlib.Path) -> None:
-    adaptation = random_layers(ADAPTATION_SIZES, 0)
-    body = random_layers(BODY_SIZES, 1)
-    write_torchscript(tmp_path / "a.jit", adaptation)
-    write_torchscript(tmp_path / "b.jit", body)
-    params = torchscript.convert(tmp_path / "a.jit", tmp_path / "b.jit")
-    history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
-    latent = apply(adaptation, history)
-    action = apply(body, np.concatenate([history, latent], axis=1))
-    for found, expected in zip(
-        walk_policy.infer(params, jnp.asarray(history)), (action, latent), strict=True
-    ):
-        np.testing.assert_allclose(found, expected, atol=2e-5)
-
-
 @pytest.mark.parametrize("half", [False, True])
-def test_converted_weights_are_rounded_to_float16_only_on_request(
-    tmp_path: pathlib.Path, half: bool
+def test_a_converted_checkpoint_computes_what_its_layers_say(
+    tmp_path: pathlib.Path, mqe: Any, half: bool
 ) -> None:
+    """Its weights are rounded to float16 only on request."""
     layers = {
         "adaptation": random_layers(ADAPTATION_SIZES, 0),
         "body": random_layers(BODY_SIZES, 1),
@@ -115,34 +101,25 @@ def test_converted_weights_are_rounded_to_float16_only_on_request(
     for part, values in layers.items():
         write_torchscript(tmp_path / f"{part}.jit", values)
     file = tmp_path / "walk.safetensors"
-    parts = [str(tmp_path / f"{part}.jit") for part in layers]
-    assert (
-        cli.main(
-            ["skill", "convert", "walk", *parts, "-o", str(file), *(["--float16"] if half else [])]
-        )
-        == 0
-    )
+    parts = [tmp_path / f"{part}.jit" for part in layers]
+    mqe("skill convert walk", *parts, "-o", file, *(["--float16"] if half else []))
     assert (file.stat().st_size < 3.7e6) is half
     found = walk_policy.load_params(GO1, file)
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}
-    for part, values in layers.items():
-        for name, value in values.items():
-            layer, kind = name.split(".")
-            stored = value.astype(np.float16) if half else value
-            np.testing.assert_array_equal(found[part][layer][kind], stored)
+    for values in layers.values():
+        values.update({n: x.astype(np.float16).astype(x.dtype) for n, x in values.items() if half})
+    history = np.random.default_rng(2).normal(size=(3, 2100)).astype(np.float32)
+    action, latent = walk_policy.infer(found, jnp.asarray(history))
+    np.testing.assert_allclose(latent, apply(layers["adaptation"], history), atol=2e-5)
+    both = np.concatenate([history, latent], axis=1)
+    np.testing.assert_allclose(action, apply(layers["body"], both), atol=2e-5)
 
 
-def test_foreign_files_are_refused_in_one_line(tmp_path: pathlib.Path) -> None:
-    text = tmp_path / "text.jit"
-    text.write_text("hello")
-    refuses(
-        r"text\.jit: damaged, or not a TorchScript Sequential", torchscript.read_torchscript, text
-    )
-    write_torchscript(tmp_path / "small.jit", random_layers((10, 5, 2), 0))
-    with pytest.raises(
-        ValueError, match=r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"
-    ):
-        torchscript.convert(tmp_path / "small.jit", tmp_path / "small.jit")
+def test_a_network_of_another_size_is_refused(tmp_path: pathlib.Path) -> None:
+    file = tmp_path / "small.jit"
+    write_torchscript(file, random_layers((10, 5, 2), 0))
+    said = r"adaptation\.0\.weight has shape \(5, 10\); expected \(256, 2100\)"
+    refuses(said, torchscript.convert, file, file)
 
 
 @pytest.mark.parametrize(
