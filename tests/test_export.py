@@ -1,5 +1,6 @@
 """Exported policies: equal outputs in onnxruntime and in JAX, and refused exports."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,10 @@ from mqe_jax.core.settings import build
 from mqe_jax.policies import zoo
 from mqe_jax.skills import SKILLS
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.needs import needs_of
-from mqe_jax.train.normalize import RunningStatistics, running_init
+from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from tests.inputs import refuses
-from tests.training import export_error, random_params
+from tests.training import export_error, untrained
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("jax2onnx")
@@ -50,17 +50,12 @@ def new_policy(
         "network": network,
         "group": group,
     }
-    config = build(TrainConfig, settings)
-    needs = needs_of(env, config)
-    net = config.network.build(needs.dims)
-    params = jax.tree.map(
-        lambda x: jnp.asarray(np.asarray(x) + np.float32(0.1)),
-        net.policy_params(random_params(net)),
-    )
-    fresh = running_init(needs.dims.observation, config.network.features(needs.dims))
+    policy = untrained(env, build(TrainConfig, settings))
+    params = jax.tree.map(lambda x: jnp.asarray(np.asarray(x) + np.float32(0.1)), policy.params)
+    fresh = policy.normalizer
     mean, spread = np.random.default_rng(3).normal(size=(2, *fresh.mean.shape)).astype(np.float32)
     statistics = RunningStatistics(jnp.asarray(mean), jnp.asarray(spread**2), fresh.samples + 9.0)
-    return TrainedPolicy(params, statistics, needs, config, {})
+    return dataclasses.replace(policy, params=params, normalizer=statistics)
 
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: Any) -> None:

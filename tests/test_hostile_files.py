@@ -30,9 +30,8 @@ from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train
 from mqe_jax.walk.torchscript import read_torchscript
 from tests import inputs
-from tests import training as probes
 from tests.inputs import module, named, refuses, tensor, zipped
-from tests.training import Probe, settings
+from tests.training import PROBE, settings
 
 
 def peak() -> int:
@@ -251,7 +250,6 @@ def test_bad_archives(case: str, tmp_path: Path) -> None:
 
 # -- impossible content, whose checksum is right
 
-PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 SETTINGS = settings(
     normalization__observations=True, ppo__epochs=1, ppo__minibatches=1, total_steps=32
 )

@@ -22,11 +22,9 @@ from mqe_jax.policies import zoo
 from mqe_jax.runs.cast import prepare
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.needs import Needs, needs_of, unmet
-from mqe_jax.train.normalize import running_init
-from mqe_jax.train.policy import TrainedPolicy, read_policy
+from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train_seeds
 from mqe_jax.train.stages import Stages
-from tests import training as probes
 from tests.inputs import refuses
 from tests.states import needed
 from tests.training import (
@@ -35,10 +33,12 @@ from tests.training import (
     ProbeState,
     Stop,
     assert_same_run,
-    random_params,
+    pay_one,
     registered,
     settings,
+    show_hidden,
     stop_after,
+    untrained,
     updated,
 )
 
@@ -118,18 +118,12 @@ def test_policies_without_sensors_send_no_messages() -> None:
 
 def test_a_policy_sees_its_own_last_action_among_several_skills() -> None:
     (config,), cast = onboard()
-    needs = needs_of(cast.env, config)
+    policy = untrained(cast.env, config).acting(True)
     random = np.random.default_rng(0)
-    network = config.network.build(needs.dims)
-    features = config.network.features(needs.dims)
-    statistics = running_init(needs.dims.observation, features)
-    policy = TrainedPolicy(
-        network.policy_params(random_params(network)), statistics, needs, config, {}, True
-    )
     env = make("go1gate", impl="c", num_envs=1, skill=("walk", "agile"), **SENSES)
     layout = env.layouts["onboard"]
     met = names.seat(policy, env, "opponent")
-    assert layout.size == needs.dims.observation + 1
+    assert layout.size == policy.dims.observation + 1
     memory = met.initial_memory(3)
     own = policy.initial_memory(3)
     last = jnp.zeros((3, 2, 3))
@@ -223,7 +217,7 @@ def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
 
     env = Seeing(
         show,
-        probes.pay_one,
+        pay_one,
         num_envs=32,
         action_size=2,
         features=2,
@@ -251,13 +245,13 @@ def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
         np.testing.assert_allclose(action, obs[..., 2:3] * obs[..., 3:] / 8 / 0.5, atol=1e-6)
     losses = [float(row["loss/imitation"]) for row in metrics]
     assert losses[-1] < losses[0] - 0.1 and losses[-1] < 0.1  # of its deviation alone -0.08
-    blind = Probe(probes.show_hidden, probes.pay_one, num_envs=32)
+    blind = Probe(show_hidden, pay_one, num_envs=32)
     refuses("group: 'signs' is missing in the state", updated, blind, config, 0, teacher=Counter())
 
 
 def test_a_critic_needs_the_final_observations_of_its_group() -> None:
     """The group `policy` has them, the group `signs` has not."""
-    env: Any = Seeing(probes.show_hidden, probes.pay_one, num_envs=4)
+    env: Any = Seeing(show_hidden, pay_one, num_envs=4)
     env.group_sizes = {"signs": 1}
     said = r"env: final_obs \(group 'signs'\) of probe is missing; expected \(4, 2, 1\)"
     blind = settings(FAST, num_envs=4, group="signs", network__critic_input="own")

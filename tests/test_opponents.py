@@ -26,10 +26,9 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.monitor import score
 from mqe_jax.train.needs import needs_of
-from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy
 from tests.inputs import refuses
-from tests.training import random_params
+from tests.training import untrained
 
 KEY = jax.random.PRNGKey(0)
 MATCHES = (
@@ -68,11 +67,7 @@ def new_policy(
         "env": {"control": env.env.control, **params},
         "num_envs": env.num_envs,
     }
-    config = build(TrainConfig, {**SETTINGS, **own, **settings})
-    needs = needs_of(env, config)
-    network = config.network.build(needs.dims)
-    weights = network.policy_params(random_params(network, seed))
-    return TrainedPolicy(weights, running_init(needs.dims.observation), needs, config, {})
+    return untrained(env, build(TrainConfig, {**SETTINGS, **own, **settings}), seed)
 
 
 def test_teams_may_see_different_groups_of_observations() -> None:

@@ -22,14 +22,12 @@ from mqe_jax.policies.scripted.cooperative import _sides
 from mqe_jax.presets import resolve
 from mqe_jax.runs.cast import make_learner
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.needs import needs_of
-from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.view.stage import Stage
 from mqe_jax.viz import cameras, framing, geometry
 from mqe_jax.viz.recording import Episode
 from tests.inputs import refuses
-from tests.training import random_params
+from tests.training import untrained
 
 BALL = "go1football-1vs1"
 SHEEP = "go1sheep-hard"
@@ -269,13 +267,7 @@ def policy(task: str, env: Any, **settings: Any) -> TrainedPolicy:
         "network": NETWORK,
         **settings,
     }
-    config = build(TrainConfig, settings)
-    needs = needs_of(env, config)
-    network = config.network.build(needs.dims)
-    statistics = running_init(needs.dims.observation, config.network.features(needs.dims))
-    return TrainedPolicy(
-        network.policy_params(random_params(network)), statistics, needs, config, {}
-    )
+    return untrained(env, build(TrainConfig, settings))
 
 
 @pytest.mark.parametrize("task", [BALL, SHEEP])

@@ -18,11 +18,9 @@ from mqe_jax.core.settings import build
 from mqe_jax.core.types import Observations
 from mqe_jax.export.task import normal_numbers
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.needs import needs_of
-from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from tests.inputs import refuses
-from tests.training import random_params
+from tests.training import untrained
 
 pytest.importorskip("jax2onnx")
 pytest.importorskip("onnxruntime")
@@ -44,11 +42,7 @@ def policy() -> TrainedPolicy:
         "group": "onboard",
         "network": {"recurrent": True, "gru_size": 8},
     }
-    config = build(TrainConfig, settings)
-    needs = needs_of(env, config)
-    network = config.network.build(needs.dims)
-    params = network.policy_params(random_params(network))
-    return TrainedPolicy(params, running_init(needs.dims.observation), needs, config, {})
+    return untrained(env, build(TrainConfig, settings))
 
 
 @pytest.fixture(scope="module")

@@ -21,13 +21,11 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.monitor import EvaluationLog, Monitor
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
-from tests import training as probes
 from tests.fake_env import SMALL
 from tests.inputs import refuses
-from tests.training import Probe, Stop, largest_file, rows, settings, stop_after
+from tests.training import PROBE, Stop, largest_file, rows, settings, stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
-PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 SETTINGS = settings(network__recurrent=False, ppo__epochs=1, ppo__minibatches=1)
 
 

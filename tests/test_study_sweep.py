@@ -22,13 +22,12 @@ from mqe_jax.study import sweep as sweeps
 from mqe_jax.study.runs import Cell, read_runs
 from mqe_jax.study.sweep import Sweep
 from mqe_jax.train.config import TrainConfig
-from tests import training as probes
 from tests.inputs import refuses
-from tests.training import Probe
+from tests.training import Probe, pay_near_hidden, show_hidden
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 CONFIGS = Path(__file__).parents[1] / "configs"
-PROBE = Probe(probes.show_hidden, probes.pay_near_hidden, num_envs=4)
+PROBE = Probe(show_hidden, pay_near_hidden, num_envs=4)
 FILE = """
 tasks: [go1gate]
 algorithms: [mappo, jrpo]

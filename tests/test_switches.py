@@ -30,14 +30,13 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.runner import train, train_seeds
-from tests import training as probes
 from tests.inputs import refuses
 from tests.states import needed
 from tests.test_opponents import matches
-from tests.training import Probe, content, differences, settings
+from tests.training import Probe, content, differences, pay_near_hidden, settings, show_hidden_first
 
 # none ends at first
-PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4, max_episode_steps=6)
+PROBE = Probe(show_hidden_first, pay_near_hidden, num_envs=4, max_episode_steps=6)
 
 
 @contextlib.contextmanager

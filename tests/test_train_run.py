@@ -24,9 +24,9 @@ from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train, train_seeds
 from mqe_jax.train.schedules import check_ended
 from mqe_jax.train.start import check_same
-from tests import training as probes
 from tests.inputs import refuses
 from tests.training import (
+    PROBE,
     Probe,
     Stop,
     assert_same,
@@ -34,12 +34,12 @@ from tests.training import (
     largest_file,
     rows,
     settings,
+    show_hidden_first,
     stop_after,
 )
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 KEY = jax.random.PRNGKey(0)
-PROBE = Probe(probes.show_hidden_first, probes.pay_near_hidden, num_envs=4)
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +221,7 @@ def pay_nan_later(hidden: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def test_a_training_stops_at_the_first_update_that_is_not_finite(tmp_path: Path) -> None:
-    env = Probe(probes.show_hidden_first, pay_nan_later, num_envs=4)
+    env = Probe(show_hidden_first, pay_nan_later, num_envs=4)
     with pytest.raises(NonFiniteError, match=r"update \d+ \(\d+ environment steps\) made loss/"):
         train(
             env,

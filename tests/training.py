@@ -28,7 +28,10 @@ from mqe_jax.train.algorithms import StagesSettings, register_stages
 from mqe_jax.train.checkpoint import latest
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.learner import make_learner
+from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import Network
+from mqe_jax.train.normalize import running_init
+from mqe_jax.train.policy import TrainedPolicy
 from mqe_jax.train.stages import Stages
 
 
@@ -184,6 +187,7 @@ def pay_meeting(hidden: jax.Array, action: jax.Array) -> jax.Array:
     return -jnp.square(action[:, 0, 0] - action[:, 1, 0])
 
 
+PROBE = Probe(show_hidden_first, pay_near_hidden, num_envs=4)
 SHORT = {
     "num_envs": 4,
     "total_steps": 5 * 16,
@@ -293,6 +297,15 @@ def random_params(network: Network, seed: int = 0) -> Params:
     return jax.tree.map(
         lambda x: jnp.asarray(scale(x) * random.normal(size=x.shape), x.dtype), shapes
     )
+
+
+def untrained(env: Any, config: TrainConfig, seed: int = 0) -> TrainedPolicy:
+    """Returns a policy with random weights, of a training with some settings."""
+    needs = needs_of(env, config)
+    network = config.network.build(needs.dims)
+    statistics = running_init(needs.dims.observation, config.network.features(needs.dims))
+    weights = network.policy_params(random_params(network, seed))
+    return TrainedPolicy(weights, statistics, needs, config, {})
 
 
 def export_error(policy: Any, env: Any) -> float:
