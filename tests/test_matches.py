@@ -1,16 +1,30 @@
-"""The matches: mirrored views, zero-sum rewards, results and endings on states made by hand."""
+"""The matches and football on states made by hand: mirrored views, zero-sum rewards, results and
+endings, the defender's play.
+"""
 
 import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from mqe_jax.envs import TASKS, QuadrupedEnv, make
+from mqe_jax.envs import TASKS, QuadrupedEnv, State, make
 from mqe_jax.envs.match import Match
-from tests.states import initial, made, observation, placed, stepper, still, terms_of
+from tests.states import (
+    ending,
+    initial,
+    made,
+    moment,
+    observation,
+    placed,
+    stepper,
+    still,
+    terms_of,
+    with_object,
+)
 
 MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
 PI = np.pi
@@ -286,3 +300,313 @@ def test_robots_start_as_listed(task: str) -> None:
     for side in (away, -away):
         assert np.all(side[..., 0].max(axis=0) > 0.8 * spread[0])
     assert env.compiled.scene.colors == (0, 2)
+
+
+# -- football
+
+
+NO = jnp.array(False)
+FOOTBALL = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
+
+
+envs = pytest.fixture(scope="module")(lambda: {task: made(task) for task in FOOTBALL})
+
+
+@pytest.fixture(scope="module")
+def drawn(envs: dict[str, Any]) -> dict[str, State]:
+    keys = jax.random.split(jax.random.PRNGKey(0), 64)
+    return {task: jax.jit(jax.vmap(env.reset))(keys) for task, env in envs.items()}
+
+
+@pytest.fixture(scope="module")
+def fresh(drawn: dict[str, State]) -> dict[str, State]:
+    return jax.device_put(jax.tree.map(lambda x: x[0], jax.device_get(drawn)))
+
+
+duel = pytest.fixture(scope="module")(lambda envs: envs["go1football-1vs1"])
+duel_step = pytest.fixture(scope="module")(lambda duel: stepper(duel.name))
+attack = pytest.fixture(scope="module")(lambda envs: envs["go1football-defender"])
+attack_step = pytest.fixture(scope="module")(lambda attack: stepper(attack.name))
+
+
+def with_ball(
+    env: QuadrupedEnv, state: State, position: Any, velocity: Any = (0.0, 0.0, 0.0)
+) -> State:
+    """The state with the ball somewhere else, moving; on the ground if only x and y are given."""
+    return with_object(
+        env, state, "ball", [*position, 0.1] if len(position) == 2 else position, velocity
+    )
+
+
+def standing(env: QuadrupedEnv, state: State, places: Any, roll: float = 0.0) -> State:
+    """The state with all robots at x, y, yaw, standing still; the first one, instead, rolled over
+    at yaw 0.
+    """
+    places = np.asarray(places)
+    euler = np.c_[np.zeros((len(places), 2)), places[:, 2]]
+    if roll:
+        euler[0] = [roll, 0.0, 0.0]
+    return placed(env, np.c_[places[:, :2], np.full(len(places), 0.31)], euler, state=state)
+
+
+@pytest.mark.parametrize("task", FOOTBALL)
+def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str) -> None:
+    env = envs[task]
+    states = drawn[task]
+    robots = jax.jit(jax.vmap(env.read))(states.data)
+    listed = {
+        "go1football-defender": ([(4, -2), (4, 2), (10, 0)], [0, 0, 1], (5, -2.1)),
+        "go1football-1vs1": ([(4, 0), (10, 0)], [0, 1], (7, 0)),
+        "go1football-2vs2": ([(4, -2), (4, 2), (10, 2), (10, -2)], [0, 0, 1, 1], (7, 0)),
+    }
+    places, turned, ball = listed[task]
+    away = np.abs(np.asarray(robots.position_w)[..., :2] - np.array(places))
+    assert away.max() <= 0.1 + 1e-5 and away.max() > 0.09
+    np.testing.assert_allclose(robots.position_w[..., 2], 0.42, atol=1e-6)
+    np.testing.assert_allclose(
+        np.cos(robots.euler[..., 2]), np.tile(1 - 2 * np.array(turned), (64, 1)), atol=1e-5
+    )
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(env.ball))(states.data), np.tile([*ball, 0.1], (64, 1)), atol=1e-6
+    )
+    assert env.max_steps == 1000
+
+
+def test_the_ball_can_start_between_the_attackers() -> None:
+    changes: dict[str, Any] = {"ball_between": 0.5, "ball_noise": 0.2, "head_start": 0.5}
+    env: Any = make("go1football-defender", impl="c", control="position", **changes)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 256))
+    y = np.asarray(jax.jit(jax.vmap(env.ball))(states.data))[:, 1]
+    between = np.abs(y) <= 0.2
+    assert 0.4 < between.mean() < 0.6 and np.all(np.abs(y[~between] + 2.1) <= 0.2)
+
+
+def test_the_field_has_two_goals_and_walls_all_around(duel: Any) -> None:
+    model = duel.compiled.model
+    data = mujoco.MjData(duel.compiled.model)
+    data.qpos[duel.index.base_qpos[:, 1]] = 4.0  # the robots out of the way, in a corner
+    data.qpos[duel.index.base_qpos[:, 0]] = [3.0, 4.0]
+    data.qpos[duel.objects["ball"].qpos[:3]] = [11.0, -4.0, 0.1]
+    mujoco.mj_forward(model, data)
+
+    def reach(x: float, y: float, direction: tuple[float, float], z: float = 0.1) -> float:
+        geom = np.zeros(1, np.int32)
+        return mujoco.mj_ray(
+            model, data, np.array([x, y, z]), np.array([*direction, 0.0]), None, 1, -1, geom
+        )
+
+    for y in (-0.95, 0.0, 0.95):  # through the mouths
+        assert reach(7.0, y, (1, 0)) == pytest.approx(13.0 - 7.0, abs=1e-3)
+        assert reach(7.0, y, (-1, 0)) == pytest.approx(7.0, abs=1e-3)
+    for y in (-1.05, 1.05, -3.0):  # beside them, up to the walls' height
+        for z in (0.1, 0.99):
+            assert reach(7.0, y, (1, 0), z) == pytest.approx(12.0 - 7.0, abs=1e-3)
+            assert reach(7.0, y, (-1, 0), z) == pytest.approx(7.0 - 2.0, abs=1e-3)
+    assert reach(12.5, 0.0, (0, 1)) == pytest.approx(1.0, abs=1e-3)  # the goal's own side
+    assert reach(7.0, 0.0, (0, 1)) == reach(7.0, 0.0, (0, -1)) == pytest.approx(4.5, abs=1e-3)
+    np.testing.assert_allclose(model.geom_size[duel.objects["ball"].geom, 0], 0.1)
+    assert model.body_mass[duel.objects["ball"].body] == pytest.approx(0.318)
+
+
+PLACES = [(4.2, 0.7, 0.3), (9.1, -1.2, 2.8), (8.4, 2.2, -2.0), (10.6, 0.4, 3.0)]
+
+
+def turned(places: Any) -> np.ndarray:
+    return np.array([(14 - x, -y, yaw + np.pi) for x, y, yaw in places])
+
+
+def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> None:
+    env = envs["go1football-2vs2"]
+    state = with_ball(env, standing(env, fresh[env.name], PLACES), (6.3, 1.1), (0.8, -0.3, 0.1))
+    obs = observation(env, state)
+    info = [[x, y, 0.31, 0, 0, yaw] for x, y, yaw in PLACES]
+    ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
+    np.testing.assert_allclose(
+        obs[0], [1, 0, *info[0], *info[1], *info[2], *info[3], *ball], atol=1e-5
+    )
+    np.testing.assert_allclose(
+        obs[1], [0, 1, *info[1], *info[0], *info[2], *info[3], *ball], atol=1e-5
+    )
+    other = [
+        [x, y, 0.31, 0, 0, (yaw + np.pi) % (2 * np.pi) - np.pi] for x, y, yaw in turned(PLACES)
+    ]
+    ball = [7.7, -1.1, 0.1, -0.8, 0.3, 0.1]
+    np.testing.assert_allclose(
+        obs[3], [0, 1, *other[3], *other[2], *other[0], *other[1], *ball], atol=1e-5
+    )
+
+    env = envs["go1football-1vs1"]
+    state = with_ball(env, standing(env, fresh[env.name], PLACES[:2]), (6.3, 1.1))
+    obs = observation(env, state)
+    np.testing.assert_allclose(
+        obs[1], [1, *other[1], *other[0], 7.7, -1.1, 0.1, 0, 0, 0], atol=1e-5
+    )
+
+    env = envs["go1football-defender"]
+    state = with_ball(env, standing(env, fresh[env.name], PLACES[:3]), (6.3, 1.1), (0.8, -0.3, 0.1))
+    obs = observation(env, state)
+    ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
+    np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *ball], atol=1e-5)
+    np.testing.assert_allclose(obs[1], [0, 1, *info[1], *info[0], *ball], atol=1e-5)
+
+
+GOALS = {
+    (1, 0): [(12.01, 0.0), (12.01, 0.99), (12.9, -0.9)],
+    (0, 1): [(1.99, 0.0), (1.99, -0.99)],
+    (0, 0): [(11.99, 0.0), (12.01, 1.01), (12.01, -1.01), (2.01, 0.0), (1.99, 1.01), (7.0, 0.0)],
+}
+
+
+@pytest.mark.parametrize(
+    ("ball", "goals"), [(ball, goals) for goals, balls in GOALS.items() for ball in balls]
+)
+def test_goals_at_both_ends(
+    duel: Any, fresh: Any, ball: tuple[float, float], goals: tuple[int, int]
+) -> None:
+    state = with_ball(duel, fresh[duel.name], ball)
+    robots = duel.read(state.data)
+    np.testing.assert_array_equal(duel.leading(state, robots), np.array(goals, bool))
+    assert bool(duel.ending(state, robots)) == any(goals)
+    outcome = duel.result(state, robots, NO)
+    assert (
+        outcome.win.tolist()
+        == outcome.success.tolist()
+        == outcome.loss[::-1].tolist()
+        == list(map(bool, goals))
+    )
+    assert outcome.draw.tolist() == [sum(goals) == 0] * 2
+
+
+def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh: Any) -> None:
+    """Before: the ball in the middle, 5 m from both goals. After: as each comment says."""
+    env = envs["go1football-2vs2"]
+    state = fresh[env.name]
+    before = with_ball(
+        env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0)
+    )
+    goals, robots = env.distances(moment(env, before))
+    np.testing.assert_allclose(goals, [5, 5], atol=1e-5)
+    np.testing.assert_allclose(robots, [2, 3], atol=1e-5)
+    # The ball at (8, 0): 4 m from team 0's goal (+1), 6 m from team 1's (-1): 1 - (-1) = 2. Team
+    # 0's nearest robot, now at (6.5, 0), is 1.5 m away (+0.5), team 1's 2 m (+1): 0.5 - 1 = -0.5.
+    after = with_ball(
+        env, standing(env, state, [(4, -2, 0), (6.5, 0, 0), (10, 0, 0), (10, -4, 0)]), (8.0, 0.0)
+    )
+    reward = terms_of(env, before, after)[1]
+    np.testing.assert_allclose(reward, np.array([1, 1, -1, -1]) * (0.3 * 2 - 0.1 * 0.5), atol=1e-4)
+    # A goal of team 1: the ball at (1.9, 0), 10.1 m from the far goal (-6.1), 0.1 m from the near
+    # one (+5.9). Nearest robots: team 0's (4, -2) at hypot(2.1, 2) = 2.9 m (-1.4), team 1's at 8.1
+    # m (-6.1).
+    reward = terms_of(env, after, with_ball(env, after, (1.9, 0.0)))[1]
+    expected = -10 + 0.3 * (-6.1 - 5.9) + 0.1 * (-1.4 + 6.1)
+    np.testing.assert_allclose(reward, np.array([1, 1, -1, -1]) * expected, atol=1e-4)
+    assert abs(expected + 10) < 5  # the goal is most of it
+
+
+def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
+    places = [(4, 0, 0), (10, 0, np.pi)]
+    state = standing(duel, fresh[duel.name], places)
+    play = duel_step(state, still(duel))
+    assert not play.terminated and not play.truncated
+    late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), still(duel))
+    assert late.truncated and not late.terminated and late.outcome.draw.tolist() == [1, 1]
+    fallen = duel_step(standing(duel, state, places, roll=1.0), still(duel))
+    assert fallen.terminated and fallen.outcome.win.tolist() == [0, 1]
+    assert float(fallen.metrics["reward/fall"]) == -10
+    np.testing.assert_allclose(fallen.reward[0], -fallen.reward[1], atol=1e-6)
+    for x, speed, sign in ((11.98, 2.0, 1), (2.02, -2.0, -1)):
+        goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), still(duel))
+        assert (
+            goal.terminated
+            and float(goal.outcome.win[0]) == (sign == 1)
+            and ending(goal) == ["task"]
+        )
+        assert float(goal.metrics["reward/goal"]) == 10 * sign
+        np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
+
+
+def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -> None:
+    state = standing(attack, fresh[attack.name], [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
+    for ball, expected in (((9.0, 0.0), 3 * np.exp(-1)), ((12.3, 0.4), 10 + 3 * np.exp(-0.5 / 3))):
+        reward = terms_of(attack, state, with_ball(attack, state, ball))[1]
+        np.testing.assert_allclose(reward, [expected] * 2, atol=1e-4)
+    # The agents' own goal is none.
+    own = with_ball(attack, state, (1.9, 0.0))
+    assert terms_of(attack, state, own)[0]["goal"] == 0
+    # A goal counts until the end of the episode, also when the ball comes out again.
+    scored = attack_step(with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)), still(attack))
+    assert float(scored.outcome.success[0]) == 1 and not scored.terminated
+    out = attack_step(with_ball(attack, scored, (11.0, 0.5)), still(attack))
+    assert float(out.outcome.success[0]) == 1 and float(out.metrics["reward/goal"]) == 0
+    late = attack_step(
+        dataclasses.replace(state, step=jnp.int32(attack.max_steps - 1)), still(attack)
+    )
+    assert late.truncated and not late.terminated and float(late.outcome.success[0]) == 0
+    fallen = standing(attack, state, [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)], roll=1.0)
+    assert attack_step(fallen, still(attack)).terminated
+    assert [int(terms_of(attack, state, after)[0]["fall"]) for after in (state, fallen)] == [0, 1]
+    defender = placed(
+        attack, [[4, -2, 0.31], [4, 2, 0.31], [10, 0, 0.31]], [[0, 0, 0], [0, 0, 0], [1.0, 0, 0]]
+    )
+    assert int(terms_of(attack, state, defender)[0]["fall"]) == 0
+    assert attack.params.rewards.fall == 0
+
+
+TOUCHES = {
+    (): [0, 0, False],
+    (0,): [0, 0, False],
+    (0, 0): [0, 0, False],
+    (0, 1): [1, 0, True],
+    (1, 0, 0, 1): [2, 0, True],
+    (0, 2, 1): [0, 0, True],
+    (0, 2, 1, 0): [1, 0, True],
+    (2, 3, 0): [0, 1, False],
+    (0, 1, 2, 3, 2): [1, 2, True],
+}
+"""Passes of both teams, and whether both robots of team 0 touched the ball, by the robots that
+touch it in turn."""
+
+
+@pytest.mark.parametrize(
+    ("task", "touching"),
+    [
+        (task, touching)
+        for task in (FOOTBALL[0], FOOTBALL[2])
+        for touching in TOUCHES
+        if task == FOOTBALL[2] or 3 not in touching
+    ],
+)
+def test_passes_and_goals_of_both(
+    envs: dict[str, Any], fresh: Any, task: str, touching: tuple[int, ...]
+) -> None:
+    env = envs[task]
+    state = fresh[task]
+    speed = 0.0
+    corners = [(3, -4, 0), (3, 4, 0), (11, 4, 0), (11, -4, 0)][: len(env.kick_off)]
+    for robot in (None, *(step for each in touching for step in (each, None)), "goal"):
+        places = [(6.6, 0, 0) if i == robot else corner for i, corner in enumerate(corners)]
+        speed += 0.2 * isinstance(robot, int)
+        ball = (12.1, 0.0) if robot == "goal" else (7.0, 0.0)
+        after = with_ball(env, standing(env, state, places), ball, (speed, 0.0, 0.0))
+        state = dataclasses.replace(
+            after, task=env.step_task(moment(env, state), moment(env, after))
+        )
+    first, second, both = TOUCHES[touching]
+    outcome = env.result(state, env.read(state.data), NO)
+    assert float(outcome.further["both_touched"][0]) == both
+    assert outcome.further["passes"].tolist() == (
+        [first, second] if task == FOOTBALL[2] else [first]
+    )
+
+
+def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> None:
+    state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
+    idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
+    robots = attack.read(state.data)
+    rest = idle.controller.default_commands
+    np.testing.assert_allclose(idle.npc_commands(state, robots), rest[None])
+    commands = np.asarray(attack.npc_commands(state, robots))[0]
+    # 10 m along x, the law asks for 0.6 hypot(4, 2) - 2 = 0.68 m further out, and for 0.9 m to the
+    # side.
+    np.testing.assert_allclose(commands[:2], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(commands[3:], rest[3:])

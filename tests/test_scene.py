@@ -27,7 +27,7 @@ from mqe_jax.terrain import Plane, Track
 from tests.driving import start_in_air
 from tests.inputs import refuses
 from tests.states import made
-from tests.test_engines import QUICK
+from tests.test_physics import QUICK
 
 PLANE = Track(blocks=(Plane(4.0),), walled=False, num_robots=1)
 
