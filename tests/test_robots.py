@@ -107,7 +107,8 @@ def test_a_robot_imports_nothing_of_the_simulation(policy: TrainedPolicy, files:
     )
     command = [sys.executable, "-c", code, str(files["mean"]), str(policy.dims.observation)]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert out == f"(1, {policy.dims.action})\nmqe_jax mqe_jax.export mqe_jax.export.robot\n"
+    core = "mqe_jax.core mqe_jax.core.lazy mqe_jax.core.version"
+    assert out == f"(1, {policy.dims.action})\n{core} mqe_jax mqe_jax.export mqe_jax.export.robot\n"
 
 
 def act(team: RobotTeam) -> None:
