@@ -70,16 +70,21 @@ class FakeState(EnvironmentState):
     data: FakeData
 
 
-class FakeEnv:
-    """Two robots that glide along x by a tenth of a metre times their first action; ends after ten
-    steps.
-    """
+class Fake:
+    """What an environment and a batch of them have."""
 
     name = "fake"
     num_agents = 2
     observation_size = 1
     privileged_observation_size = 2
     action_size = 3
+
+
+class FakeEnv(Fake):
+    """Two robots that glide along x by a tenth of a metre times their first action; ends after ten
+    steps.
+    """
+
     teams = ((0, 1),)
     dt = 0.02
     robot_x = np.array([0, 19])
@@ -142,15 +147,10 @@ class FakeEnv:
         return dataclasses.replace(state, data=data, **seen, outcome=outcome)
 
 
-class FakeVectorEnv:
+class FakeVectorEnv(Fake):
     def __init__(self, env: Any, num_envs: int) -> None:
         self.env = env
         self.num_envs = num_envs
-        self.name = env.name
-        self.num_agents = env.num_agents
-        self.action_size = env.action_size
-        self.observation_size = env.observation_size
-        self.privileged_observation_size = env.privileged_observation_size
 
     def reset(self, key: jax.Array) -> FakeState:
         return jax.vmap(self.env.reset)(

@@ -1,7 +1,4 @@
-"""What tests of sensors share: scattered states, the declared shapes as a MuJoCo model, readings.
-
-`python -m tests.sensing` prints how far the lidar deviates from the scene's own geoms, by task.
-"""
+"""What tests of sensors share: scattered states, declared shapes as a MuJoCo model, readings."""
 
 import dataclasses
 import functools
@@ -179,37 +176,3 @@ def sense(env: Any, sensor: Any) -> Any:
         )
 
     return jax.jit(read)
-
-
-def deviation(task: str, count: int) -> np.ndarray:
-    """Returns how far the lidar deviates from rays against the scene's own geoms at the height of
-    the trunk, m.
-    """
-    env = made(task)
-    states = scattered(task, count)
-    read = readings(env, states, Lidar(range=RANGE))
-    model = env.compiled.model
-    data = mujoco.MjData(model)
-    groups = model.geom_group.copy()
-    apart = []
-    for number in range(count):
-        data.qpos = states.data.qpos[number]
-        data.mocap_pos = states.data.mocap_pos[number]
-        mujoco.mj_kinematics(model, data)
-        for agent, origin, angles in rays(env, states, number):
-            model.geom_group[:] = 0
-            model.geom_group[env.index.geoms[agent]] = 5  # its own geoms
-            seen = np.array([1, 1, 1, 1, 1, 0], np.uint8)
-            real = np.minimum([ray(model, data, origin, angle, seen) for angle in angles], RANGE)
-            apart.append(np.abs(real - read[number, agent]))
-    model.geom_group[:] = groups
-    return np.concatenate(apart)
-
-
-if __name__ == "__main__":
-    for name in SENSING:
-        apart = deviation(name, 200)
-        print(
-            f"{name:22} median {np.median(apart):.3f} m, above 0.1 m {np.mean(apart > 0.1):5.1%}",
-            flush=True,
-        )

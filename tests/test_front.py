@@ -17,9 +17,7 @@ from mqe_jax import cli, names
 from mqe_jax.acting.results import Rate, Result
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import NonFiniteError
-from mqe_jax.core.settings import to_mapping
 from mqe_jax.runs import playing
-from mqe_jax.runs.cast import prepare
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.train import algorithms
 from mqe_jax.train.algorithms import StagesSettings, register_stages
@@ -250,17 +248,6 @@ def test_a_run_whose_weights_are_not_finite_is_not_saved(run: mqe_jax.Run) -> No
             "broken"
         )
     assert list(Path.cwd().iterdir()) == []
-
-
-def test_an_environment_keeps_its_parameters() -> None:
-    own: dict[str, Any] = {"control": "position", "gate_width": 0.7, "rewards": {"collision": -5.0}}
-    env = mqe_jax.make("go1gate", impl="c", episode_length=8.0, **own)
-    changes = {"robot": "go2", "episode_length": 5.0}
-    (config,), cast = prepare(env, {"num_envs": 2, "evaluation.every": 5}, changes)
-    assert config.env == own | changes
-    assert to_mapping(cast.eval_env.env.params) == to_mapping(env.params) | changes
-    assert cast.env.env.params.gate_width == 0.7 and cast.env.env.control == "position"
-    assert names.table(env, "idle").env.params == env.params
 
 
 @pytest.mark.parametrize(

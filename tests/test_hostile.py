@@ -721,25 +721,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def refuses_rewritten(
-    said: str, kind: str, run: Path, name: str, value: Any, metadata: dict[str, Any]
-) -> None:
-    """Asserts that a run is refused with a value in the last place of the first array whose name
-    starts so.
-    """
-    path = run / "policy.safetensors" if kind == "policy" else checkpoint.list_checkpoints(run)[-1]
-    _, arrays, about = checkpoint.read_file(path, kind=kind)
-    name = next(other for other in arrays if other.startswith(name))
-    changed = np.array(arrays[name])
-    changed[(-1,) * changed.ndim] = value
-    checkpoint.save_tree(path, {**arrays, name: changed}, {**about, **metadata}, kind=kind)
-    said = rf"{path.name}: {said}"
-    if kind == "policy":
-        refuses(said, read_policy, path)
-    else:
-        refuses(said, train, PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
-
-
 NUMBERS = {
     "policy": (
         ("normalizer/variance", -1.0),
@@ -766,39 +747,60 @@ NUMBERS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "value"), [(kind, *row) for kind, rows in NUMBERS.items() for row in rows]
-)
-def test_impossible_numbers(
-    kind: str, name: str, value: float, trained: Path, tmp_path: Path
+REWRITTEN: list[tuple[str, str, float, dict[str, Any], str]] = [
+    *(
+        (kind, name, value, {}, rf"({name}.* holds .*; a number from|holds 1000000 updates)")
+        for kind, rows in NUMBERS.items()
+        for name, value in rows
+    ),
+    ("checkpoint", "learning_rate", 1e-3, {"seconds": -1.0}, "its settings or its seconds"),
+    ("checkpoint", "learning_rate", 1e-3, {"seconds": math.nan}, "its settings or its seconds"),
+    ("checkpoint", "learning_rate", 1e-3, {"task": ["probe"]}, ".*belongs to task"),
+    (
+        "policy",
+        "normalizer/samples",
+        1e-3,
+        {"env_steps": -1},
+        r"its settings cannot be read \(env_steps",
+    ),
+    (
+        "policy",
+        "normalizer/samples",
+        1e-3,
+        {"env_steps": "many"},
+        r"its settings cannot be read \(env_steps",
+    ),
+    (
+        "policy",
+        "normalizer/samples",
+        1e-3,
+        {"needs": {"task": ["probe"]}},
+        r"its settings cannot be read \(task",
+    ),
+]
+"""Kind of file; start of the name of an array, and a number in its last place; metadata; what is
+said."""
+
+
+@pytest.mark.parametrize(("kind", "name", "value", "metadata", "said"), REWRITTEN)
+def test_impossible_content(
+    kind: str, name: str, value: float, metadata: Any, said: str, trained: Path, tmp_path: Path
 ) -> None:
     """The updates of a checkpoint are those of its name: a run that seems to be finished is not,
     however untrained.
     """
     run = Path(shutil.copytree(trained, tmp_path / "run"))
-    refuses_rewritten(
-        rf"({name}.* holds .*; a number from|holds 1000000 updates)", kind, run, name, value, {}
-    )
-
-
-@pytest.mark.parametrize(
-    ("kind", "metadata", "said"),
-    [
-        ("checkpoint", {"seconds": -1.0}, "its settings or its seconds"),
-        ("checkpoint", {"seconds": math.nan}, "its settings or its seconds"),
-        ("checkpoint", {"task": ["probe"]}, ".*belongs to task"),
-        ("policy", {"env_steps": -1}, r"its settings cannot be read \(env_steps"),
-        ("policy", {"env_steps": "many"}, r"its settings cannot be read \(env_steps"),
-        ("policy", {"needs": {"task": ["probe"]}}, r"its settings cannot be read \(task"),
-    ],
-)
-def test_impossible_metadata(
-    kind: str, metadata: Any, said: str, trained: Path, tmp_path: Path
-) -> None:
-    name = "learning_rate" if kind == "checkpoint" else "normalizer/samples"
-    refuses_rewritten(
-        said, kind, Path(shutil.copytree(trained, tmp_path / "run")), name, 1e-3, metadata
-    )
+    path = run / "policy.safetensors" if kind == "policy" else checkpoint.list_checkpoints(run)[-1]
+    _, arrays, about = checkpoint.read_file(path, kind=kind)
+    name = next(other for other in arrays if other.startswith(name))
+    changed = np.array(arrays[name])
+    changed[(-1,) * changed.ndim] = value
+    checkpoint.save_tree(path, {**arrays, name: changed}, {**about, **metadata}, kind=kind)
+    said = rf"{path.name}: {said}"
+    if kind == "policy":
+        refuses(said, read_policy, path)
+    else:
+        refuses(said, train, PROBE, override(SETTINGS, {"total_steps": 64}), run, resume=True)
 
 
 @pytest.mark.parametrize("name", ["games", "score", "born"])

@@ -494,23 +494,6 @@ def test_a_resumed_league_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("task", MATCHES)
-def test_a_match_is_trained_in_a_league_unless_settings_are_named(task: str) -> None:
-    config = resolve(task)
-    assert {"newest", "older", "scripted"} <= set(config.opponents) and config.num_envs % len(
-        config.opponents
-    ) == 0
-    assert make(task, impl="c", num_envs=1, **config.training_env).params.frozen_time == 0
-    # its episodes are shared by the fixed opponents
-    override(config, {"evaluation": {"every": 50}})
-    if task == "go1wrestling":
-        assert dict(config.train_env) == {
-            "frozen_time": 0.0,
-            "rewards": {"push": 3.0, "approach": 1.0},
-        }
-    assert resolve(task, "paper/mappo").opponents == () == resolve("go1gate").opponents
-
-
 def test_ratings_recover_the_strengths_behind_many_games() -> None:
     """Odds of 3 are 191 points; a draw counts half."""
     games = np.zeros((3, 3, 3), int)

@@ -24,7 +24,6 @@ from mqe_jax.physics.collision import MAX_ROBOTS, robot_bits
 from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.scripted.cooperative import _sides, plan_sheep_hard
-from mqe_jax.presets import resolve
 from mqe_jax.runs.cast import make_learner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.policy import TrainedPolicy, save_policy
@@ -691,16 +690,3 @@ def test_a_policy_with_a_size_is_refused_at_another_one(tmp_path: Path) -> None:
             tmp_path / str(number),
             large,
         )
-
-
-@pytest.mark.parametrize("task", [BALL, SHEEP])
-def test_shipped_settings_train_a_range_of_sizes(task: str) -> None:
-    config: Any = resolve(task, "sizes")
-    usual: Any = resolve(task)
-    assert (config.group, config.network.name) == (ENTITIES, "blocks")
-    assert (
-        config.training_env["fewest_agents"] < config.env["num_agents"]
-        and "fewest_agents" not in config.env
-    )
-    assert config.ppo == usual.ppo and config.network.hidden_sizes == usual.network.hidden_sizes
-    assert config.train_env.items() >= usual.train_env.items()
