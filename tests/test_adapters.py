@@ -24,7 +24,6 @@ from mqe_jax.adapters import task_env
 from mqe_jax.adapters.gymnasium import SingleEnv, VectorEnv, register
 from mqe_jax.adapters.host import HostEnvs
 from mqe_jax.adapters.opponent import TeamEnv
-from mqe_jax.core.errors import InputError
 from mqe_jax.envs import tasks
 from mqe_jax.envs.autoreset import autoreset
 from mqe_jax.names import versus
@@ -370,15 +369,26 @@ def test_every_adapter_takes_an_opponent(library: str) -> None:
 
 def test_bad_opponents_are_named() -> None:
     env = match()
-    with pytest.raises(InputError, match="opponent: go1gate is not a match; omit the opponent"):
-        task_env("go1gate", opponent="idle", impl="c", control="position")
+    refuses(
+        "opponent: go1gate is not a match; omit the opponent",
+        task_env,
+        "go1gate",
+        opponent="idle",
+        impl="c",
+        control="position",
+    )
     refuses("opponent: unknown 'scriptd'", task_env, env, opponent="scriptd")
-    with pytest.raises(
-        InputError, match=r"opponent: .* needs task 'go1tug'; the environment has 'go1wrestling'"
-    ):
-        task_env(env, opponent=counting("go1tug"))
+    refuses(
+        r"opponent: .* needs task 'go1tug'; the environment has 'go1wrestling'",
+        task_env,
+        env,
+        opponent=counting("go1tug"),
+    )
     team = TeamEnv(env, "idle")
-    with pytest.raises(InputError, match=r"action: shape \(2, 12\); expected \(1, 12\)"):
-        jax.eval_shape(
-            team.step, jax.eval_shape(team.reset, jax.random.PRNGKey(0)), jnp.zeros((2, 12))
-        )
+    refuses(
+        r"action: shape \(2, 12\); expected \(1, 12\)",
+        jax.eval_shape,
+        team.step,
+        jax.eval_shape(team.reset, jax.random.PRNGKey(0)),
+        jnp.zeros((2, 12)),
+    )

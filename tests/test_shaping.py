@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from mqe_jax.acting.seats import Seats
-from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.envs import Moment, State, make
 from mqe_jax.selfplay.demonstrations import Demonstrated
@@ -235,8 +234,12 @@ class Bending:
 
 
 def test_a_demonstrator_needs_assistance_and_episodes_of_sixteen_steps() -> None:
-    with pytest.raises(InputError, match=r"curriculum\.assistance.*above 0"):
-        build(TrainConfig, {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}})
+    refuses(
+        r"curriculum\.assistance.*above 0",
+        build,
+        TrainConfig,
+        {"task": "go1gate", "curriculum": {"demonstrator": "scripted"}},
+    )
     task = make("go1plane", impl="c", num_envs=N, control="position", episode_length=0.2)
     refuses(
         r"episode_length: 0\.2 .*at least 16 steps with a demonstrator",

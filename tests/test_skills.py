@@ -27,13 +27,11 @@ from mqe_jax.skills.choice import HOLD
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.checkpoint import read_file
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.needs import needs_of
 from mqe_jax.train.networks import EnvDims
-from mqe_jax.train.normalize import running_init
 from mqe_jax.train.policy import TrainedPolicy, policy_in, save_policy
 from mqe_jax.walk_policy import WalkPolicy
 from tests.inputs import refuses
-from tests.training import random_params
+from tests.training import untrained
 
 WALKING = population.FOLDER / "1-go1football-1vs1-late.safetensors"  # a policy of the skill `walk`
 WIDE = {"vx": (-1.5, 2.5), "vy": (-1.0, 1.0), "yaw_rate": (-2.5, 2.5)}
@@ -254,10 +252,8 @@ def test_a_policy_needs_the_contents_of_its_skill_weights(weights: str, tmp_path
     params = {"skill": "agile", "skill_weights": str(file)}
     env = make("go1gate", impl="c", num_envs=1, **params)
     config = TrainConfig(task="go1gate", env=params)
-    needs = needs_of(env, config)
-    network = config.network.build(needs.dims)
-    learned = network.policy_params(random_params(network))
-    policy = TrainedPolicy(learned, running_init(needs.dims.observation), needs, config, {})
+    policy = untrained(env, config)
+    needs = policy.needs
     path = save_policy(tmp_path / "run", policy)
     assert load_policy(path).needs == needs
     assert table("go1gate", path, impl="c").env.params.skill_weights == str(file)

@@ -21,6 +21,7 @@ import pytest
 from viewer import Client, Driven, free_port, open_page, session
 
 from tests.fake_env import FakeEnv
+from tests.inputs import refuses
 
 pytest.importorskip("mjviser")
 
@@ -233,10 +234,13 @@ def test_a_viser_without_the_hook_is_refused(monkeypatch: pytest.MonkeyPatch) ->
             stopped.append(True)
 
     monkeypatch.setattr(viser, "ViserServer", Other)
-    with pytest.raises(
-        InputError, match=r"view: viser .* cannot be restricted \(pip install 'viser==1.1.1' can\)"
-    ):
-        open_server("127.0.0.1", free_port(), "test")
+    refuses(
+        r"view: viser .* cannot be restricted \(pip install 'viser==1.1.1' can\)",
+        open_server,
+        "127.0.0.1",
+        free_port(),
+        "test",
+    )
     assert stopped == [True]
 
 
