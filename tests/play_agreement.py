@@ -8,17 +8,18 @@ differences of the states after 1 and 20 environment steps. Then the page plays 
 their mean outcomes are reported.
 """
 
-import argparse
 import functools
 import json
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import tyro
+from tyro.conf import Positional, arg
 
 from mqe_jax.acting.seats import Seats
 from mqe_jax.core.types import Observations
@@ -197,24 +198,21 @@ environment steps per second.
 """
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="site of `mqe play-site` without arguments")
-    parser.add_argument("--tasks", nargs="*", default=[], help="all by default")
-    parser.add_argument("--rollouts", type=int, default=10)
-    parser.add_argument("--episodes", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
+def main(
+    folder: Positional[Path],
+    tasks: tuple[str, ...] = (),
+    rollouts: int = 10,
+    episodes: int = 0,
+    file: Annotated[Path | None, arg(name="json")] = None,
+) -> None:
+    """Measures a site that `mqe play-site` wrote without arguments, by default all its tasks."""
     reports = {}
-    for entry in entries(arguments.tasks):
-        reports[entry.name] = measure(
-            arguments.folder, entry, arguments.rollouts, arguments.episodes
-        )
+    for entry in entries([*tasks]):
+        reports[entry.name] = measure(folder, entry, rollouts, episodes)
         print(entry.name, json.dumps(reports[entry.name]), flush=True)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(reports, indent=1) + "\n", encoding="utf-8")
-    return 0
+    if file is not None:
+        file.write_text(json.dumps(reports, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    tyro.cli(main)

@@ -164,3 +164,8 @@ def terms_of(
 
 def still(env: QuadrupedEnv) -> jax.Array:
     return jnp.zeros((env.num_agents, env.action_size))
+
+
+def stepped(env: QuadrupedEnv, state: State) -> State:
+    """The state after a step in which all robots stand still."""
+    return stepper(env.name)(state, still(env))

@@ -25,10 +25,8 @@ from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import override
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.replay import load_recording
-from mqe_jax.presets import resolve
 from mqe_jax.runs import learning
 from mqe_jax.train.checkpoint import checkpoint_step
-from mqe_jax.train.networks import Mat
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import SETTINGS
 from tests import fake_env
@@ -186,32 +184,14 @@ def test_a_policy_of_another_task_is_refused_by_name(
     assert "needs task 'fake'; the environment has 'go1tug'" in said
 
 
-def test_flags_change_the_settings_of_the_file_and_of_the_named_network() -> None:
-    parsed = parse_train(
-        ["go1gate", "--config", "demo", "--ppo.clip", "0.1", "--network.hidden-sizes", "8", "4"]
-    )
-    expected = {"ppo.clip": 0.1, "network.hidden_sizes": (8, 4)}
-    assert parsed.settings == override(resolve("go1gate", "demo"), expected)
-    parsed = parse_train(
-        ["go1gate", "--network.name", "mat", "--network.heads", "2", "--checkpoint.no-environments"]
-    )
-    assert parsed.settings.network == Mat(heads=2) and not parsed.settings.checkpoint.environments
-    assert parse_train(["go1plane", "--algorithm", "jrpo"]).settings.ppo.ratio == "joint"
-    flags = [
-        "--ppo.critic-warmup",
-        "0.02",
-        "--network.symmetry-coef",
-        "1",
-        "--task.shove-length",
-        "0.1",
-        "2",
-    ]
-    for skill, (settings, task) in SETTINGS.items():
-        parsed = parse_skill_train([skill, *flags])
-        assert parsed.settings == override(
-            settings, {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0}
-        )
-        assert parsed.task == override(task, {"shove_length": (0.1, 2.0)})
+@pytest.mark.parametrize("skill", SETTINGS)
+def test_flags_change_the_settings_of_a_skill(skill: str) -> None:
+    settings, task = SETTINGS[skill]
+    flags = "--ppo.critic-warmup 0.02 --network.symmetry-coef 1 --task.shove-length 0.1 2"
+    parsed = parse_skill_train([skill, *flags.split()])
+    changes = {"ppo.critic_warmup": 0.02, "network.symmetry_coef": 1.0}
+    assert parsed.settings == override(settings, changes)
+    assert parsed.task == override(task, {"shove_length": (0.1, 2.0)})
 
 
 @pytest.mark.parametrize(

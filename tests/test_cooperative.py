@@ -29,29 +29,28 @@ from tests.states import (
     observation,
     placed,
     robot_state,
-    stepper,
+    stepped,
     still,
     terms_of,
     with_object,
 )
 
 gate = pytest.fixture(scope="module")(lambda: made("go1gate"))
-gate_fresh = pytest.fixture(scope="module")(lambda gate: initial(gate))
 
 
-def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv, gate_fresh: State) -> None:
+def test_gate_observation_is_what_the_paper_lists(gate: QuadrupedEnv) -> None:
     both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], yaw=(0.1, 0.2))
-    state = dataclasses.replace(gate_fresh, anchors=jnp.array([[3.4, 0.2]]))
+    state = dataclasses.replace(initial(gate), anchors=jnp.array([[3.4, 0.2]]))
     obs = gate.observation_layout.pack(gate.observe(state, both))
     first = [1, 0, 1, 2, 0.3, 0, 0, 0.1, 4, 5, 0.6, 0, 0, 0.2, 3.4, 0.2]
     second = [0, 1, 4, 5, 0.6, 0, 0, 0.2, 1, 2, 0.3, 0, 0, 0.1, 3.4, 0.2]
     np.testing.assert_allclose(obs, [first, second], atol=1e-6)
 
 
-def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, gate_fresh: State) -> None:
+def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv) -> None:
     before = robot_state([[3.5, 0.75, 0.3], [3.5, 0.35, 0.3]])
     # Targets are (5.5, 0.75) and (5.5, -0.75): the first is 2 m away, the second hypot(2, 1.1) m.
-    state = dataclasses.replace(gate_fresh, anchors=jnp.array([[3.5, 0.0]]))
+    state = dataclasses.replace(initial(gate), anchors=jnp.array([[3.5, 0.0]]))
     after = robot_state([[3.8, 0.78, 0.3], [3.5, 0.35, 0.3]])
     terms = gate.rewards(Moment(state, before), Moment(state, after), jnp.array(True))
     assert float(terms["success"]) == 1  # 0.3 m past the gate; the other stands in it
@@ -70,10 +69,8 @@ def test_gate_rewards_add_up_as_worked_out_by_hand(gate: QuadrupedEnv, gate_fres
     assert float(logged["average_step_reward"]) == pytest.approx(3.29974, abs=1e-4)
 
 
-def test_gate_success_needs_both_through_and_no_failure(
-    gate: QuadrupedEnv, gate_fresh: State
-) -> None:
-    state = dataclasses.replace(gate_fresh, anchors=jnp.array([[3.5, 0.0]]))
+def test_gate_success_needs_both_through_and_no_failure(gate: QuadrupedEnv) -> None:
+    state = dataclasses.replace(initial(gate), anchors=jnp.array([[3.5, 0.0]]))
     both = robot_state([[3.8, 0, 0.3], [4.5, 0, 0.3]])
     one = robot_state([[3.8, 0, 0.3], [3.7, 0, 0.3]])
     fine = jnp.array(False)
@@ -98,17 +95,16 @@ def ground_height(env: Any, x: float, y: float) -> float:
 @pytest.mark.parametrize("task", list(TASKS))
 def test_endings(task: str) -> None:
     env = made(task)
-    step = stepper(task)
     pose = np.array(env.spawn_poses())
     height = [ground_height(env, x, y) + env.robot.stand_height + 0.01 for x, y, _ in pose]
     position = np.c_[pose[:, :2], height]
     euler = np.c_[np.zeros((len(pose), 2)), pose[:, 2]]
 
-    after = step(placed(env, position, euler), still(env))
+    after = stepped(env, placed(env, position, euler))
     assert not after.terminated and not after.truncated and not ending(after)
 
     late = dataclasses.replace(placed(env, position, euler), step=jnp.int32(env.max_steps - 1))
-    after = step(late, still(env))
+    after = stepped(env, late)
     assert after.truncated and not after.terminated and ending(after) == ["time_limit"]
 
     rolled = euler.copy()
@@ -116,10 +112,10 @@ def test_endings(task: str) -> None:
     rolled[-1, 0] = env.params.max_roll + 0.1
     high[-1, 2] = high[-1, 2] + 0.5
     for start in (placed(env, high, rolled), placed(env, high, rolled, state=late)):
-        after = step(start, still(env))
+        after = stepped(env, start)
         assert after.terminated and ending(after) == ["fall"]
     rolled[-1, 0] = env.params.max_roll - 0.1
-    assert not step(placed(env, high, rolled), still(env)).terminated
+    assert not stepped(env, placed(env, high, rolled)).terminated
 
     # The first robot's trunk lies across the second's: they touch.
     if len(pose) > 1:
@@ -127,7 +123,7 @@ def test_endings(task: str) -> None:
         across = euler.copy()
         touching[0] = touching[1] + [0.0, 0.0, 0.09]
         across[0, 2] = pose[1, 2] + np.pi / 2
-        bumped = step(placed(env, touching, across), still(env))
+        bumped = stepped(env, placed(env, touching, across))
         assert bool(bumped.metrics["collision"])
         assert bool(bumped.terminated) == env.params.end_on_collision
         assert ending(bumped) == ["collision"] * env.params.end_on_collision
@@ -146,19 +142,15 @@ def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(
     task: str, ceiling: bool
 ) -> None:
     env = made(task)
-    step = stepper(task)
     for height, euler, ends in (
         (0.9, angles(roll=(0.9, 0.0)), True),
         (0.9, angles(pitch=(1.2, 0.0)), False),
         (1.6, angles(), ceiling),
     ):
-        assert (
-            step(placed(env, [[1.0, -0.75, height], SPAWN[1]], euler), still(env)).terminated
-            == ends
-        )
+        assert stepped(env, placed(env, [[1.0, -0.75, height], SPAWN[1]], euler)).terminated == ends
     # the head against the back wall
     at_wall = placed(env, [[0.33, -0.75, 0.31], SPAWN[1]], angles(yaw=(np.pi, 0.0)))
-    bumped = step(moving(env, at_wall, [-1.5, 0.0, 0.0]), still(env))
+    bumped = stepped(env, moving(env, at_wall, [-1.5, 0.0, 0.0]))
     assert bumped.terminated and float(bumped.metrics["reward/collision"]) == -2
 
 
@@ -166,8 +158,6 @@ def test_roll_and_a_bump_into_a_wall_end_pitch_does_not_and_height_in_the_gate(
 
 
 env = pytest.fixture(scope="module")(lambda: made("go1seesaw"))
-step = pytest.fixture(scope="module")(lambda env: stepper(env.name))
-fresh = pytest.fixture(scope="module")(lambda env: initial(env))
 
 
 def on_plank(x: float, height: float = 0.31) -> list[float]:
@@ -213,22 +203,22 @@ def test_the_scene_is_as_listed(env: Any) -> None:
     assert low == pytest.approx([7.5, -0.5, 0.97]) and high == pytest.approx([8.5, 0.5, 1.0])
 
 
-def test_observation(env: Any, fresh: State) -> None:
+def test_observation(env: Any) -> None:
     both = robot_state([[1.0, 2.0, 0.3], [4.0, 5.0, 0.6]], pitch=(-0.2, 0.0), yaw=(0.0, 0.4))
-    obs = env.observation_layout.pack(env.observe(fresh, both))
+    obs = env.observation_layout.pack(env.observe(initial(env), both))
     first = [1, 2, 0.3, 0, -0.2, 0]
     second = [4, 5, 0.6, 0, 0, 0.4]
     np.testing.assert_allclose(obs, [[1, 0, *first, *second], [0, 1, *second, *first]], atol=1e-6)
     assert env.observation_size == 14
 
 
-def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
+def test_rewards_add_up_as_worked_out_by_hand(env: Any) -> None:
     no = jnp.array(False)
     yes = jnp.array(True)
-    before = Moment(fresh, robot_state([[7.70, 0, 0.3], [3.90, 0, 0.3]]))
+    before = Moment(initial(env), robot_state([[7.70, 0, 0.3], [3.90, 0, 0.3]]))
 
     def reward(after: RobotState, collision: Any = no) -> tuple[Any, Any]:
-        terms = env.rewards(before, Moment(fresh, after), collision)
+        terms = env.rewards(before, Moment(initial(env), after), collision)
         total, logged = weigh(terms, env.params.rewards, env.teams, jnp.ones(2, bool))
         assert float(logged["average_step_reward"]) == float(total[0]) == float(total[1])
         return total[0], terms
@@ -256,27 +246,23 @@ def test_rewards_add_up_as_worked_out_by_hand(env: Any, fresh: State) -> None:
     assert float(reward(close)[0]) == pytest.approx(5 * (7.30 - 3.90) - 0.25 / 0.16, abs=1e-3)
 
 
-def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any, fresh: State) -> None:
+def test_success_is_a_robot_on_the_platform_that_did_not_fail(env: Any) -> None:
     fine = jnp.array(False)
     up = robot_state([[3.9, 0, 0.45], [8.0, 0, 1.3]])
     below = robot_state([[3.9, 0, 0.45], [8.0, 0, 0.3]])
-    assert float(env.outcome(fresh, up, fine)["success"]) == 1
-    assert float(env.outcome(fresh, up, ~fine)["success"]) == 0
-    assert float(env.outcome(fresh, below, fine)["success"]) == 0
-    assert float(env.outcome(fresh, up, fine)["height"]) == pytest.approx(1.3)
+    assert float(env.outcome(initial(env), up, fine)["success"]) == 1
+    assert float(env.outcome(initial(env), up, ~fine)["success"]) == 0
+    assert float(env.outcome(initial(env), below, fine)["success"]) == 0
+    assert float(env.outcome(initial(env), up, fine)["height"]) == pytest.approx(1.3)
 
 
-def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(
-    env: Any, step: Any, fresh: State
-) -> None:
-    rolled = step(
-        placed(env, [[1.0, -0.75, 1.6], SPAWN[1]], angles(roll=(0.9, 0.0)), state=fresh), still(env)
-    )
+def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(env: Any) -> None:
+    rolled = stepped(env, placed(env, [[1.0, -0.75, 1.6], SPAWN[1]], angles(roll=(0.9, 0.0))))
     assert rolled.terminated and float(rolled.metrics["reward/fall"]) == -2
     # Legs upwards, so that nothing but the trunk is near the ground, which it does not touch yet.
-    low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]], state=fresh)
+    low = placed(env, [[1.0, -0.75, 0.075], SPAWN[1]])
     qpos = low.data.qpos.at[env.index.joint_qpos[0, 1::3]].set(np.pi)
-    low = step(dataclasses.replace(low, data=low.data.replace(qpos=qpos)), still(env))
+    low = stepped(env, dataclasses.replace(low, data=low.data.replace(qpos=qpos)))
     assert (
         low.terminated
         and float(low.metrics["collision"]) == 0
@@ -284,13 +270,11 @@ def test_a_fall_costs_and_a_trunk_too_low_ends_without_a_cost(
     )
 
 
-def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(
-    env: Any, step: Any, fresh: State
-) -> None:
+def test_robots_hold_and_tip_the_plank_and_stand_on_the_platform(env: Any) -> None:
     def stand(first: Any, second: Any, pitch: Any) -> State:
-        after = placed(env, [first, second], angles(pitch=pitch), state=fresh)
+        after = placed(env, [first, second], angles(pitch=pitch))
         for _ in range(30):
-            after = step(after, still(env))
+            after = stepped(env, after)
         return after
 
     held = stand(on_plank(7.0), on_plank(3.9), (-0.25, -0.25))

@@ -251,26 +251,25 @@ def test_the_graph_of_a_match_is_that_of_one_team() -> None:
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line(
-    tmp_path: Path, capsys: Any, monkeypatch: Any
+    tmp_path: Path, mqe: Any, monkeypatch: Any
 ) -> None:
-    file = str(tmp_path / "a.onnx")
+    file = tmp_path / "a.onnx"
 
-    def refused(*arguments: str) -> str:
-        assert cli.main(["export", *arguments]) == 2
-        said = capsys.readouterr().err
+    def refused(*arguments: object) -> str:
+        said = mqe("export", *arguments, code=2).err
         assert said.count("\n") == 1 and list(tmp_path.iterdir()) == []
         return said
 
-    assert "a.txt" in refused(str(GATE), "--onnx", str(tmp_path / "a.txt"))
-    assert "none" in refused(str(tmp_path / "none"), "--onnx", file)
+    assert "a.txt" in refused(GATE, "--onnx", tmp_path / "a.txt")
+    assert "none" in refused(tmp_path / "none", "--onnx", file)
     monkeypatch.setattr("mqe_jax.export.check.STEPS", 2)
     monkeypatch.setitem(translate.REPLACED, "max", lambda x, low: x + low)  # no ReLU
-    said = refused(str(GATE), "--onnx", file)
+    said = refused(GATE, "--onnx", file)
     assert (
         "nothing is written" in said and "differs from JAX by" in said and "at most 0.0001" in said
     )
     monkeypatch.setitem(translate.REPLACED, "max", lambda x, low: jax.lax.nextafter(x, x))
-    assert "jax2onnx cannot translate go1gate (" in refused(str(GATE), "--onnx", file)
+    assert "jax2onnx cannot translate go1gate (" in refused(GATE, "--onnx", file)
     refuses(
         "needs task 'go1gate'; the environment has 'go1tug'",
         to_onnx,

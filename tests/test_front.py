@@ -41,6 +41,16 @@ FEW |= {"ppo.minibatches": 1, "network.recurrent": False}
         ("go1gate --config demo", "demo", {}),
         ("go1gate --config demo --total-steps 64", {"config": "demo", "total_steps": 64}, {}),
         ("go1sheep-hard --algorithm mat", {"algorithm": "mat"}, {}),
+        (
+            "go1gate --config demo --ppo.clip 0.1 --network.hidden-sizes 8 4",
+            {"config": "demo", "ppo.clip": 0.1, "network.hidden_sizes": (8, 4)},
+            {},
+        ),
+        (
+            "go1gate --network.name mat --network.heads 2 --checkpoint.no-environments",
+            {"network": {"name": "mat", "heads": 2}, "checkpoint.environments": False},
+            {},
+        ),
         ("go1wrestling --set episode_length=5", None, {"episode_length": 5}),
         (
             "go1gate --control position --ppo.clip 0.1",

@@ -20,18 +20,14 @@ from tests.states import (
     moment,
     observation,
     placed,
+    stepped,
     stepper,
-    still,
     terms_of,
     with_object,
 )
 
 MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
 PI = np.pi
-
-
-def stepped(env: QuadrupedEnv, state: Any) -> Any:
-    return stepper(env.name)(state, still(env))
 
 
 def result(env: Any, state: Any) -> tuple[float, float]:
@@ -324,9 +320,7 @@ def fresh(drawn: dict[str, State]) -> dict[str, State]:
 
 
 duel = pytest.fixture(scope="module")(lambda envs: envs["go1football-1vs1"])
-duel_step = pytest.fixture(scope="module")(lambda duel: stepper(duel.name))
 attack = pytest.fixture(scope="module")(lambda envs: envs["go1football-defender"])
-attack_step = pytest.fixture(scope="module")(lambda attack: stepper(attack.name))
 
 
 def with_ball(
@@ -503,19 +497,19 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh:
     assert abs(expected + 10) < 5  # the goal is most of it
 
 
-def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
+def test_match_endings(duel: Any, fresh: Any) -> None:
     places = [(4, 0, 0), (10, 0, np.pi)]
     state = standing(duel, fresh[duel.name], places)
-    play = duel_step(state, still(duel))
+    play = stepped(duel, state)
     assert not play.terminated and not play.truncated
-    late = duel_step(dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)), still(duel))
+    late = stepped(duel, dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)))
     assert late.truncated and not late.terminated and late.outcome.draw.tolist() == [1, 1]
-    fallen = duel_step(standing(duel, state, places, roll=1.0), still(duel))
+    fallen = stepped(duel, standing(duel, state, places, roll=1.0))
     assert fallen.terminated and fallen.outcome.win.tolist() == [0, 1]
     assert float(fallen.metrics["reward/fall"]) == -10
     np.testing.assert_allclose(fallen.reward[0], -fallen.reward[1], atol=1e-6)
     for x, speed, sign in ((11.98, 2.0, 1), (2.02, -2.0, -1)):
-        goal = duel_step(with_ball(duel, state, (x, 0.5), (speed, 0, 0)), still(duel))
+        goal = stepped(duel, with_ball(duel, state, (x, 0.5), (speed, 0, 0)))
         assert (
             goal.terminated
             and float(goal.outcome.win[0]) == (sign == 1)
@@ -525,7 +519,7 @@ def test_match_endings(duel: Any, duel_step: Any, fresh: Any) -> None:
         np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
 
 
-def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -> None:
+def test_attack_rewards_and_success(attack: Any, fresh: Any) -> None:
     state = standing(attack, fresh[attack.name], [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
     for ball, expected in (((9.0, 0.0), 3 * np.exp(-1)), ((12.3, 0.4), 10 + 3 * np.exp(-0.5 / 3))):
         reward = terms_of(attack, state, with_ball(attack, state, ball))[1]
@@ -534,16 +528,14 @@ def test_attack_rewards_and_success(attack: Any, attack_step: Any, fresh: Any) -
     own = with_ball(attack, state, (1.9, 0.0))
     assert terms_of(attack, state, own)[0]["goal"] == 0
     # A goal counts until the end of the episode, also when the ball comes out again.
-    scored = attack_step(with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)), still(attack))
+    scored = stepped(attack, with_ball(attack, state, (11.98, 0.5), (2.0, 0, 0)))
     assert float(scored.outcome.success[0]) == 1 and not scored.terminated
-    out = attack_step(with_ball(attack, scored, (11.0, 0.5)), still(attack))
+    out = stepped(attack, with_ball(attack, scored, (11.0, 0.5)))
     assert float(out.outcome.success[0]) == 1 and float(out.metrics["reward/goal"]) == 0
-    late = attack_step(
-        dataclasses.replace(state, step=jnp.int32(attack.max_steps - 1)), still(attack)
-    )
+    late = stepped(attack, dataclasses.replace(state, step=jnp.int32(attack.max_steps - 1)))
     assert late.truncated and not late.terminated and float(late.outcome.success[0]) == 0
     fallen = standing(attack, state, [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)], roll=1.0)
-    assert attack_step(fallen, still(attack)).terminated
+    assert stepped(attack, fallen).terminated
     assert [int(terms_of(attack, state, after)[0]["fall"]) for after in (state, fallen)] == [0, 1]
     defender = placed(
         attack, [[4, -2, 0.31], [4, 2, 0.31], [10, 0, 0.31]], [[0, 0, 0], [0, 0, 0], [1.0, 0, 0]]

@@ -4,7 +4,6 @@ environment, resumed runs.
 
 import dataclasses
 import functools
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,13 +16,11 @@ from mqe_jax import make, names
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.settings import override
-from mqe_jax.core.types import Batch, Cast, Observations
+from mqe_jax.core.types import Batch, Observations
 from mqe_jax.policies import zoo
 from mqe_jax.runs.cast import prepare
 from mqe_jax.train.learner import make_learner
 from mqe_jax.train.needs import Needs, needs_of, unmet
-from mqe_jax.train.policy import read_policy
-from mqe_jax.train.runner import train_seeds
 from mqe_jax.train.stages import Stages
 from tests.inputs import refuses
 from tests.states import needed
@@ -31,13 +28,10 @@ from tests.training import (
     FAST,
     Probe,
     ProbeState,
-    Stop,
-    assert_same_run,
     pay_one,
     registered,
     settings,
     show_hidden,
-    stop_after,
     untrained,
     updated,
 )
@@ -256,41 +250,3 @@ def test_a_critic_needs_the_final_observations_of_its_group() -> None:
     said = r"env: final_obs \(group 'signs'\) of probe is missing; expected \(4, 2, 1\)"
     blind = settings(FAST, num_envs=4, group="signs", network__critic_input="own")
     refuses(said, make_learner, env, blind)
-
-
-class Pacer:
-    """A teacher that remembers the number of its steps."""
-
-    task = "go1gate"
-    agents = 2
-    groups = ("policy",)
-
-    def initial_memory(self, num_envs: int) -> jax.Array:
-        return jnp.zeros(num_envs)
-
-    def act(self, obs: Any, memory: jax.Array, key: jax.Array) -> Any:
-        return jnp.tanh(memory[:, None, None] + obs.group("policy")[..., :3]), memory + 1
-
-
-@pytest.mark.soak
-@pytest.mark.usefixtures("shared_programs")
-def test_a_training_with_sensors_resumes_bit_for_bit(tmp_path: Path) -> None:
-    """Noise, delay, drift and dropout included."""
-    late = {"all": {"noise": 0.1, "delay": 2, "dropout": 0.3}}
-    senses = [
-        "proprioception",
-        {"name": "detections", "pipeline": late},
-        {"name": "lidar", "pipeline": late},
-    ]
-    (config,), cast = prepare("go1gate", TINY, {"senses": senses}, impl="c")
-    whole = tmp_path / "whole"
-    stopped = tmp_path / "stopped"
-    train = functools.partial(train_seeds, Cast(cast.env, teacher=Pacer()), [config])
-    train([whole])
-    with pytest.raises(Stop):
-        train([stopped], on_update=stop_after(1))
-    train([stopped], resume=True)
-    assert_same_run(whole, stopped)
-    policy = read_policy(whole)
-    assert needed("go1gate", policy) == {"senses": policy.needs.senses}
-    check_policy(policy, make("go1gate", impl="c", num_envs=1, **needed("go1gate", policy)))

@@ -251,7 +251,7 @@ def test_tasks_of_other_sizes_are_played_by_their_scripted_policies() -> None:
 
 
 def test_libraries_of_other_content_are_refused(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, mqe: Any
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     folder = tmp_path / "mqe_jax" / "play"
@@ -260,11 +260,8 @@ def test_libraries_of_other_content_are_refused(
     refuses(r"@mujoco/mujoco@3.14.0.*SHA-256", libraries.add_libraries, tmp_path / "lib")
     monkeypatch.setenv("PATH", str(tmp_path))
     refuses("npm is not installed", libraries.add_libraries, tmp_path / "lib")
-    assert (
-        cli.main(["play-site", "go1gate", "-o", str(tmp_path / "o"), "--libraries", str(tmp_path)])
-        == 2
-    )
-    assert "has no mujoco.js" in capsys.readouterr().err
+    said = mqe(f"play-site go1gate -o {tmp_path}/o --libraries {tmp_path}", code=2).err
+    assert "has no mujoco.js" in said
 
 
 def add_libraries(folder: Path) -> None:

@@ -24,7 +24,6 @@ from mqe_jax.physics.collision import MAX_ROBOTS, robot_bits
 from mqe_jax.physics.robots.index import trunk_bodies
 from mqe_jax.policies.scripted import scripted_policy
 from mqe_jax.policies.scripted.cooperative import _sides, plan_sheep_hard
-from mqe_jax.runs.cast import make_learner
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from mqe_jax.view.stage import Stage
@@ -506,34 +505,6 @@ def test_pictures_show_those_who_take_part(task: str) -> None:
     bodies = [*framing.targets(env.mj_model, episode)]
     stage.draw(episode.cut(slice(1)), (0, bodies))
     assert stage.span < 20
-
-
-@pytest.mark.soak
-def test_an_update_is_the_same_whatever_parked_robots_are() -> None:
-    settings = {
-        "num_envs": 4,
-        "rollout_steps": 4,
-        "ppo.minibatches": 1,
-        "ppo.epochs": 2,
-        "time_limit_ends": False,
-    }
-    settings |= {
-        "group": ENTITIES,
-        "network": {**NETWORK, "critic_input": "privileged"},
-        "imitation.teacher": None,
-    }
-    init, update = make_learner(
-        SHEEP, settings, env={**LARGE[SHEEP], "control": "position"}, impl="c"
-    )
-    state = jax.jit(init)(jax.random.PRNGKey(0))
-    update = jax.jit(update)
-    assert not np.all(state.rollout.env_state.active)
-    other = forged(varied(SHEEP, True), state.rollout.env_state)
-    other = dataclasses.replace(state, rollout=state.rollout._replace(env_state=other))
-    assert np.any(
-        np.asarray(other.rollout.env_state.data.qpos != state.rollout.env_state.data.qpos)
-    )
-    jax.tree.map(np.testing.assert_array_equal, update(other), update(state))
 
 
 def policy(task: str, env: Any, **settings: Any) -> TrainedPolicy:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from mqe_jax import cli, make, skills, walk_policy
+from mqe_jax import make, skills, walk_policy
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory
 from mqe_jax.physics import actuators
@@ -522,40 +522,17 @@ def test_weights_are_started_from_a_file(tmp_path: pathlib.Path) -> None:
 
 
 @pytest.mark.soak
-def test_a_run_is_resumed_and_its_weights_walk(
-    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    weights = str(walk_policy.ASSETS / "walk_go1.safetensors")
-    train = [
-        "walk",
-        "train",
-        "--run-dir",
-        str(tmp_path),
-        "--num-envs",
-        "16",
-        "--impl",
-        "c",
-        "--weights",
-        weights,
-    ]
-    train += ["--optimizer.learning-rate", "1e-5", "--network.log-std-init", "-2", "--total-steps"]
-    assert cli.main([*train, str(16 * 24)]) == 0
-    assert cli.main([*train, str(3 * 16 * 24), "--resume"]) == 0
+def test_a_run_is_resumed_and_its_weights_walk(tmp_path: pathlib.Path, mqe: Any) -> None:
+    weights = walk_policy.ASSETS / "walk_go1.safetensors"
+    small = "--num-envs 16 --impl c --optimizer.learning-rate 1e-5 --network.log-std-init -2"
+    train = f"walk train --run-dir {tmp_path} --weights {weights} {small} --total-steps"
+    mqe(f"{train} {16 * 24}")
+    mqe(f"{train} {3 * 16 * 24} --resume")
     rows = (tmp_path / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[1] for row in rows] == ["updates", "1", "2", "3"]
-    evaluate = [
-        "walk",
-        "eval",
-        "--weights",
-        str(tmp_path / "walk.safetensors"),
-        "--episodes",
-        "4",
-        "--impl",
-        "c",
-    ]
-    assert cli.main([*evaluate, "--scenario", "trot"]) == 0
-    assert cli.main([*train, str(3 * 16 * 24), "--resume", "--robot", "go2"]) == 2
-    assert "env.robot: 'go2' differs" in capsys.readouterr().err
+    mqe(f"walk eval --weights {tmp_path}/walk.safetensors --episodes 4 --impl c --scenario trot")
+    said = mqe(f"{train} {3 * 16 * 24} --resume --robot go2", code=2).err
+    assert "env.robot: 'go2' differs" in said
 
 
 Y_AND_ROTATIONS = SKILL.index(("vy", "yaw_rate", "roll"))

@@ -11,7 +11,7 @@ from mqe_jax.study.estimates import group
 from mqe_jax.study.report import write_report
 from mqe_jax.study.runs import Cell
 from tests.inputs import refuses
-from tests.test_study_report import CASES, PACKAGE, RUNS, PackageRandom, made_up, rows_of
+from tests.test_study import CASES, PACKAGE, RUNS, PackageRandom, made_up, rows_of
 
 REFERENCE = report.Reference(
     label="theirs", values={"plain": {"go1gate": {"mappo": 2.75}}}, tasks={"go1sheep-hard": "Hard"}
