@@ -182,16 +182,13 @@ LONG = ("view", "skill train", "skill eval", "tournament", "exploit")
 are."""
 
 
-def settings_of(command: str) -> Any:
-    return TrainConfig if isinstance(COMMANDS[command], str) else COMMANDS[command]
-
-
 @st.composite
 def wrong_flags(draw: st.DrawFn) -> list[str]:
     """Words of a command line with a number that is refused, or a hostile text anywhere."""
     command = draw(st.sampled_from(sorted(set(COMMANDS) - {"demo", "tasks", "zoo"})))
     words = [*command.split(), *TARGETS.get(command, [])]
-    fields = dict(numbers(settings_of(command)))
+    kind = COMMANDS[command]
+    fields = dict(numbers(TrainConfig if isinstance(kind, str) else kind))
     text = st.sampled_from(TEXTS) | st.text(max_size=20)
     if command in LONG or (fields and draw(st.integers(0, 3))):
         field = draw(st.sampled_from(sorted(fields)))

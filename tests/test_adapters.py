@@ -378,12 +378,6 @@ def test_bad_opponents_are_named() -> None:
         control="position",
     )
     refuses("opponent: unknown 'scriptd'", task_env, env, opponent="scriptd")
-    refuses(
-        r"opponent: .* needs task 'go1tug'; the environment has 'go1wrestling'",
-        task_env,
-        env,
-        opponent=counting("go1tug"),
-    )
     team = TeamEnv(env, "idle")
     refuses(
         r"action: shape \(2, 12\); expected \(1, 12\)",

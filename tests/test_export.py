@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_policies import StandAndLean
 
 from mqe_jax import cli, evaluate, load_policy, make
 from mqe_jax.core.settings import build
@@ -25,6 +24,7 @@ from mqe_jax.train.normalize import RunningStatistics
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 from tests.inputs import refuses
 from tests.robot_agreement import Compared
+from tests.test_skills import StandAndLean
 from tests.training import export_error, untrained
 
 onnx = pytest.importorskip("onnx")

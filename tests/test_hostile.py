@@ -12,7 +12,6 @@ import resource
 import shutil
 import struct
 from collections.abc import Callable, Iterator
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +58,6 @@ from tests.training import PROBE, settings
 
 KEY = jax.random.PRNGKey(0)
 NAN = math.nan
-LEVELS = (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3))
-WALLS = np.full((3, 2, 3), NAN)
 GAMES = np.ones((1, 1, 3), np.int64)
 RATINGS = games.Estimate(np.zeros(1), np.zeros(1), np.zeros(1))
 
@@ -112,8 +109,6 @@ def _render(x: Any, **options: Any) -> Any:
     return render.render_episode(x["fake"], **given)
 
 
-READERS = (load_yaml, read_torchscript)
-FILES = ((load_policy, "/dev/zero"), *product((*READERS, load_recording), ("/", "/dev/zero")))
 CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ("task: ", lambda x, v: make(v), (3, [], None)),
     *(
@@ -183,7 +178,11 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: x["matches"].step(x.get(v, v), np.zeros((2, 2, 12))),
         (None, 3, "state", "other"),
     ),
-    ("assistance: ", lambda x, v: x["task"].reset(KEY, v), LEVELS),
+    (
+        "assistance: ",
+        lambda x, v: x["task"].reset(KEY, v),
+        (None, "x", [], 2, -0.5, NAN, np.zeros(2), True, np.float64(NAN), np.int64(3)),
+    ),
     (
         "policy: ",
         lambda x, v: load_policy("go1tug", make("go1tug", impl="c", num_envs=1, robot=v)),
@@ -298,7 +297,9 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     (
         "episode: ",
-        lambda x, v: _render(x, episode=dataclasses.replace(x["episode"], **{v: WALLS})),
+        lambda x, v: _render(
+            x, episode=dataclasses.replace(x["episode"], **{v: np.full((3, 2, 3), NAN)})
+        ),
         ("mocap_pos",),
     ),
     ("view: ", lambda x, v: _render(x, view=v, backend=None), ("x", "")),
@@ -331,7 +332,11 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         lambda x, v: build(Sweep, {"tasks": ["go1gate"], v: 1}),
         ("self", "__dataclass_self__", "init"),
     ),
-    ("not a regular file", lambda x, v: v[0](v[1]), FILES),
+    ("not a regular file", lambda x, v: load_policy(v), ("/dev/zero",)),
+    *(
+        ("not a regular file", lambda x, v, read=read: read(v), ("/", "/dev/zero"))
+        for read in (load_yaml, read_torchscript, load_recording)
+    ),
 ]
 
 

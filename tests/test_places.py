@@ -160,8 +160,7 @@ def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (command.run_dir, command.settings.start) == (home / "run", f"{home}/start")
     assert command.dump_diverged == home / "dumps"
     assert parse(["render", "~/run", "-o", "~/a.png"]).target == f"{home}/run"
-    policy = zoo.load("go1gate")
-    save_policy("~/policies", policy, "gate.safetensors")
+    save_policy("~/policies", zoo.load("go1gate"), "gate.safetensors")
     assert load_policy("~/policies/gate.safetensors").task == "go1gate"
     assert list(work.iterdir()) == []
     monkeypatch.delenv("HOME")

@@ -60,25 +60,24 @@ def straight(
     return run_dir, train(PROBE, settings(), run_dir)
 
 
+@pytest.mark.parametrize("updates", [0, 2])
 def test_a_killed_training_resumes_as_if_never_stopped(
-    straight: Any, tmp_path: Path, capsys: Any
+    updates: int, straight: Any, tmp_path: Path, capsys: Any
 ) -> None:
-    straight_dir, expected = straight
-    run_dir = tmp_path / "killed"
-
+    """Its newest checkpoint is of that update, the last row of the next one."""
+    (tmp_path / "nohup.out").touch()  # the output of its command
     with pytest.raises(Stop):
-        # the checkpoint of update 2, the row of update 3
-        train(PROBE, settings(), run_dir, on_update=stop_after(2))
-    assert len(rows(run_dir)) == 3
-    with (run_dir / "metrics.csv").open("a") as file:
+        train(PROBE, settings(), tmp_path, on_update=stop_after(updates))
+    assert checkpoint_step(list_checkpoints(tmp_path)[-1]) == 16 * updates
+    assert len(rows(tmp_path)) == updates + 1
+    with (tmp_path / "metrics.csv").open("a") as file:
         file.write("64,4,0.1")  # a half-written row
     capsys.readouterr()
-    state = train(PROBE, settings(), run_dir, resume=True)
-    assert_same(state, expected)
+    assert_same(train(PROBE, settings(), tmp_path, resume=True), straight[1])
     told = capsys.readouterr()
     assert told.out == "" and "80 of 80 steps, reward" in told.err
-    assert_same_run(straight_dir, run_dir)
-    assert [int(row["env_steps"]) for row in rows(run_dir)] == [16, 32, 48, 64, 80]
+    assert_same_run(straight[0], tmp_path)
+    assert [int(row["env_steps"]) for row in rows(tmp_path)] == [16, 32, 48, 64, 80]
 
 
 def test_a_finished_run_is_neither_repeated_nor_overwritten(
@@ -163,15 +162,6 @@ def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path) -> None
 
     with pytest.raises(Stop):
         train(PROBE, settings(), tmp_path, on_update=again)
-
-
-def test_a_training_killed_before_its_first_update_can_be_resumed(tmp_path: Path) -> None:
-    (tmp_path / "nohup.out").touch()  # the output of its command
-    with pytest.raises(Stop):
-        train(PROBE, settings(), tmp_path, on_update=stop_after(0))
-    assert [path.name for path in list_checkpoints(tmp_path)] == ["step_000000000000.safetensors"]
-    train(PROBE, settings(), tmp_path, resume=True)
-    assert len(rows(tmp_path)) == 5
 
 
 def test_an_interrupted_evaluation_is_made_when_the_run_resumes(
