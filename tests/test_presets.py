@@ -37,6 +37,7 @@ from mqe_jax.core.settings import (
     settings_class,
     to_mapping,
 )
+from mqe_jax.envs import TASKS
 from mqe_jax.envs.gate import GateParams
 from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.presets import CONFIG_FOLDER, resolve
@@ -80,6 +81,12 @@ def digests() -> dict[str, str]:
 
 def test_shipped_settings_are_the_stored_ones() -> None:
     assert digests() == json.loads(STORED.read_text())
+
+
+@pytest.mark.parametrize("name", [None, "league", "sizes"])
+@pytest.mark.parametrize("task", SHIPPED)
+def test_tasks_have_the_parameters_of_shipped_settings(task: str, name: str | None) -> None:
+    build(TASKS[task].Params, resolve(task, name).training_env)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
