@@ -138,14 +138,15 @@ def _has_sensors(env: Mapping[str, Any]) -> bool:
 
 def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     """Returns the layers of a shipped name or a file."""
-    shipped = ["demo", "league", "sizes"]
+    shipped = ["demo", "laptop", "league", "sizes"]
     for file in ("paper", "tuned"):
         shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
     name = path_text(check("config", config, PathText))
     if name == "demo":
         return [_Layer.of("", _parts(name))]
     if name in shipped:
-        below = _layers_of(task, default_name(task)) if name == "sizes" else []
+        changes = name in ("laptop", "sizes")  # of the default settings
+        below = _layers_of(task, default_name(task)) if changes else []
         file, _, part = name.partition("/")
         parts = [_parts(file)["common"], _parts(file).get(part or task, {})]
         return below + [_Layer.of("", values) for values in parts]
