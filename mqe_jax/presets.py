@@ -22,7 +22,7 @@ from mqe_jax.core.settings import (
     override,
     path_text,
 )
-from mqe_jax.envs.registry import ALIASES, SHIPPED, TASKS
+from mqe_jax.envs.registry import ALIASES, SCRIPTED, SHIPPED, TASKS
 from mqe_jax.train.config import TrainConfig, read_settings
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
@@ -149,7 +149,10 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
         below = _layers_of(task, default_name(task)) if changes else []
         file, _, part = name.partition("/")
         parts = [_parts(file)["common"], _parts(file).get(part or task, {})]
-        return below + [_Layer.of("", values) for values in parts]
+        layers = below + [_Layer.of("", values) for values in parts]
+        if task in TASKS and task not in SCRIPTED:
+            layers.append(_Layer.of("", _unscripted(_stack(TrainConfig(), layers))))
+        return layers
     path = Path(name)
     allowed = f"a YAML file, or one of {', '.join(shipped)}"
     if path.suffix not in (".yaml", ".yml") and path.parent == Path("."):
@@ -159,6 +162,19 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     if not path.is_file():
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
     return [_Layer.of(f"{path}: ", read_settings(path))]
+
+
+def _unscripted(config: TrainConfig) -> dict[str, Any]:
+    """Returns what replaces the scripted policy in the settings of a task without one."""
+    changes: dict[str, Any] = {}
+    if config.imitation.teacher == "scripted":
+        changes["imitation.teacher"] = None
+    if config.curriculum.demonstrator == "scripted":
+        changes |= {"curriculum.demonstrator": None, "curriculum.assistance": 0.0}
+    if "scripted" in config.opponents:
+        others = [name for name in config.opponents if name != "scripted"]
+        changes["opponents"] = ["newest"] * (len(config.opponents) - len(others)) + others
+    return changes
 
 
 def preset(algorithm: str) -> dict[str, Any]:
