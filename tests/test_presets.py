@@ -60,7 +60,7 @@ def shipped() -> list[str | None]:
         for part in load_yaml(CONFIG_FOLDER / f"{file}.yaml")
         if part != "common"
     ]
-    return [None, "demo", "league", "sizes", *parts]
+    return [None, "demo", "laptop", "league", "sizes", *parts]
 
 
 def digests() -> dict[str, str]:
