@@ -143,7 +143,7 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
         shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
     name = path_text(check("config", config, PathText))
     if name == "demo":
-        return [_Layer.of("", _parts(name))]
+        return _layers_of("go1gate", "laptop")
     if name in shipped:
         changes = name in ("laptop", "sizes")  # of the default settings
         below = _layers_of(task, default_name(task)) if changes else []

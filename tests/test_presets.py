@@ -39,7 +39,7 @@ from mqe_jax.core.settings import (
 )
 from mqe_jax.envs import TASKS
 from mqe_jax.envs.gate import GateParams
-from mqe_jax.envs.registry import SHIPPED
+from mqe_jax.envs.registry import SCRIPTED, SHIPPED
 from mqe_jax.presets import CONFIG_FOLDER, resolve
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import ActorCritic, Mat
@@ -462,6 +462,19 @@ def test_arguments_are_checked_by_their_annotations() -> None:
     refuses(r"^count: 0 is not allowed; it must be greater than 0$", call, 0)
     refuses("^path: ", call, 1, "")
     refuses(r"^names\.1: ", call, 1, names=["a", 3])
+
+
+def test_a_task_without_a_scripted_policy_trains_without_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    usual = resolve("go1tug")
+    assert usual.opponents.count("scripted") == 2
+    monkeypatch.delitem(SCRIPTED, "go1tug")
+    config = resolve("go1tug")
+    assert config.opponents == (*["newest"] * 3, "older", "older", "uniform", "idle", "random")
+    assert config.imitation.teacher is config.curriculum.demonstrator is None
+    assert not config.curriculum.assistance
+    assert resolve("go1tug", usual) == usual
 
 
 if __name__ == "__main__":
