@@ -196,10 +196,11 @@ def default_name(task: str) -> str:
     """Returns the name of the settings with which a task is trained by default."""
     if task in _parts("tuned"):
         return f"tuned/{task}"
-    return "league" if _is_match(task) else "paper/mappo"
+    return "league" if is_match(task) else "paper/mappo"
 
 
-def _is_match(task: str) -> bool:
+def is_match(task: str) -> bool:
+    """Returns whether a task has two teams."""
     if task in SHIPPED:
         return len(SHIPPED[task].teams) > 1
     from mqe_jax.envs.match import Match

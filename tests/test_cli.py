@@ -50,6 +50,12 @@ def test_alone_it_says_what_to_do_first_and_its_version_on_request(mqe: Any) -> 
     assert mqe("--version").out == f"mqe {mqe_jax.__version__}\n"
 
 
+def test_a_training_ends_with_what_its_policy_reaches(capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train", "fake", "--run-dir", "run", *SMALL]) == 0
+    said = r"mqe: run reaches [\d.]+% \([\d.]+ to [\d.]+%\) success in 256 episodes without assist"
+    assert re.search(said, capfd.readouterr().err)
+
+
 @pytest.mark.parametrize("command", [[], *(name.split() for name in arguments.COMMANDS), ["walk"]])
 def test_help_ends_well_and_explains(command: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:

@@ -249,6 +249,14 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
         np.asarray(reward.lines[0].get_xdata()), run.metrics["env_steps"] / 1e6
     )
     assert figure._repr_png_().startswith(b"\x89PNG")  # pyright: ignore[reportAttributeAccessIssue]
+    evaluated = {"env_steps": 32, "sampled": {"success_rate": 0.5}}
+    metrics = run.metrics | {"assistance": np.array([1.0, 0.0]), "success": np.full(2, 0.5)}
+    shown = dataclasses.replace(run, metrics=metrics, evaluations=[evaluated]).plot().axes[1]
+    assert shown.get_ylabel().splitlines()[1:] == ["dotted: with assistance", "points: evaluated"]
+    assisted, alone, point = shown.lines
+    np.testing.assert_array_equal(np.isnan(assisted.get_ydata()), [False, True])
+    np.testing.assert_array_equal(np.isnan(alone.get_ydata()), [True, False])
+    assert (point.get_xdata()[0], point.get_ydata()[0]) == (32e-6, 50.0)
 
 
 def test_a_run_whose_weights_are_not_finite_is_not_saved(run: mqe_jax.Run) -> None:

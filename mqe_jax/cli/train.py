@@ -16,11 +16,12 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import settings_class
-from mqe_jax.presets import resolve
+from mqe_jax.presets import is_match, resolve
 from mqe_jax.train.algorithms import UnknownStages
 from mqe_jax.train.config import TrainConfig
 
 HINT = "resume with the same command and --resume; the run is in {}"
+_EPISODES = 256  # after a training
 MARKERS = (tyro.conf.AvoidSubcommands,)
 
 
@@ -102,9 +103,27 @@ class Train(TaskOptions):
             raise interrupts.Interrupted(HINT.format(run_dir))
         if jax.process_index() > 0:  # one process writes the files
             return
-        for folder in folders:
+        for folder, run in zip(folders, runs, strict=True):
+            if jax.process_count() == 1:
+                echo(f"mqe: {folder} reaches {_reached(run, folder, self.impl)}")
             echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
         echo(f"mqe: {run_dir / 'curve.png'} has the curve")
+
+
+def _reached(run: Any, folder: Path, impl: str) -> str:
+    """Returns what the policy of a run reaches in the task without assistance."""
+    from mqe_jax import names
+    from mqe_jax.runs.cast import reference_opponents
+    from mqe_jax.runs.playing import evaluate
+
+    rival = None
+    aim = "success"
+    if is_match(run.policy.task):
+        env = names.environment(run.policy.task, run.config.env, impl=impl)
+        rival = reference_opponents(env)[0]
+        aim = f"wins against {rival}"
+    result = evaluate(folder, None, rival, episodes=_EPISODES, impl=impl)
+    return f"{result.success} {aim} in {_EPISODES} episodes without assistance"
 
 
 def parse_train(arguments: Sequence[str]) -> Train:

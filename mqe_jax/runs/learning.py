@@ -72,7 +72,7 @@ class Run:
 
     def plot(self) -> "Figure":
         """Returns a figure of reward and success over environment steps."""
-        return curves.plot_curves([self.metrics], self.policy.task)
+        return curves.plot_curves([self.metrics], self.policy.task, self.evaluations)
 
     @checked
     def save(self, folder: str | Path) -> None:
@@ -228,7 +228,9 @@ def _train(
             return list(_runs(training))
         runs = [load_run(place) for place in written]
     if folder is not None and all(run.finished for run in runs):
-        figure = curves.plot_curves([run.metrics for run in runs], runs[0].policy.task)
+        evaluations = [each for run in runs for each in run.evaluations]
+        tables = [run.metrics for run in runs]
+        figure = curves.plot_curves(tables, runs[0].policy.task, evaluations)
         curves.save_figure(figure, folder / "curve.png")
     return runs
 

@@ -41,10 +41,15 @@ def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
     return [float(window.mean()) if window.size else math.nan for window in finite]
 
 
-def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> "Figure":
+def plot_curves(
+    tables: Sequence[Mapping[str, np.ndarray]],
+    title: str,
+    evaluations: Sequence[Mapping[str, Any]] = (),
+) -> "Figure":
     """Returns a figure of average step reward (else return) and success over environment steps.
 
-    `tables` are columns of metrics.csv by name, of each seed.
+    `tables` are columns of metrics.csv by name, of each seed, and `evaluations` those of all seeds.
+    Success with assistance is dotted; evaluations, which have none, are points.
     """
     from matplotlib.figure import Figure
 
@@ -73,14 +78,30 @@ def plot_curves(tables: Sequence[Mapping[str, np.ndarray]], title: str) -> "Figu
     axes.set(xlabel="environment steps (millions)", ylabel=name.replace("_", " "), xlim=(0, last))
     if any(np.isfinite(table.get("success", math.nan)).any() for table in tables):
         right = axes.twinx()
-        for table in tables:
-            rate = [100 * v for v in smooth(table["success"])]
-            right.plot(table["env_steps"] / 1e6, rate, color=_SECOND, lw=1.4, alpha=0.9)
+        notes = []
+        if any(_plot_success(right, table) for table in tables):
+            notes.append("dotted: with assistance")
+        if evaluations:
+            notes.append("points: evaluated")
+        for each in evaluations:
+            rate = each["sampled"].get("success_rate")
+            height = math.nan if rate is None else 100 * rate
+            right.plot(each["env_steps"] / 1e6, height, "o", color=_SECOND, ms=4)
         right.set(ylim=(0, 100))
-        right.set_ylabel("success rate in training (%)", color=_SECOND)
+        right.set_ylabel("\n".join(["success rate in training (%)", *notes]), color=_SECOND)
         right.spines[["top", "left"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="best")
     return figure
+
+
+def _plot_success(axes: Any, table: Mapping[str, np.ndarray]) -> bool:
+    """Draws a seed's success in training, dotted with assistance; returns whether there is any."""
+    steps = table["env_steps"] / 1e6
+    rate = 100 * np.asarray(smooth(table["success"]))
+    assisted = np.asarray(table.get("assistance", np.zeros(len(steps)))) > 0
+    for shown, style in ((assisted, ":"), (~assisted, "-")):
+        axes.plot(steps, np.where(shown, rate, math.nan), style, color=_SECOND, lw=1.4, alpha=0.9)
+    return bool(assisted.any())
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
