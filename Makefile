@@ -39,8 +39,9 @@ browser: ## Install Debian's Chromium for the test of `mqe view`, where possible
 npm: ## Install Debian's npm for the libraries of `mqe play-site`, where possible
 	@bash tools/install.sh npm
 
-demo: $(STAMP) system ## Train Narrow Gate on the CPU, evaluate before and after, write to runs/demo
-	JAX_PLATFORMS=cpu $(BIN)/mqe demo
+demo: $(STAMP) system ## Train Narrow Gate on the CPU, evaluate and render it, in runs/demo
+	JAX_PLATFORMS=cpu $(BIN)/mqe train go1gate --config demo --run-dir runs/demo --resume
+	JAX_PLATFORMS=cpu $(BIN)/mqe render runs/demo -o runs/demo/video.mp4
 
 test: $(STAMP) ## Run the tests
 	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal

@@ -142,7 +142,7 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     for file in ("paper", "tuned"):
         shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
     name = path_text(check("config", config, PathText))
-    if name == "demo":
+    if name == "demo":  # of the gate, whatever the task
         return _layers_of("go1gate", "laptop")
     if name in shipped:
         changes = name in ("laptop", "sizes")  # of the default settings

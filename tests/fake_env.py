@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from mqe_jax import names
-from mqe_jax.cli import demo, launch, main
+from mqe_jax.cli import launch, main
 from mqe_jax.core import devices
 from mqe_jax.core.types import Outcome
 from mqe_jax.envs import TASKS, EnvironmentState, VectorEnv
@@ -200,7 +200,7 @@ def install(patch: pytest.MonkeyPatch) -> None:
         return made(num_envs)[1] if fake else VectorEnv(env, num_envs, *others, **named)
 
     patch.setattr(names, "make", make_env)
-    for module in (names, cast, demo, exploiting, playing, throughput):
+    for module in (names, cast, exploiting, playing, throughput):
         patch.setattr(module, "VectorEnv", batch)
     patch.setitem(TASKS, "fake", FakeEnv)  # pyright: ignore[reportArgumentType]
 

@@ -18,7 +18,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax import cli, names
-from mqe_jax.cli import arguments, demo
+from mqe_jax.cli import arguments
 from mqe_jax.cli.skill_train import parse_skill_train
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError, NonFiniteError
@@ -273,19 +273,6 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     assert all(f"--{flag}" in done.stderr for flag in ("seed", "ppo.epochs", "network.heads"))
 
 
-def test_the_demo_resumes_only_what_has_begun(mqe: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(demo, "DEMO_TASK", "fake")
-    small = "task: fake, num_envs: 4, rollout_steps: 8, total_steps: 64, checkpoint: {every: 1}"
-    Path("small.yaml").write_text(f"{{{small}, network: {{recurrent: false}}}}")
-    for _ in range(2):
-        said = mqe("demo --run-dir run --config small.yaml --episodes 4")
-        assert "no checkpoint" not in said.err
-        assert re.search(
-            r"after training:  both robots through [\d.]+% \([\d.]+ to [\d.]+%\)", said.out
-        )
-    assert json.loads(Path("run/evaluation.json").read_text())["after"]["episodes"] == 4
-
-
 # -- exit codes and messages
 
 
@@ -448,7 +435,6 @@ def test_an_output_is_checked_first(
         ["exploit", "go1gate", "idle", "-o", "new/exploit"],
         ["play-site", "nobody", "-o", "new/site"],
         ["play-site", "go1gate", "--libraries", ".", "-o", "new/site"],
-        ["demo", "--run-dir", "new/demo", "--config", "nobody"],
         [
             "train",
             "go1plane",

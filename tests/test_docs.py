@@ -24,7 +24,6 @@ import pytest
 import mqe_jax
 from mqe_jax import cli, names
 from mqe_jax.acting.evaluate import Evaluator
-from mqe_jax.cli import demo
 from mqe_jax.cli.arguments import COMMANDS, parse
 from mqe_jax.core.settings import override
 from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv, VectorEnv, make
@@ -35,7 +34,6 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import NETWORKS
 from mqe_jax.walk.training import AGILE
 from tests.acting import seats
-from tests.training import Stop
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -294,25 +292,6 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     for name, task in TASKS.items():
         page = (tmp_path / "tasks" / f"{name}.html").read_text(encoding="utf-8")
         assert all(f"<code>{term}</code>" in page for term in vars(task.Params().rewards))
-
-
-def test_the_demo_makes_a_policy_of_its_real_task(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Other tests of the demo have a task without physics, whose states hold all final
-    observations.
-    """
-
-    def evaluated(task: str, policy: Any, **_: Any) -> None:
-        assert (task, policy.task, policy.agents) == ("go1gate", "go1gate", 2)
-        raise Stop
-
-    monkeypatch.setattr(demo, "evaluate", evaluated)
-    settings = tmp_path / "small.yaml"
-    few = "num_envs: 4, rollout_steps: 8, total_steps: 32, ppo: {minibatches: 1}"
-    settings.write_text(f"{{{few}, env: {{control: position}}}}")
-    with pytest.raises(Stop):
-        demo.demo(tmp_path / "run", str(settings), 4, "c")
 
 
 EXAMPLES = ROOT / "examples"

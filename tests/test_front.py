@@ -256,7 +256,7 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
     assisted, alone, point = shown.lines
     np.testing.assert_array_equal(np.isnan(assisted.get_ydata()), [False, True])
     np.testing.assert_array_equal(np.isnan(alone.get_ydata()), [True, False])
-    assert (point.get_xdata()[0], point.get_ydata()[0]) == (32e-6, 50.0)
+    np.testing.assert_allclose(np.asarray(point.get_xydata()), [[32e-6, 50.0]])
 
 
 def test_a_run_whose_weights_are_not_finite_is_not_saved(run: mqe_jax.Run) -> None:

@@ -38,7 +38,6 @@ COMMANDS: dict[str, Any] = {
     "play-site": export.PlaySite,
     "replay": commands.Replay,
     "bench": commands.Bench,
-    "demo": commands.Demo,
     "skill train": "Train a skill's weights (GPU): mqe skill train agile.",
     "skill eval": skill.SkillEval,
     "skill convert": skill.SkillConvert,

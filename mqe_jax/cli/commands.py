@@ -1,4 +1,4 @@
-"""The commands `tasks`, `zoo`, `eval`, `replay`, `bench`, `demo`.
+"""The commands `tasks`, `zoo`, `eval`, `replay`, `bench`.
 
 Heavy imports are deferred until a command runs, to keep `mqe --help` fast.
 """
@@ -13,7 +13,6 @@ import tyro
 
 from mqe_jax.cli.options import (
     DumpDiverged,
-    Impl,
     Json,
     Long,
     PolicyOptions,
@@ -297,22 +296,3 @@ class Bench(TaskOptions):
         if not self.json:
             print_table(result)
         return result
-
-
-@settings_class
-class Demo:
-    """Train Narrow Gate from scratch on the CPU, evaluate before and after, draw curve and clip."""
-
-    run_dir: Path = Path("runs/demo")
-    """Run folder; an interrupted demo resumes from it."""
-    config: str = "demo"
-    """Settings, as `--config` of `mqe train`."""
-    episodes: Episodes = 256
-    """Number of episodes per evaluation."""
-    impl: Impl = "auto"
-
-    def run(self) -> None:
-        """Trains, evaluates and renders."""
-        from mqe_jax.cli import demo
-
-        demo.demo(self.run_dir, self.config, self.episodes, self.impl)
