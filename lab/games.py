@@ -10,7 +10,6 @@ Sources: Balduzzi et al. 2018, arXiv 1806.02643 (Nash averaging); Li and Wellman
 """
 
 import argparse
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, one_line
+from mqe_jax.core.files import parsing, read_rows
 from mqe_jax.core.types import RESULTS
 from mqe_jax.selfplay.league.games import Estimate, estimate, games_of, payoffs, resample
 from mqe_jax.selfplay.league.tables import shorten, table
@@ -214,22 +214,19 @@ def read_table(file: Path, columns: Sequence[str]) -> tuple[list[str], Array]:
     """Returns the policies of a tournament's table, in its order, and numbers of each pair (P, P,
     columns); InputError for another file.
     """
-    try:
-        with file.open(encoding="utf-8", newline="") as stream:
-            header, *rows = csv.reader(stream)
+    with parsing(file, "a tournament's table"):
+        header, *rows = read_rows(file)
         at = [header.index(name) for name in columns]
         names = list(dict.fromkeys(row[0] for row in rows))
         values = np.array([[float(row[i]) for i in at] for row in rows])
+        if not rows or not np.isfinite(values).all():
+            raise ValueError("no rows of finite numbers")
         return names, values.reshape(len(names), len(names), len(at))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: is not a tournament's table ({error})") from None
 
 
 def describe(file: Path) -> str:
     """Returns what the table of a tournament says, as text."""
-    with file.open(encoding="utf-8") as stream:
-        match = stream.readline().startswith("team0,")
-    if match:
+    if next(read_rows(file), [""])[0] == "team0":
         names, results = read_table(file, RESULTS)
         found = solve(results)
         order = np.argsort(-found.average.value, kind="stable").tolist()
@@ -263,4 +260,4 @@ if __name__ == "__main__":
     try:
         main()
     except (InputError, OSError) as error:
-        raise SystemExit(f"error: {error}") from None
+        raise SystemExit(f"error: {one_line(error)}") from None

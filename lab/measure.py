@@ -18,15 +18,15 @@ from typing import Annotated, Any, NamedTuple
 
 from annotated_types import MinLen
 
-from mqe_jax.core.errors import InputError, InUseError
-from mqe_jax.core.files import lock, read_json, write_atomically
+from mqe_jax.core.errors import InputError, InUseError, one_line
+from mqe_jax.core.files import lock, parsing, read_json, write_atomically
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import FrozenMapping, build, fail, settings_class
 from mqe_jax.envs.registry import task_id
 from mqe_jax.names import find
 from mqe_jax.study.provenance import provenance
 from mqe_jax.study.runs import PLAIN, table
-from mqe_jax.study.sweep import for_task, match_names, read_part
+from mqe_jax.study.sweep import check_variants, for_task, match_names, read_part
 from mqe_jax.train.policy import TrainedPolicy
 
 MEASURES = {
@@ -59,6 +59,7 @@ class Measurement:
     """Named arguments that override all others, such as slippery: {env: {friction: 0.5}}."""
 
     def __post_init__(self) -> None:
+        check_variants(self.variants)
         for task, values in self.by_task.items():
             if task not in self.tasks:
                 fail("by_task", task, f"one of the part's tasks: {', '.join(self.tasks)}")
@@ -91,7 +92,8 @@ class Item(NamedTuple):
         if not self.file.is_file():
             return None
         kept = read_json(self.file)
-        return kept["result"] if self.provenance.items() <= kept.items() else None
+        with parsing(self.file, "a result of lab.measure"):
+            return kept["result"] if self.provenance.items() <= kept.items() else None
 
 
 def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
@@ -105,6 +107,12 @@ def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
         for variant, changes in part.variants.items():
             place = folder / "results" / task / variant
             asked = for_task({**usual, **changes}, task_id(task))
+            for name in {"folder", "dump_diverged"} & asked.keys():
+                fail(
+                    f"arguments.{name}",
+                    asked[name],
+                    "left out: a measurement writes only into its folder",
+                )
             arguments = {
                 "impl": impl,
                 **{name: _with_files(name, value) for name, value in asked.items()},
@@ -190,19 +198,20 @@ def _rates(item: Item) -> list[dict[str, Any]]:
     result.
     """
     result = item.result() or {}
-    about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions")}
-    return [
-        {
-            "task": item.task,
-            "variant": item.variant,
-            **about,
-            "rate": name,
-            "value": result[name],
-            "low": low,
-            "high": high,
-        }
-        for name, (low, high) in result.get("intervals", {}).items()
-    ]
+    with parsing(item.file, "a result of lab.measure"):
+        about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions")}
+        return [
+            {
+                "task": item.task,
+                "variant": item.variant,
+                **about,
+                "rate": name,
+                "value": result[name],
+                "low": low,
+                "high": high,
+            }
+            for name, (low, high) in result.get("intervals", {}).items()
+        ]
 
 
 def main() -> None:
@@ -223,5 +232,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    except (InputError, OSError) as error:
+        raise SystemExit(f"error: {one_line(error)}") from None

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, one_line
 from mqe_jax.selfplay.league import pool
 from mqe_jax.train.checkpoint import latest, read_file
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
@@ -49,6 +49,6 @@ if __name__ == "__main__":
     try:
         policy = member(arguments.run, arguments.share)
         save_policy(arguments.file.parent, policy, arguments.file.name)
-    except InputError as error:
-        parser.exit(2, f"error: {error}\n")
+    except (InputError, OSError) as error:
+        parser.exit(2, f"error: {one_line(error)}\n")
     print(f"{arguments.file}: after {policy.metadata['env_steps']} steps")

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from lab import paper_page
-from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import write_atomically
+from mqe_jax.core.errors import InputError, one_line
+from mqe_jax.core.files import parsing, read_json, read_rows, write_atomically
 from mqe_jax.study.estimates import absolute
 from mqe_jax.study.runs import REWARD, Cell, Curve, Run, read_runs, table
 from mqe_jax.train.logs import number
@@ -71,6 +71,11 @@ def read_tables(folder: Path) -> list[Run]:
     """Reads the published runs of a folder, by path and seed; InputError for a missing or damaged
     table.
     """
+    with parsing(folder, "tables of runs"):
+        return _read_tables(folder)
+
+
+def _read_tables(folder: Path) -> list[Run]:
     evaluations: dict[Key, dict[str, list[dict[str, Any]]]] = {}
     for key, row in _read(folder / EVALUATIONS):
         point: dict[str, Any] = {
@@ -96,12 +101,13 @@ def read_tables(folder: Path) -> list[Run]:
 
 
 def _read(path: Path) -> Iterable[tuple[Key, dict[str, str]]]:
-    try:
-        for row in csv.DictReader(io.StringIO(gzip.decompress(path.read_bytes()).decode())):
+    with parsing(path, "a table of runs"):
+        rows = csv.DictReader(io.StringIO(gzip.decompress(path.read_bytes()).decode()))
+        if rows.fieldnames is None:
+            raise ValueError("empty")
+        for row in rows:
             task, algorithm, variant, seed = (row.pop(name) for name in IDENTITY)
             yield (Cell(task, algorithm, variant), int(seed)), row
-    except (OSError, EOFError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: is not a table of runs ({error!r})") from None
 
 
 def write_tables(folder: Path, runs: Sequence[Run]) -> None:
@@ -180,10 +186,15 @@ def _order(run: Run) -> tuple[str, int]:
 
 def add_measurement(name: str, file: Path, target: Path = MEASUREMENTS) -> None:
     """Puts the content of a JSON file, or the rows of a CSV file, into a JSON file under a name."""
-    text = file.read_text(encoding="utf-8")
-    content = list(csv.DictReader(io.StringIO(text))) if file.suffix == ".csv" else json.loads(text)
-    entries = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}
-    write_atomically(target, _entries({**entries, name: content}).encode())
+    entries = read_json(target) if target.is_file() else {}
+    with parsing(file, "a JSON list or mapping, or a CSV file"):
+        if file.suffix == ".csv":
+            head, *rows = read_rows(file)
+            content: Any = [dict(zip(head, row, strict=True)) for row in rows if row]
+        else:
+            content = read_json(file)
+        written = _entries({**entries, name: content})
+    write_atomically(target, written.encode())
 
 
 def _entries(entries: Mapping[str, Any]) -> str:
@@ -213,8 +224,8 @@ def main() -> int:
             return 0
         publish(arguments.sweeps, arguments.target)
         paper_page.update(read_tables(arguments.target), arguments.target, arguments.page)
-    except InputError as error:
-        parser.exit(2, f"error: {error}\n")
+    except (InputError, OSError) as error:
+        parser.exit(2, f"error: {one_line(error)}\n")
     return 0
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, one_line
 from mqe_jax.core.files import write_atomically
 from mqe_jax.core.literal import to_label
 from mqe_jax.core.settings import FrozenMapping, build, load_yaml, settings_class
@@ -175,5 +175,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    except (InputError, OSError) as error:
+        raise SystemExit(f"error: {one_line(error)}") from None

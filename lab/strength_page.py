@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 from lab.games import means
 from lab.paper_page import filled, reduced
 from mqe_jax.acting.results import Rate
-from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import write_atomically
+from mqe_jax.core.errors import InputError, one_line
+from mqe_jax.core.files import parsing, read_json, write_atomically
 from mqe_jax.study import runs
 
 ROOT = Path(__file__).parents[1]
@@ -427,8 +427,11 @@ def leads(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def results(folder: Path, part: str) -> list[dict[str, Any]]:
     """Returns the results of a part's calls below a folder."""
-    files = sorted(folder.glob(f"{part}/results/*/plain/result.json"))
-    return [json.loads(file.read_text("utf-8"))["result"] for file in files]
+    found = []
+    for file in sorted(folder.glob(f"{part}/results/*/plain/result.json")):
+        with parsing(file, "a result of lab.measure"):
+            found.append(read_json(file)["result"])
+    return found
 
 
 def copy_rates(folder: Path) -> None:
@@ -468,6 +471,10 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rates", type=Path, help="folder of the measured parts")
-    if folder := parser.parse_args().rates:
-        copy_rates(folder)
-    update()
+    folder = parser.parse_args().rates
+    try:
+        if folder is not None:
+            copy_rates(folder)
+        update()
+    except (InputError, OSError) as error:
+        raise SystemExit(f"error: {one_line(error)}") from None

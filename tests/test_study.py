@@ -714,6 +714,14 @@ def test_runs_of_other_settings_files_or_versions_are_not_reused(
     refuses(f"^go1gate/default: .*{message}.* name another folder$", study.plan)
 
 
+def test_damaged_provenance_is_named(study: Study) -> None:
+    assert study.run(study.plan()) == []
+    (file,) = study.folder.rglob(sweeps.PROVENANCE)
+    for content in ("{", "[]", "3"):
+        file.write_text(content)
+        refuses(rf"^go1gate/default: {file}: damaged, or not ", study.plan)
+
+
 def test_of_two_processes_the_one_that_trains_first_settles_the_settings(study: Study) -> None:
     before = study.plan()
     study.edit(ppo={"clip": 0.1})

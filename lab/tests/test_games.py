@@ -236,5 +236,20 @@ def test_the_table_of_mixed_teams_gives_means(tmp_path: Path) -> None:
         ["gap", "25.0"],
         ["idle", "25.0"],
     ]
-    (tmp_path / "tournament.csv").write_text("agent0,others\na,b\n")
-    refuses("is not a tournament's table", games.describe, tmp_path / "tournament.csv")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"agent0,others\na,b\n",
+        b"\xff",
+        b"team0,team1,wins,draws,losses\na\n",
+        b"team0,team1,wins,draws,losses\na,a,nan,0,0\n",
+        b"agent0,others,success,episodes\n",
+    ],
+)
+def test_a_damaged_table_is_named(content: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "tournament.csv"
+    file.write_bytes(content)
+    refuses(r"tournament\.csv: damaged, or not ", games.describe, file)

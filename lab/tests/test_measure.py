@@ -118,6 +118,14 @@ def test_unknown_cells_and_parts_are_named(tmp_path: Path) -> None:
             "by_task.go1gate: 64 is not allowed; it must be a mapping of arguments",
         ),
         (
+            "variants: {/tmp/up: {}}",
+            "variants./tmp/up: {} is not allowed; it must be a mapping of settings, under a name",
+        ),
+        (
+            "arguments: {dump_diverged: up}",
+            "arguments.dump_diverged: 'up' is not allowed; it must be left out",
+        ),
+        (
             "arguments: {policy: ['no/*']}",
             "arguments.policy: 'no/*' is not allowed; it must be a pattern of files that",
         ),
@@ -155,6 +163,26 @@ def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(
         "seed": 4,
         "episodes": 64,
     }
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda kept: [],
+        lambda kept: {**kept, "result": [1]},
+        lambda kept: {**kept, "result": {"intervals": {"win_rate": 3}}},
+        lambda kept: {name: value for name, value in kept.items() if name != "result"},
+    ],
+)
+def test_a_damaged_result_is_named(
+    change: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = build(measuring.Measurement, {"measure": "evaluate", "tasks": ["go1gate"]})
+    (item,) = measuring.plan(part, tmp_path)
+    item.file.parent.mkdir(parents=True)
+    item.file.write_text(json.dumps(change(item.provenance)))
+    with pytest.raises(InputError, match=r"result\.json: damaged, or not a result"):
+        measuring.measure(part, tmp_path)
 
 
 def published(part: str) -> measuring.Measurement:

@@ -1,11 +1,12 @@
 """Reports beside reference values, from made-up runs, and performance profiles."""
 
+import gzip
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lab import report
+from lab import publish, report
 from mqe_jax.study import statistics
 from mqe_jax.study.estimates import group
 from mqe_jax.study.report import write_report
@@ -59,3 +60,18 @@ def test_profiles_equal_the_package(case: dict[str, Any]) -> None:
     bounds = statistics.bootstrap_interval([x], profile, random, samples=PACKAGE["samples"])
     found = np.stack(bounds, axis=-1)
     np.testing.assert_allclose(found, case["profile_interval"], rtol=1e-9, atol=1e-12)
+
+
+def test_damaged_tables_and_measurements_are_named(tmp_path: Path) -> None:
+    whole = gzip.compress(
+        b"task,algorithm,variant,seed,kind,env_steps\ngo1gate,mappo,plain,0,x,1\n"
+    )
+    for content in (b"", b"task", whole[:20] + b"\0\0" + whole[22:], whole):
+        for name in (publish.EVALUATIONS, publish.CURVES):
+            (tmp_path / name).write_bytes(content)
+        refuses("damaged, or not .*tables? of runs", publish.read_tables, tmp_path)
+    target = tmp_path / "measurements.json"
+    for name, content in (("a.json", "{"), ("b.json", "3"), ("c.csv", "a,b\n1\n"), ("d.csv", "")):
+        (tmp_path / name).write_text(content)
+        refuses(f"{name}: damaged", publish.add_measurement, "x", tmp_path / name, target)
+    assert not target.exists()

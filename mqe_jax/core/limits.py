@@ -64,6 +64,7 @@ Port = Annotated[int, Gt(0), Lt(65536)]
 # -- texts, settings and files
 TEXT = 4096  # characters of a name or a path, none of which is a control character
 FILE_NAME = 255  # bytes of a part of a path
+VARIANT = 50  # characters of the name of a variant, with which folders are named
 SHOWN = 200  # characters of a value in a message
 DEPTH = 32  # nesting of settings
 YAML_BYTES = 2**17

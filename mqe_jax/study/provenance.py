@@ -8,7 +8,7 @@ from typing import Any
 
 from mqe_jax.core import files, version
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import read_json, write_atomically
+from mqe_jax.core.files import parsing, read_json, write_atomically
 from mqe_jax.core.settings import leaves, to_mapping
 from mqe_jax.envs.registry import TASKS
 from mqe_jax.train.policy import POLICY_FILE
@@ -60,7 +60,8 @@ def check_provenance(file: Path, wanted: Mapping[str, Any]) -> None:
     if before == wanted:
         return
     hint = f"the results in {file.parent}; name another folder"
-    old = {name: value for name, value in leaves(before) if value != {}}
+    with parsing(file, f"what `mqe sweep` wrote about {hint}"):
+        old = {name: value for name, value in leaves(before) if value != {}}
     new = {name: value for name, value in leaves(wanted) if value != {}}
     for name in {**new, **old}:
         if old.get(name) != new.get(name):

@@ -18,6 +18,7 @@ import jax
 import yaml
 from annotated_types import MaxLen, MinLen
 
+from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, InUseError, NonFiniteError, nearest
 from mqe_jax.core.files import check_folder, lock, write_atomically
 from mqe_jax.core.limits import Seed, SeedCount
@@ -77,16 +78,7 @@ class Sweep:
             values = getattr(self, name)
             if len(set(values)) < len(values):
                 fail(name, values, "a list without repetitions")
-        for name, values in self.variants.items():
-            if (
-                not isinstance(values, Mapping)
-                or not name.replace("-", "").replace("_", "").isalnum()
-            ):
-                fail(
-                    f"variants.{name}",
-                    values,
-                    "a mapping of settings, under a name of letters and digits",
-                )
+        check_variants(self.variants)
         named = {f"variants.{name}": values for name, values in self.variants.items()}
         for name, values in {"settings": self.settings, **named}.items():
             for key in {"task", "seed"} & values.keys():
@@ -100,6 +92,15 @@ class Sweep:
         """Returns the changes of the settings of a cell, the lowest first."""
         variant = {f"variants.{cell.variant}": self.variants[cell.variant]}
         return for_task({"settings": self.settings, **variant}, cell.task)
+
+
+def check_variants(variants: Mapping[str, Any]) -> None:
+    """Raises an InputError unless variants are mappings whose names can be those of folders."""
+    for name, values in variants.items():
+        plain = name.replace("-", "").replace("_", "").isalnum()
+        if not isinstance(values, Mapping) or not plain or len(name) > limits.VARIANT:
+            allowed = f"at most {limits.VARIANT} letters and digits"
+            fail(f"variants.{name}", values, f"a mapping of settings, under a name of {allowed}")
 
 
 @dataclass(frozen=True)
