@@ -502,3 +502,10 @@ def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: An
         recording,
         made("go1seesaw"),
     )
+
+
+def test_a_state_says_what_it_has_in_place_of_done() -> None:
+    state = State.__new__(State)
+    with pytest.raises(AttributeError, match=r"no attribute 'done'; .*`terminated` or"):
+        _ = state.done  # pyright: ignore[reportAttributeAccessIssue]
+    assert not hasattr(state, "info")

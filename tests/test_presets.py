@@ -319,6 +319,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 """Values of `Derived` that are refused, and how the message starts."""
 TRAINING: list[tuple[dict[str, Any], str]] = [
     ({"ppo": {"gama": 1.0}}, "ppo.gama: unknown name .*did you mean 'gamma'"),
+    ({"gamma": 1.0}, "gamma: unknown name .*did you mean 'ppo.gamma'"),
+    ({"ppo": {"learning_rate": 1.0}}, ".*did you mean 'optimizer.learning_rate'"),
+    ({"every": 1}, "every: unknown name .*did you mean 'checkpoint.every'"),
+    ({"steps": 1}, "steps: unknown name .*did you mean 'total_steps'"),
     ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be greater than 0"),
     ({"ppo.ratio": "joint"}, "ppo.value: 'agent' .* 'joint' when ppo.ratio is 'joint'"),
     (
@@ -446,6 +450,19 @@ def test_parameters_in_training_change_those_that_they_name() -> None:
         {"env": {"rewards.success": 9}},
     ):
         assert override(config, changes).env == {"rewards": {"collision": -5, "success": 9}}
+
+
+def test_an_unknown_argument_names_the_one_that_takes_it() -> None:
+    @checked
+    def function(config: Any, episodes: int = 1) -> None:
+        pass
+
+    with pytest.raises(TypeError, match=r"^function: .*'episode' \(did you mean 'episodes'\?\)"):
+        function({}, episode=3)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(TypeError, match=r"'gamma'; settings of a training are in `config`$"):
+        function({}, gamma=1.0)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(TypeError, match=r"^function: missing a required argument: 'config'$"):
+        function()  # pyright: ignore[reportCallIssue]
 
 
 def test_arguments_are_checked_by_their_annotations() -> None:

@@ -90,10 +90,17 @@ def known_name(wrong: str, name: str, known: Collection[str]) -> str:
     return name
 
 
-def nearest(word: object, known: Iterable[object]) -> str:
-    """Returns ' (did you mean ...?)' for the closest known word, or an empty string."""
+def nearest(word: object, known: Iterable[object], least: float = 0.5) -> str:
+    """Returns ' (did you mean ...?)' for the closest known word, or an empty string.
+
+    `least` is the share of letters that must match. A word that ends with the whole of it is closer
+    than one that only looks like it.
+    """
     import difflib  # 10 ms, which a program needs for a message only
 
     text = word[:SHOWN] if isinstance(word, str) else short_repr(word)
-    match = difflib.get_close_matches(text, [str(name) for name in known], 1, 0.5)
+    names = [str(name) for name in known]
+    match = difflib.get_close_matches(text, names, 1, 0.85)
+    match += sorted((x for x in names if x.endswith((f".{text}", f"_{text}"))), key=len)
+    match += difflib.get_close_matches(text, names, 1, least)
     return f" (did you mean {match[0]!r}?)" if match else ""

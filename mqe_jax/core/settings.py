@@ -174,6 +174,13 @@ def is_text(value: str) -> bool:
     )
 
 
+_PLACES = {
+    "config": "; settings of a training are in `config`",
+    "env": "; parameters of the task are in `env`",
+}
+"""Arguments that hold values by name, and what a message says of them."""
+
+
 def checked(function: Callable[P, R]) -> Callable[P, R]:
     """Makes a public function check its arguments against their annotations, as settings are.
 
@@ -188,7 +195,14 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def call(*given: P.args, **named: P.kwargs) -> R:
-        bound = signature.bind(*given, **named)
+        try:
+            bound = signature.bind(*given, **named)
+        except TypeError as error:
+            known = signature.parameters
+            hints = [nearest(name, known, 0.8) for name in named if name not in known]
+            if hints:
+                hints += [text for name, text in _PLACES.items() if name in known]
+            raise TypeError(f"{function.__name__}: {error}{''.join(hints)}") from None
         for name, kind in kinds().items():
             if name in bound.arguments:
                 bound.arguments[name] = check(name, bound.arguments[name], kind)
@@ -464,6 +478,13 @@ def _settings_in(hint: Any) -> Any:
     return next((found for found in inner if found is not None), None)
 
 
+def _names_within(kind: Any) -> Iterator[str]:
+    """Yields the dotted names of the fields within those fields that are settings."""
+    for field in dataclasses.fields(kind):
+        if is_settings(field.default):
+            yield from (f"{field.name}.{inner}" for inner in hints_of(type(field.default)))
+
+
 def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     """Returns the first error of a validation: path, value, and what is allowed."""
     first = error.errors(include_url=False)[0]
@@ -475,10 +496,11 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
         named = places and re.match(rf"{re.escape(places[-1])}[:.]", str(raised))
         return InputError(".".join([*(places[:-1] if named else places), str(raised)]))
     if first["type"] == "unexpected_keyword_argument":
+        inner = _names_within(kind)
         for part in places[:-1]:
             kind = _settings_in(hints_of(kind)[part])
         known = list(hints_of(kind))
-        hint = f"{nearest(places[-1], known)}; allowed: {', '.join(known)}"
+        hint = f"{nearest(places[-1], [*known, *inner])}; allowed: {', '.join(known)}"
         return InputError(f"{'.'.join(places)}: unknown name (value {short_repr(value)}){hint}")
     if first["type"] == "missing":
         return InputError(f"{'.'.join(places)}: is missing")

@@ -109,7 +109,8 @@ class EnvBatch:
             raise InputError(
                 f"state: {found} is not allowed; it must be the {kind.__name__} of "
                 f"{self.num_envs} environments that "
-                f"`reset` of this {type(self).__name__} returns"
+                f"`reset` of this {type(self).__name__} returns; it steps all of them, without "
+                "jax.vmap"
             )
         shape = (self.num_envs, self.num_agents, self.action_size)
         if getattr(action, "shape", None) != shape:

@@ -59,6 +59,12 @@ class EnvironmentState:
     active: Any = dataclasses.field(default=None, kw_only=True)
     """Which agents take part (A,) bool; the others count nowhere. None: all."""
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            hint = "; an episode is over if `terminated` or `truncated`" if name == "done" else ""
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{hint}")
+
     @property
     def obs(self) -> jax.Array:
         """Observations of the group `policy` (A, O)."""
