@@ -16,6 +16,7 @@ from gymnasium.spaces import Box
 
 from mqe_jax import names
 from mqe_jax.acting.seats import Policy, Seat, Seats, actor_of
+from mqe_jax.core import keys
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import check, checked
@@ -126,7 +127,7 @@ class TeamEnv:
                 f"action: shape {jnp.shape(action)}; expected {shape} (agents, action size)"
             )
         own: Any = state  # a `TeamEnvState`; the match's step keeps its further fields
-        key = jax.random.fold_in(own.key, 1)
+        key = jax.random.fold_in(own.key, keys.OPPONENT)
         seen = Observations({name: x[None] for name, x in own.rival_groups.items()})
         action = jnp.asarray(action, jnp.float32)
         both = jnp.concatenate([action, jnp.zeros_like(action)])[None]

@@ -1,7 +1,22 @@
-"""Constants that are folded into a random key for a draw besides those that it is split for.
+"""Random keys: each is drawn from once, or split.
 
-Each draw has its own key. `jax.random.split(key, n)` returns the keys of `fold_in` with 0 to n - 1,
-so a key that is split is folded with constants above n only.
+`jax.random.split(key, n)` returns the keys of `fold_in` with 0 to n - 1, so a key that is split is
+folded only with constants above n. A key that is drawn from may be folded with any.
 """
 
-LINEAR = 7933  # into that of hidden layers: the layer `linear`
+SECOND = 1
+"""Into a key that is drawn from: another draw."""
+THIRD = 2
+"""Likewise."""
+SENSING = 7907
+"""Into a state's key: the readings of its sensors."""
+NOISE = 7919
+"""Into a state's key: the noise of its observations; groups add their number, below 8."""
+LINEAR = 7933
+"""Into the key of a trunk's hidden layers: its layer `linear`."""
+ENCODER = 7937
+"""Into the key of a trunk: its encoder."""
+OPPONENT = 7949
+"""Into a state's key: the actions of the opponent."""
+RESUMED = 7951
+"""Into the key of a training: its environments after a checkpoint without them."""

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mqe_jax.core import keys
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import digest
 from mqe_jax.core.limits import Environments
@@ -47,10 +48,6 @@ from mqe_jax.skills.control import check_mode
 
 if TYPE_CHECKING:
     from mujoco import mjx
-
-_NOISE = 7919  # folded into a state's key for the noise of its observations
-_SENSING = 7907  # folded into it for its sensors
-
 
 T = TypeVar("T")
 
@@ -413,14 +410,14 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             if name not in ("policy", *groups):
                 continue
             if name == ONBOARD:
-                key = jax.random.fold_in(state.key, _SENSING)
+                key = jax.random.fold_in(state.key, keys.SENSING)
                 blocks, senses = self.suite.observe(self.snapshot(state, robots), state.senses, key)
                 state = dataclasses.replace(state, senses=senses)
             else:
                 blocks = self.observe_group(name, state, robots)
             obs = layout.pack(blocks, self.num_agents)
             if noise:
-                key = jax.random.fold_in(state.key, _NOISE + number)
+                key = jax.random.fold_in(state.key, keys.NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
             obs = hide(layout, obs, there) if there else obs
             seen[name] = jnp.where(self.observed(state)[:, None], finite(obs), 0.0)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core import keys
 from mqe_jax.core.limits import Distance, Fraction, Length, Robots, TimeLimit
 from mqe_jax.core.settings import settings_class
 from mqe_jax.envs.base import QuadrupedEnv
@@ -130,7 +131,7 @@ class Football(QuadrupedEnv[S, F]):
         position = jnp.append(self.sample_spot(key), params.ball.radius).at[:2].add(noise)
         qpos = qpos.at[self.objects["ball"].qpos[:3]].set(position)
         if params.head_start:
-            goal, attackers = self.sample_attack(jax.random.fold_in(start_key, 1))
+            goal, attackers = self.sample_attack(jax.random.fold_in(start_key, keys.SECOND))
             start = params.head_start * assistance * jax.random.uniform(start_key)
             way = start * (goal - position[:2])
             forward = jnp.where(attackers, way[0], 0.0)

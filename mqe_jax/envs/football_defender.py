@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core import keys
 from mqe_jax.core.limits import Fraction
 from mqe_jax.core.settings import settings_class
 from mqe_jax.envs.football import BALL_BLOCKS, FAR, GOALS, Football, FootballParams, Play
@@ -116,7 +117,7 @@ class Go1FootballDefender(Football[DefenderState, DefenderParams]):
         share = self.params.ball_between
         if not share:
             return spot
-        between = jax.random.bernoulli(jax.random.fold_in(key, 2), share)
+        between = jax.random.bernoulli(jax.random.fold_in(key, keys.THIRD), share)
         return jnp.where(between, spot.at[1].set(0.0), spot)
 
     def sample_attack(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -109,9 +109,7 @@ class Randomizer:
         """Returns the parameters of one environment."""
         random = self.random
         robots = self.index.num_robots
-        keys = jax.random.split(key, 5)
-        joint_key = jax.random.fold_in(key, 5)
-        offset_key = jax.random.fold_in(key, 6)
+        keys = jax.random.split(key, 7)
 
         def uniform(
             key: jax.Array, span: Range | None, shape: tuple[int, ...], default: float
@@ -128,8 +126,8 @@ class Randomizer:
             payload=uniform(keys[1], random.payload, (robots,), 0.0),
             center_of_mass=uniform(keys[2], random.center_of_mass, (robots, 3), 0.0),
             motor_strength=uniform(keys[3], random.motor_strength, (robots,), 1.0),
-            motor_offset=uniform(offset_key, offset, self.index.joint_qpos.shape, 0.0),
-            joint_mechanics=uniform(joint_key, random.joint_mechanics, (robots,), 1.0),
+            motor_offset=uniform(keys[6], offset, self.index.joint_qpos.shape, 0.0),
+            joint_mechanics=uniform(keys[5], random.joint_mechanics, (robots,), 1.0),
             action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
         )
 

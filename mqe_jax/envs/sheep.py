@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core import keys
 from mqe_jax.core.limits import (
     Buffer,
     Coordinate,
@@ -263,7 +264,7 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
                 for size in sizes
             ]
             start, spread = self.herd.start(
-                jax.random.fold_in(key, 1), grids, assistance * params.growing
+                jax.random.fold_in(key, keys.SECOND), grids, assistance * params.growing
             )
         noise = jax.random.uniform(key, start.shape, minval=-spread, maxval=spread)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel

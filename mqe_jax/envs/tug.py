@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core import keys
 from mqe_jax.core.limits import Distance, Length, TimeLimit
 from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.match import Duel
@@ -119,7 +120,7 @@ class Go1Tug(Duel[TugState, TugParams]):
         """Samples spawn poses as the base class does, with a wider range along x."""
         params = self.params
         shift = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
-        return super().spawn(jax.random.fold_in(key, 1)).at[:, 0].add(shift)
+        return super().spawn(jax.random.fold_in(key, keys.SECOND)).at[:, 0].add(shift)
 
     def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> TugState:
         return TugState(self.cylinder_y(state.data))

@@ -50,7 +50,8 @@ def _trunk_init(
             *((settings.gru_size,) if settings.recurrent else ()),
         )
         params["norm"] = {str(i): nn.layer_norm_init(size) for i, size in enumerate(widths)}
-    if encoded := encoder.init(jax.random.fold_in(key, 1)):
+    encoder_key = jax.random.fold_in(key, keys.ENCODER) if settings.recurrent else gru_key
+    if encoded := encoder.init(encoder_key):
         params["encoder"] = encoded
     return params
 

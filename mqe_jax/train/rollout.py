@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.acting.seats import Seats
-from mqe_jax.core import devices
+from mqe_jax.core import devices, keys
 from mqe_jax.core.types import (
     Batch,
     Memory,
@@ -105,7 +105,7 @@ def rollout(
         teacher_memory = ()
         if teacher is not None:
             remembered = teacher.restart((state.teacher_memory,), state.is_first)
-            teacher_key = jax.random.fold_in(key, 1)
+            teacher_key = jax.random.fold_in(key, keys.SECOND)
             label, (teacher_memory,) = teacher.act(
                 observations(before), remembered, teacher_key, jnp.zeros_like(action)
             )

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.acting.seats import check_policy
+from mqe_jax.core import keys
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import fail, leaves, override, to_mapping
@@ -128,7 +129,8 @@ def first_state(
         held = f"{updates} updates of {config.steps_per_update} environment steps"
         raise InputError(f"{checkpoint}: holds {held}; its name says {steps} steps")
     if not whole:
-        fresh = init(jax.random.fold_in(tree["key"], tree["updates"]))
+        key = jax.random.fold_in(tree["key"], keys.RESUMED)
+        fresh = init(jax.random.fold_in(key, tree["updates"]))
         state = jax.tree.map(jnp.asarray, dataclasses.replace(fresh, **tree))
         return (state if league is None else league.seat(state)), float(seconds)
     tree = processes.part(tree)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import walk_policy
+from mqe_jax.core import keys
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.randomization import Randomization
@@ -42,7 +43,6 @@ GRAVITY = 9.81  # m/s^2
 DT = walk_policy.STEP
 SHOVED = np.array([0.25, 0.08, 0.06])  # half-lengths of the box of the trunk to shove, m
 _UP = np.array([0.0, 0.0, 1.0], np.float32)
-_NOISE = 7919  # folded into a state's key for the noise of its observations
 
 
 class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
@@ -130,7 +130,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         angle = jax.random.uniform(direction_key, (), maxval=2 * jnp.pi)
         push = jnp.where(pushed, size, 0.0) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         data = state.data.replace(qvel=state.data.qvel.at[self.index.base_qvel[0, :2]].add(push))
-        shove, shove_steps = self._shove(state, jax.random.fold_in(time_key, 1))
+        shove, shove_steps = self._shove(state, jax.random.fold_in(time_key, keys.SECOND))
         newest = jnp.clip(action, -self.action_limit, self.action_limit)
         walk = dataclasses.replace(
             walk,
@@ -254,8 +254,8 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
     def observe(self, state: State[WalkState], robot_state: RobotState) -> dict[str, jax.Array]:
         sensed = self._sense(state, robot_state)
         if self.task.randomize:
-            keys = jax.random.split(jax.random.fold_in(state.key, _NOISE), 3)
-            parts = zip(sensed, (0.02, 0.005, 0.5), keys, strict=True)
+            noise_keys = jax.random.split(jax.random.fold_in(state.key, keys.NOISE), 3)
+            parts = zip(sensed, (0.02, 0.005, 0.5), noise_keys, strict=True)
             noisy = [x + size * jax.random.normal(key, x.shape) for x, size, key in parts]
             sensed = Proprioception(*noisy)
         return {"skill": self._skill_observation(state.task, sensed)[None]}
