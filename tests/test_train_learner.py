@@ -22,6 +22,7 @@ from mqe_jax.train import checkpoint as checkpoints
 from mqe_jax.train import logs
 from mqe_jax.train.checkpoint import latest, read_file, save_checkpoint, save_tree
 from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.folder import write_config
 from mqe_jax.train.learner import TrainState, make_learner
 from mqe_jax.train.networks import Network
 from mqe_jax.train.stages import Stages
@@ -269,6 +270,7 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WANDB_MODE", raising=False)
     first = tmp_path / "run"
     first.mkdir()
+    write_config(first, TrainConfig(rollout_steps=7))
     write(logs.LOGGERS["wandb"](first, 0))
     run_id = (first / "wandb" / "run_id").read_text()
     (file,) = first.glob("wandb/offline-run-*/*.wandb")
@@ -276,7 +278,7 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wandb.teardown()  # the end of the program; before it the file may lack rows
     content = file.read_bytes()
     assert all(word in content for word in (b"average_step_reward", b"0.25", b"success", b"0.75"))
-    assert b"NaN" not in content
+    assert b"NaN" not in content and b"rollout_steps" in content
     write(logs.LOGGERS["wandb"](first, 200), [{"env_steps": 300, "average_step_reward": 1.0}])
     assert (first / "wandb" / "run_id").read_text() == run_id
 

@@ -35,6 +35,9 @@ from mqe_jax.core.settings import (
 from mqe_jax.train.algorithms import PPOStages, StagesSettings, stages_settings
 from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_settings
 
+CONFIG_FILE = "config.yaml"
+"""Name of the settings in a run folder."""
+
 _OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
 
 

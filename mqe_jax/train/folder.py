@@ -19,12 +19,11 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_folder, lock, write_atomically
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.train.checkpoint import checkpoint_step, latest, list_checkpoints
-from mqe_jax.train.config import TrainConfig, load_config
+from mqe_jax.train.config import CONFIG_FILE, TrainConfig, load_config
 from mqe_jax.train.logs import CSV_FILE
 from mqe_jax.train.monitor import EVALUATIONS_FILE
 from mqe_jax.train.policy import POLICY_FILE
 
-CONFIG_FILE = "config.yaml"
 RUN_FILES = (CONFIG_FILE, CSV_FILE, POLICY_FILE, EVALUATIONS_FILE)
 """Names of a run's files beside its checkpoints."""
 

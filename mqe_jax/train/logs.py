@@ -25,7 +25,8 @@ from rich.text import Text
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import append, make_folder, parsing, read_rows, write_atomically
-from mqe_jax.train.config import TrainConfig
+from mqe_jax.core.settings import load_yaml
+from mqe_jax.train.config import CONFIG_FILE, TrainConfig
 
 CSV_FILE = "metrics.csv"
 _PLAIN_SECONDS = 10.0
@@ -160,9 +161,9 @@ class TensorBoardLog(MetricsLog):
 class WandbLog(MetricsLog):
     """A Weights & Biases run, logged offline to `run_dir/wandb` unless WANDB_MODE=online is set.
 
-    `wandb sync` uploads it later. A resumed training run keeps its run id. wandb's own process
-    writes the file, and finishes it when the program ends. `wandb.teardown()` finishes it at once,
-    but ends all runs of the program.
+    It has the settings of the run folder. `wandb sync` uploads it later. A resumed training run
+    keeps its run id. wandb's own process writes the file, and finishes it when the program ends.
+    `wandb.teardown()` finishes it at once, but ends all runs of the program.
     """
 
     def __init__(self, run_dir: Path, env_steps: int) -> None:
@@ -177,6 +178,8 @@ class WandbLog(MetricsLog):
             name=run_dir.name,
             id=id_file.read_text(encoding="utf-8"),
             dir=str(run_dir),
+            config=load_yaml(run_dir / CONFIG_FILE),
+            allow_val_change=True,  # by a run that resumes
             mode=os.environ.get("WANDB_MODE", "offline"),
             resume="allow",
             reinit="create_new",  # several seeds in one program are separate runs
