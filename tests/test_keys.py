@@ -120,7 +120,7 @@ def sheep() -> Any:
 
 
 def flocks() -> Any:
-    sizes = {"num_agents": 3, "fewest_agents": 1, "num_sheep": 3, "fewest_sheep": 1}
+    sizes: Any = {"num_agents": 3, "fewest_agents": 1, "num_sheep": 3, "fewest_sheep": 1}
     return VectorEnv(make("go1sheep-hard", **EVERYTHING, **sizes, growing=True), 2)
 
 

@@ -17,7 +17,7 @@ import pytest
 
 from mqe_jax.core.settings import build, to_mapping
 from mqe_jax.core.types import Cast, Outcome
-from mqe_jax.envs import TASKS, Randomization
+from mqe_jax.envs import TASKS, Randomization, make
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.reward import crowding
 from mqe_jax.envs.state import EnvironmentState
@@ -279,19 +279,22 @@ def test_one_program_serves_all_policies_of_a_tournament() -> None:
 
 AT = {
     ("go1gate", "gate_width"): (3.0, 2.9),
-    ("go1gate", "min_height"): (1.5, 1.4),
+    ("go1gate", "spawn_height"): (0.299, 0.3),
+    ("go1gate", "min_height"): (0.42, 0.41),
+    ("go1gate", "max_height"): (0.42, 0.43),
     ("go1pushbox", "gate_width"): (5.0, 4.9),
     ("go1sheep-easy", "gate_width"): (4.0, 3.9),
     ("go1football-1vs1", "goal_width"): (9.0, 8.9),
     ("go1revolvingdoor", "gap"): (1.95, 1.96),
     ("go1revolvingdoor", "door"): ({"position": (0.5, 0.0)}, {"position": (0.51, 0.0)}),
-    ("go1bridge", "platform_x"): ((3.0, 4.3), (3.0, 4.31)),
     ("go1tug", "cylinder"): ({"x": 0.1}, {"x": 0.11}),
     ("go1seesaw", "plank_start"): (0.255, 0.254),
     ("go1wrestling", "spawn_height"): (0.699, 0.7),
     ("go1wrestling", "head_start"): (0.601, 0.6),
     ("go1pushbox", "head_start"): (0.951, 0.95),
     ("go1bridge", "spawn_height"): (1.319, 1.32),
+    ("go1wrestling", "spawn_noise"): (0.701, 0.69),
+    ("go1bridge", "spawn_noise"): (0.501, 0.499),
 }
 """Parameters: values that are just refused, and just accepted."""
 
@@ -305,7 +308,27 @@ def test_a_bound_itself_is_refused_or_accepted_as_documented(task: str, name: st
     build(kind, {name: accepted})
 
 
+@pytest.mark.parametrize(
+    ("task", "name", "room"),
+    [
+        ("go1gate", "spawn_noise", 0.75),
+        ("go1tug", "spawn_x", 1.5),
+        ("go1pushbox", "box_noise", 2.5),
+        ("go1football-1vs1", "ball_noise", 4.5),
+        ("go1sheep-easy", "flock_noise", 2.0),
+    ],
+)
+def test_nothing_starts_outside_of_the_walls(task: str, name: str, room: float) -> None:
+    options: Any = {"impl": "c", "num_envs": 1, name: room}
+    make(task, **options)
+    refuses(f"{name}: .* at most {room:.2f}", make, task, **{**options, name: room + 0.01})
+
+
 def test_bounds_of_tracks_payloads_and_settings() -> None:
+    apart: Any = {"spawn_x": (3.0, 4.31), "platform_x": (3.0, 4.31)}
+    bridge = TASKS["go1bridge"].Params
+    refuses("platform_x", build, bridge, {**apart, "platform_x": (3.0, 4.3)})
+    build(bridge, apart)
     for width in (3.0, 0.0):
         refuses("gate: width", Track((Gate(width=width),)).layout)
     plane = made("go1plane")
@@ -314,6 +337,18 @@ def test_bounds_of_tracks_payloads_and_settings() -> None:
     def random(low):
         return Randomizer(Randomization(payload=(low, 1.0)), plane.compiled.model, plane.index, 1.0)
 
+    for name, value, accepted in (
+        ("friction", (0.0, 1.0), (0.01, 100.0)),
+        ("payload", (0.0, 101.0), (-1.0, 100.0)),
+        ("center_of_mass", (-1.1, 0.0), (-1.0, 1.0)),
+        ("motor_strength", (1.0, 101.0), (0.1, 100.0)),
+        ("joint_mechanics", (0.0, 1.0), (0.1, 1.0)),
+        ("motor_offset", 3.2, 3.1),
+        ("push", 101.0, 100.0),
+        ("observation_noise", 1001.0, 1000.0),
+    ):
+        refuses(name, build, Randomization, {name: value})
+        build(Randomization, {name: accepted})
     refuses("payload", random, -mass)
     random(-mass + 1e-3)
     base: dict[str, Any] = {

@@ -360,13 +360,18 @@ def test_senses_are_settings() -> None:
             [{"name": "lidar", "pipeline": {"lida": {}}}],
             r"senses.lidar.pipeline: 'lida' .*one of all, lidar",
         ),
+        (
+            "go1gate",
+            [{"name": "lidar", "pipeline": {"all": {"nose": 0.1}}}],
+            r"senses\.lidar\.pipeline\.all\.nose: unknown name .*did you mean 'noise'",
+        ),
         ("go1tug", ["messages"], r"senses: 'messages' .*no robot has teammates"),
         ("go1gate", [{"name": "messages", "numbers": 0}], r"senses.*numbers: 0 .*greater than 0"),
         ("go1gate", ["depth"], r"senses: 'depth' needs impl warp; the engine here is c"),
     ],
 )
 def test_bad_senses_are_named(task: str, senses: Any, message: str) -> None:
-    refuses(message, lambda: make(task, impl="c", senses=senses).layouts)
+    refuses(message, make, task, impl="c", senses=senses)
 
 
 @settings_class
@@ -410,6 +415,7 @@ def test_mistakes_of_a_sensor_are_named(mistake: str, message: str) -> None:
         return suite.observe(env.snapshot(state, env.read(state.data)), suite.reset(), state.key)
 
     with pytest.raises(ValueError, match=message):
+        suite.check()
         jax.eval_shape(read, initial(env))
 
 

@@ -39,11 +39,15 @@ from mqe_jax.core.errors import InputError, brief, nearest, short_repr
 from mqe_jax.core.files import read_yaml
 from mqe_jax.core.limits import (  # noqa: F401  (for modules that declare settings)
     Coordinate,
+    Factor,
     Fraction,
     NonNegative,
     NonNegativeInt,
     Number,
+    Offset,
+    Payload,
     Positive,
+    PositiveFriction,
     PositiveInt,
     Seed,
 )
@@ -85,6 +89,12 @@ def _check_order(value: tuple[float, float]) -> tuple[float, float]:
 
 
 Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
+Frictions = Annotated[
+    tuple[PositiveFriction, PositiveFriction], pydantic.AfterValidator(_check_order)
+]
+Payloads = Annotated[tuple[Payload, Payload], pydantic.AfterValidator(_check_order)]
+Offsets = Annotated[tuple[Offset, Offset], pydantic.AfterValidator(_check_order)]
+Factors = Annotated[tuple[Factor, Factor], pydantic.AfterValidator(_check_order)]
 Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_check_order)]
 
 
@@ -498,7 +508,7 @@ def _one_line(kind: Any, error: pydantic.ValidationError) -> InputError:
     if first["type"] == "unexpected_keyword_argument":
         inner = _names_within(kind)
         for part in places[:-1]:
-            kind = _settings_in(hints_of(kind)[part])
+            kind = _settings_in(hints_of(kind).get(part)) or kind  # keys of a mapping are no fields
         known = list(hints_of(kind))
         hint = f"{nearest(places[-1], [*known, *inner])}; allowed: {', '.join(known)}"
         return InputError(f"{'.'.join(places)}: unknown name (value {short_repr(value)}){hint}")

@@ -104,6 +104,11 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         self.compiled = compile_scene(scene)
         self.index = self.compiled.index
         self.objects = self.compiled.objects
+        for name, (places, noise) in self.spreads.items():
+            room = self.compiled.layout.room(places)
+            if noise > room:
+                allowed = f"at most {room:.2f}, the distance to the nearest outer wall"
+                fail(name, getattr(self.params, name), allowed)
         constraints = self.params.constraints_per_robot * scene.num_robots
         constraints += 4 * self.extra_contacts
         self.physics = engines.make(
@@ -116,7 +121,6 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             sparse_solver=self.params.sparse_solver,
         )
         self.impl = self.physics.impl
-        self.check_senses()
         self.dt = float(self.compiled.model.opt.timestep) * self.physics.num_substeps
         if self.max_steps < 1:
             fail(
@@ -134,6 +138,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         reads["skill_weights"] = self.controller.skill_params is not None
         files = {name: getattr(self.params, name) for name, read in reads.items() if read}
         self.digests = {name: digest(file) for name, file in files.items() if file}
+        self.check_senses()
         self.sizes = Sizes(self)
         self.randomizer = Randomizer(
             self.params.randomization, self.compiled.model, self.index, self.params.friction

@@ -9,7 +9,7 @@ import numpy as np
 from mqe_jax.core.limits import Coordinate, Length, TimeLimit
 from mqe_jax.core.settings import Coordinates, fail, settings_class
 from mqe_jax.envs.match import Duel
-from mqe_jax.envs.params import TaskParams, check_above
+from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.objects import Platform
@@ -56,7 +56,6 @@ class BridgeParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.top, self.robot)
         first, second = self.platform_x
         if second - first <= self.platform[0]:
             fail(
@@ -64,6 +63,15 @@ class BridgeParams(TaskParams):
                 self.platform_x,
                 f"more than a platform's length, {self.platform[0]}, apart",
             )
+        away = np.abs(np.subtract(self.spawn_x, self.platform_x)).max()
+        room = min(self.platform[0] / 2 - away, self.platform[1] / 2)
+        if self.spawn_noise > room:
+            allowed = f"at most {room:.2f}, the distance to the platform's edge"
+            fail("spawn_noise", self.spawn_noise, allowed)
+
+    @property
+    def ground(self) -> float:
+        return self.top
 
 
 class Go1Bridge(Duel[None, BridgeParams]):

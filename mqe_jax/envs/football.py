@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -142,6 +142,11 @@ class Football(QuadrupedEnv[S, F]):
                 .add(forward)
             )
         return qpos, qvel
+
+    @property
+    def spreads(self) -> dict[str, tuple[Any, float]]:
+        params = self.params
+        return {**super().spreads, "ball_noise": ([self.ball_spot], params.ball_noise)}
 
     def sample_spot(self, key: jax.Array) -> jax.Array:
         """Returns the point (2,), m, about which the ball's initial position is sampled."""

@@ -13,12 +13,13 @@ from mqe_jax.core.limits import (
     Fraction,
     Iterations,
     Length,
-    NonNegative,
     Positive,
     PositiveFriction,
     Robots,
+    Tilt,
     Time,
     TimeLimit,
+    Velocity,
     bounds,
 )
 from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, settings_class
@@ -58,11 +59,11 @@ class TaskParams:
     """Half-width of the uniform noise on the spawn position in x and y, m."""
     spawn_joint_scale: Range = (0.7, 1.3)
     """Range of the factor on the default joint angles at reset."""
-    spawn_velocity: NonNegative = 0.5
+    spawn_velocity: Velocity = 0.5
     """Half-width of the uniform noise on all six base velocities, m/s and rad/s."""
-    max_roll: Positive = 0.8
+    max_roll: Tilt = 0.8
     """Maximum |roll|, rad; above it the episode terminates."""
-    max_pitch: Positive = 1.6
+    max_pitch: Tilt = 1.6
     """Maximum |pitch|, rad; above it the episode terminates. Pitch is an arcsine, so it never
     reaches the released system's limit, which is above pi / 2. A robot that pitches over has a roll
     of pi."""
@@ -133,8 +134,19 @@ class TaskParams:
         commander = self.commander
         commander.skill.check_commands(commander.commands)
         commander.skill.changes(self.commands, self.command_ranges, commander.default_commands)
-        if self.min_height >= self.max_height:
-            fail("min_height", self.min_height, f"less than max_height, {self.max_height}")
+        least = self.ground + robots.get(self.robot).stand_height
+        if self.spawn_height < least:
+            allowed = f"at least {least:.2f}, because the supporting surface is at {self.ground}"
+            fail("spawn_height", self.spawn_height, allowed)
+        if self.min_height >= self.spawn_height:
+            fail("min_height", self.min_height, f"less than spawn_height, {self.spawn_height}")
+        if self.max_height <= self.spawn_height:
+            fail("max_height", self.max_height, f"greater than spawn_height, {self.spawn_height}")
+
+    @property
+    def ground(self) -> float:
+        """Height of the surface on which robots start, m."""
+        return 0.0
 
     @property
     def commander(self) -> Commander:
@@ -172,20 +184,6 @@ class TaskParams:
 
 P = TypeVar("P", bound=TaskParams)
 """Parameters of a task."""
-
-
-def check_above(spawn_height: float, top: float, robot: str) -> None:
-    """Raises an InputError unless the spawn height of a standing robot is above a surface.
-
-    `top` is the height of that surface, m.
-    """
-    least = top + robots.get(robot).stand_height
-    if spawn_height < least:
-        fail(
-            "spawn_height",
-            spawn_height,
-            f"at least {least:.2f}, because the supporting surface is at {top}",
-        )
 
 
 def check_teams(num_agents: int, most: int, room: str) -> None:

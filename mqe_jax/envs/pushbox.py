@@ -4,6 +4,7 @@ By default there are two robots. The box is too heavy for one.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -171,6 +172,11 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
             forward = np.append(self.index.base_qpos[:, 0], self.objects["box"].qpos[0])
             qpos = qpos.at[forward].add(start)
         return qpos, qvel
+
+    @property
+    def spreads(self) -> dict[str, tuple[Any, float]]:
+        params = self.params
+        return {**super().spreads, "box_noise": ([(params.box_x, 0.0)], params.box_noise)}
 
     def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> PushBoxState:
         return PushBoxState(self.object_pose(state.data, "box")[0])

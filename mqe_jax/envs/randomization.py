@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mqe_jax.core.limits import Lag, NonNegative, TimeLimit
-from mqe_jax.core.settings import Range, fail, settings_class
+from mqe_jax.core.limits import Angle, Deviation, Lag, TimeLimit, Velocity
+from mqe_jax.core.settings import Factors, Frictions, Offsets, Payloads, Range, fail, settings_class
 from mqe_jax.physics.robots.index import RobotIndex
 
 if TYPE_CHECKING:
@@ -28,33 +28,27 @@ class Randomization:
         ```
     """
 
-    friction: Range | None = None
+    friction: Frictions | None = None
     """Sliding friction of the robots' collision geoms (lowest, highest)."""
-    payload: Range | None = None
+    payload: Payloads | None = None
     """Additional mass of the trunk, kg; its inertia is scaled by the same factor as its mass."""
-    center_of_mass: Range | None = None
+    center_of_mass: Offsets | None = None
     """Shift of the trunk's centre of mass along each axis, m."""
-    motor_strength: Range | None = None
+    motor_strength: Factors | None = None
     """Factor on all torques."""
-    motor_offset: NonNegative = 0.0
+    motor_offset: Angle = 0.0
     """Maximum offset of each joint target, rad."""
-    joint_mechanics: Range | None = None
+    joint_mechanics: Factors | None = None
     """Factor on rotor inertia, damping and dry friction of the joints; needs the task parameter
     `joint_mechanics`."""
     action_lag: Lag = 0
     """Maximum delay of the actuator targets, environment steps; one sample per environment."""
-    push: NonNegative = 0.0
+    push: Velocity = 0.0
     """Maximum sudden change of a trunk's horizontal velocity, m/s."""
     push_period: TimeLimit = 5.0
     """Mean time between pushes, s."""
-    observation_noise: NonNegative = 0.0
+    observation_noise: Deviation = 0.0
     """Standard deviation of the noise on observations, except on one-hot blocks."""
-
-    def __post_init__(self) -> None:
-        for name in ("friction", "motor_strength", "joint_mechanics"):
-            span = getattr(self, name)
-            if span is not None and span[0] <= 0:
-                fail(name, span, "two numbers greater than 0 (lowest, highest), or none")
 
 
 @jax.tree_util.register_dataclass

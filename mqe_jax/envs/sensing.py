@@ -45,13 +45,15 @@ class Sensing:
         return action[..., : self.controller.action_size]
 
     def check_senses(self) -> None:
-        """Raises an InputError for a sensor that the engine lacks."""
+        """Raises an InputError for a sensor that the engine lacks, or as `Suite.check`."""
         for sensor in self.params.senses:
             if sensor.engines and self.impl not in sensor.engines:
                 allowed = " or ".join(sensor.engines)
                 raise InputError(
                     f"senses: {sensor.name!r} needs impl {allowed}; the engine here is {self.impl}"
                 )
+        if self.params.senses:
+            self.suite.check()
 
     @property
     def entities(self) -> tuple[Entity, ...]:

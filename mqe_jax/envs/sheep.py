@@ -6,7 +6,7 @@ By default there are two robots.
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,8 @@ from mqe_jax.core.limits import (
     FlockSize,
     Friction,
     Length,
-    NonNegative,
     TimeLimit,
+    Velocity,
 )
 from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.base import QuadrupedEnv
@@ -107,7 +107,7 @@ class SheepEasyParams(TaskParams):
     no room."""
     flock_noise: Distance = 0.3
     """Half-width of the uniform noise on each sheep's position, m."""
-    restlessness: NonNegative = 0.08
+    restlessness: Velocity = 0.08
     """Scale of the sheep's random motion (s in `mqe_jax.npc.flock`). It is 0 for the single sheep
     of the released system; in the paper sheep always move."""
     sheep_friction: Friction = 1.0
@@ -184,7 +184,7 @@ class SheepHardParams(SheepEasyParams):
     gate_random: tuple[Distance, Distance] = (0.0, 1.0)
     flock: tuple[Few, Few] = (3, 3)
     flock_center: tuple[Coordinate, Coordinate] = (5.0, 0.0)
-    restlessness: NonNegative = 0.1
+    restlessness: Velocity = 0.1
     contacts_per_robot: Buffer = 20  # sheep touch each other
     constraints_per_robot: Buffer = 96
     rewards: SheepRewards = SheepRewards(progress=0.0, nearness=1.0)
@@ -268,6 +268,11 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
             )
         noise = jax.random.uniform(key, start.shape, minval=-spread, maxval=spread)
         return qpos.at[self._sheep("qpos")].set(start + noise), qvel
+
+    @property
+    def spreads(self) -> dict[str, tuple[Any, float]]:
+        params = self.params
+        return {**super().spreads, "flock_noise": params.flock_grid()}
 
     @functools.cached_property
     def herd(self) -> Herd:

@@ -110,6 +110,14 @@ class Task(Sensing, Generic[S, P]):
         """
         return self.compiled.layout.spawn
 
+    @property
+    def spreads(self) -> dict[str, tuple[Any, float]]:
+        """What starts at random places, by the parameter of their noise.
+
+        Each has places x, y, ... (P, ...), m, and the half-width of the noise about them, m.
+        """
+        return {"spawn_noise": (self.spawn_poses(), self.params.spawn_noise)}
+
     def spawn(self, key: jax.Array) -> jax.Array:
         """Samples spawn poses x, y, z, yaw of all robots (R, 4), m and rad."""
         params = self.params

@@ -5,7 +5,7 @@ The cylinder slides along one axis.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -121,6 +121,11 @@ class Go1Tug(Duel[TugState, TugParams]):
         params = self.params
         shift = jax.random.uniform(key, (2,), minval=-params.spawn_x, maxval=params.spawn_x)
         return super().spawn(jax.random.fold_in(key, keys.SECOND)).at[:, 0].add(shift)
+
+    @property
+    def spreads(self) -> dict[str, tuple[Any, float]]:
+        params = self.params
+        return {**super().spreads, "spawn_x": ([self.center], params.spawn_x + params.spawn_noise)}
 
     def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> TugState:
         return TugState(self.cylinder_y(state.data))

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.limits import Distance, Length, Positive, TimeLimit
+from mqe_jax.core.limits import Distance, Length, Tilt, TimeLimit
 from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import ObservationLayout, by_entity, others
-from mqe_jax.envs.params import TaskParams, check_above, check_teams
+from mqe_jax.envs.params import TaskParams, check_teams
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds, team_colors
 from mqe_jax.physics.objects import Platform, Ring
@@ -48,7 +48,7 @@ class WrestlingParams(TaskParams):
 
     episode_length: TimeLimit = 15.0
     spawn_height: Length = 0.74
-    max_roll: Positive = 0.4 * np.pi
+    max_roll: Tilt = 0.4 * np.pi
     platform: Platform = Platform(center=(3.1, 0.0, 0.4), size=(4.37, 4.37, 0.5))
     """The platform, with the ring in its centre; its lower part is below the ground. Robots dropped
     from the spawn height land on their feet."""
@@ -67,18 +67,24 @@ class WrestlingParams(TaskParams):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above(self.spawn_height, self.platform.center[2], self.robot)
         ring = min(self.ring_radius, min(self.platform.size[:2]) / 2) - _MARGIN
         most = 1 + int(_ARC / (2 * np.arcsin(_APART / 2 / max(ring, _APART / 2))))
         room = f"ring_radius {self.ring_radius:g} and platform.size {self.platform.size}"
         check_teams(self.num_agents, most, room)
-        room = self.ring_radius - self.arc[0] - self.spawn_noise
-        if self.head_start > max(room, 0.0):
+        room = self.ring_radius - self.arc[0]
+        if self.spawn_noise > max(room, 0.0):
+            fail("spawn_noise", self.spawn_noise, f"at most {room:.2f}, as far as the ring's edge")
+        room -= self.spawn_noise
+        if self.head_start > room:
             fail(
                 "head_start",
                 self.head_start,
                 f"at most {room:.2f}, the distance of the robots from the ring's edge",
             )
+
+    @property
+    def ground(self) -> float:
+        return self.platform.center[2]
 
     @property
     def arc(self) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Walls and ground of a scene, as a terrain lays them out."""
 
 import dataclasses
-from typing import Protocol
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -79,6 +79,12 @@ class Layout:
     anchors: tuple[Anchor, ...] = ()
     spawn: tuple[tuple[float, float, float], ...] = ()
     """Spawn poses (x, y, yaw) of the robots, m and rad."""
+
+    def room(self, places: Any) -> float:
+        """Returns how far inside of all barriers places x, y, ... (P, ...) are, m."""
+        inside = np.array([place[:2] for place in places], float).reshape(-1, 2)
+        away = [(inside - barrier.point) @ barrier.normal for barrier in self.barriers]
+        return float(np.min(away, initial=np.inf))
 
 
 class Terrain(Protocol):

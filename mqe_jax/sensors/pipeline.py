@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.blocks import Block
-from mqe_jax.core.limits import Few, Fraction, Lag, NonNegative, Positive
+from mqe_jax.core.limits import Deviation, Few, Fraction, Lag, Positive
 from mqe_jax.core.settings import Range, settings_class
 
 
@@ -20,7 +20,7 @@ class Pipeline:
     Masks are delayed and dropped only.
     """
 
-    noise: NonNegative = 0.0
+    noise: Deviation = 0.0
     """Standard deviation of normal noise, in the block's unit."""
     clip: Range | None = None
     """Lowest and highest value, in the block's unit."""

@@ -115,17 +115,18 @@ class Suite:
     @functools.cached_property
     def _measured(self) -> list[tuple[Sensor, Block]]:
         """The blocks that the sensors measure, before their pipelines."""
-        found = [(sensor, sensor.layout(self.scene)) for sensor in self.sensors]
-        for sensor, blocks in found:
-            names = ["all", *(block.name for block in blocks)]
+        return [(sensor, block) for sensor in self.sensors for block in sensor.layout(self.scene)]
+
+    def check(self) -> None:
+        """Raises an InputError for a pipeline of an unknown block, or two blocks of one name."""
+        for sensor in self.sensors:
+            names = ["all", *(block.name for owner, block in self._measured if owner is sensor)]
             unknown = [name for name in sensor.pipeline if name not in names]
             if unknown:
                 fail(f"senses.{sensor.name}.pipeline", unknown[0], f"one of {', '.join(names)}")
-        measured = [(sensor, block) for sensor, blocks in found for block in blocks]
-        names = [block.name for _, block in measured]
+        names = [block.name for _, block in self._measured]
         if len({*names}) < len(names):
             fail("senses", names, "sensors whose blocks have different names")
-        return measured
 
     def reset(self) -> SensorState:
         """Returns the state at the start of an episode."""

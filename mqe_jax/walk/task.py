@@ -11,12 +11,13 @@ from mqe_jax.core.limits import (
     Buffer,
     Distance,
     Few,
+    Force,
     Fraction,
     Iterations,
-    NonNegative,
     Positive,
     Time,
     TimeLimit,
+    Velocity,
 )
 from mqe_jax.core.settings import Range, settings_class
 from mqe_jax.envs.params import TaskParams
@@ -52,13 +53,13 @@ class WalkTask:
     """Maximum slope, rad."""
     slope_share: Fraction = 0.5
     """Fraction of the episodes' specs that have a slope."""
-    force: NonNegative = 40.0
+    force: Force = 40.0
     """Maximum sustained horizontal force on the trunk, N."""
-    push: NonNegative = 0.9
+    push: Velocity = 0.9
     """Maximum instantaneous change of the trunk's velocity, m/s."""
     push_period: TimeLimit = 4.0
     """Mean time between pushes, s."""
-    shove: NonNegative = 0.0
+    shove: Force = 0.0
     """Maximum force of a shove at a random point of the trunk, as by a robot or a box, N."""
     shove_length: Range = (0.2, 1.0)
     """Duration of a shove, s."""
