@@ -17,12 +17,14 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from mqe_jax import names
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.cli import programs
 from mqe_jax.core import files
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import override, to_mapping
 from mqe_jax.core.types import Cast
+from mqe_jax.runs.cast import environments
 from mqe_jax.train import runner
 from mqe_jax.train.checkpoint import checkpoint_step, list_checkpoints
 from mqe_jax.train.config import TrainConfig
@@ -88,6 +90,9 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(
     with monkeypatch.context() as patch:
         patch.setattr(type(PROBE), "digests", {"skill_weights": "other"}, raising=False)
         refuses("skill_weights: has changed", train, PROBE, settings(), run_dir, resume=True)
+    taught = Cast(PROBE, digests=(("imitation.teacher own", "other"),))
+    said = "imitation.teacher own: has changed since the run"
+    refuses(said, train_seeds, taught, [settings()], [run_dir], resume=True)
     refuses("already holds a run", train, PROBE, settings(), run_dir)
     said = rf"ppo.gamma: 0\.5 differs from the run.*its settings are in {run_dir}/config\.yaml"
     refuses(said, train, PROBE, settings(ppo__gamma=0.5), run_dir, resume=True)
@@ -95,6 +100,25 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(
         r"total_steps: 16 .* at least", train, PROBE, settings(total_steps=16), run_dir, resume=True
     )
     assert load_run_config(run_dir) == settings()
+
+
+def test_a_training_knows_the_contents_of_the_policies_that_play_in_it(tmp_path: Path) -> None:
+    shipped: Any = names.find("go1gate")
+    file = str(tmp_path / "own.safetensors")
+    config = settings(
+        task="go1gate",
+        imitation__teacher=file,
+        curriculum__demonstrator=file,
+        curriculum__assistance=0.5,
+    )
+    found = []
+    for factor in (1, 1, 0):
+        params = jax.tree.map(lambda x, factor=factor: factor * x, shipped.params)
+        Path(file).unlink(missing_ok=True)
+        save_policy(tmp_path, dataclasses.replace(shipped, params=params), "own.safetensors")
+        found.append(dict(environments(config, impl="c").digests))
+    assert found[0] == found[1] != found[2]
+    assert [*found[0]] == [f"imitation.teacher {file}", f"curriculum.demonstrator {file}"]
 
 
 def test_a_longer_run_brings_back_nothing_that_has_ended(tmp_path: Path) -> None:

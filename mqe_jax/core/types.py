@@ -313,6 +313,8 @@ class Cast(NamedTuple):
     """Gives the environments their opponents between updates."""
     teacher: Any = None
     """The policy that imitation imitates."""
+    digests: tuple[tuple[str, str], ...] = ()
+    """Setting and name, and SHA-256, of each policy that was trained and plays here."""
     start: Any = None
     """The trained policy from which the training starts."""
 

@@ -145,6 +145,12 @@ def environments(
     trained = names.environment(task, config.training_env, impl=impl, num_envs=num_envs * seeds)
     start = names.find(config.start, trained.name, field="start", read=read)
     policies = names.seats(roles, trained, read)
+    digests = []
+    for role, sources in roles.items():
+        for name in sources:
+            policy = names.find(name, trained.name, field=role, read=read)
+            if isinstance(policy, TrainedPolicy):
+                digests.append((f"{role} {name}", policy.actor.digest))
     _check_teams(trained, config)
     teacher = policies.get(config.imitation.teacher or "")
     demonstrator = policies.get(config.curriculum.demonstrator or "")
@@ -166,7 +172,7 @@ def environments(
         env = league.env
     evaluated = _evaluated(trained, task, config, seeds, impl)
     eval_env = _evaluations(evaluated, config, seeds, groups, read)
-    return Cast(env, eval_env, league, teacher, start)
+    return Cast(env, eval_env, league, teacher, tuple(digests), start)
 
 
 def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated, Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from annotated_types import Ge
 
 from mqe_jax.core.errors import InputError, NonFiniteError
@@ -74,6 +76,14 @@ class Actor:
     def __repr__(self) -> str:
         mode = "mean" if self.form.deterministic else "sampled"
         return f"<Actor of {self.form.needs.task}: {self.form.network.name}, {mode} actions>"
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of its arrays."""
+        content = hashlib.sha256()
+        for array in jax.tree.leaves(self):
+            content.update(np.asarray(array).tobytes())
+        return content.hexdigest()
 
     @property
     def groups(self) -> tuple[str, ...]:

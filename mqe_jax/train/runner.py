@@ -118,6 +118,7 @@ class Training:
         progress: ProgressLog,
     ) -> None:
         self._env = cast.env
+        self._digests = digests_of(cast)
         self._configs = configs
         self._folders = folders
         self._config = configs[0]
@@ -253,7 +254,7 @@ class Training:
         kept = max(self._config.checkpoint.kept, min(len(self._folders), 2))
         for state, config, folder in zip(self._own(), self._configs, self._folders, strict=True):
             metadata = {"task": self._env.name, "config": to_mapping(config), "seconds": seconds}
-            metadata |= {"generator": generator(), "digests": digests_of(self._env)}
+            metadata |= {"generator": generator(), "digests": self._digests}
             metadata["environments"] = config.checkpoint.environments
             if config.checkpoint.environments:
                 tree = self._processes.join(without_shared(state, self._seeds.shared))

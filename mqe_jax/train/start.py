@@ -101,16 +101,19 @@ def first_state(
         fail("jax_default_prng_impl", generator(), f"{theirs!r}, the generator of the run in {run}")
     before = metadata.get("config", {})
     seconds = metadata.get("seconds", 0.0)
+    found = digests_of(cast)
+    known = metadata.get("digests", found)
     if (
         not isinstance(before, dict)
+        or not isinstance(known, dict)
         or not isinstance(seconds, int | float)
         or not 0 <= seconds < math.inf
     ):
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
     check_same(run, without_retired(before), config)
-    if metadata.get("digests", digests_of(env)) != digests_of(env):
-        names = ", ".join(digests_of(env))
-        raise InputError(f"{names}: has changed since the run in {run} read it")
+    changed = [name for name in found if found[name] != known.get(name)]
+    if changed:
+        raise InputError(f"{', '.join(changed)}: has changed since the run in {run} read it")
     if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
         fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
     totals = {name: value for name, value in before.items() if name == "total_steps"}
@@ -206,6 +209,6 @@ def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> No
             )
 
 
-def digests_of(env: VectorEnv) -> dict[str, str]:
-    """Returns the SHA-256 of the weights files that a task or a batch of it has read, by name."""
-    return dict(getattr(getattr(env, "env", env), "digests", {}))
+def digests_of(cast: Cast) -> dict[str, str]:
+    """Returns the SHA-256 of the files of weights and policies that a training reads, by name."""
+    return {**getattr(getattr(cast.env, "env", cast.env), "digests", {}), **dict(cast.digests)}
