@@ -8,6 +8,9 @@ SECOND = 1
 """Into a key that is drawn from: another draw."""
 THIRD = 2
 """Likewise."""
+LEAGUE = 1
+"""Into the key of a training: the draws of the league. The first rollout has that key too, when the
+league has one member to draw."""
 SENSING = 7907
 """Into a state's key: the readings of its sensors."""
 NOISE = 7919

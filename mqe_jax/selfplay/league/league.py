@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.acting.seats import Policy
-from mqe_jax.core import devices
+from mqe_jax.core import devices, keys
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import FrozenMapping, fail
 from mqe_jax.core.types import RESULTS
@@ -111,7 +111,7 @@ class League:
             rating=jnp.zeros(()),
             snapshot=jnp.zeros((), jnp.int32),
             recent=jnp.zeros((blocks, 3)),
-            key=jax.random.fold_in(state.key, 1),
+            key=jax.random.fold_in(state.key, keys.LEAGUE),
         )
 
     def seat(self, state: TrainState) -> TrainState:
