@@ -36,7 +36,6 @@ from tests.states import ending, initial, made, placed, stepper
 Array = jax.Array
 
 gate = pytest.fixture(scope="module")(lambda: made("go1gate"))
-fresh = pytest.fixture(scope="module")(lambda gate: initial(gate))
 gate_step = pytest.fixture(scope="module")(lambda gate: stepper(gate.name))
 
 
@@ -70,10 +69,8 @@ def test_contract(task: str, robot: str, control: str, count: int, steps: int) -
     check_task(env, num_envs=count, steps=steps)
 
 
-def test_a_diverged_environment_ends_and_is_counted(
-    gate: QuadrupedEnv, fresh: State, gate_step: Any
-) -> None:
-    state = fresh
+def test_a_diverged_environment_ends_and_is_counted(gate: QuadrupedEnv, gate_step: Any) -> None:
+    state = initial(gate)
     broken = dataclasses.replace(
         state, data=state.data.replace(qvel=state.data.qvel.at[0].set(jnp.nan))
     )
@@ -134,12 +131,13 @@ def test_only_the_agents_trunks_count_as_collisions(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_new_episode_is_not_drawn_from_the_key_that_the_environment_keeps(
-    gate: QuadrupedEnv, fresh: State
+    gate: QuadrupedEnv,
 ) -> None:
-    ended = dataclasses.replace(fresh, truncated=jnp.array(True))
+    ended = dataclasses.replace(initial(gate), truncated=jnp.array(True))
     after = jax.jit(lambda state: autoreset(gate, state))(ended)
     assert (
-        int(after.step) == 0 and np.abs(np.asarray(after.data.qpos - fresh.data.qpos)).max() > 1e-3
+        int(after.step) == 0
+        and np.abs(np.asarray(after.data.qpos - initial(gate).data.qpos)).max() > 1e-3
     )
     for key in (after.key, ended.key):
         assert np.abs(np.asarray(jax.jit(gate.reset)(key).data.qpos - after.data.qpos)).max() > 1e-3
@@ -291,8 +289,8 @@ def test_a_physics_step_that_does_not_fit_the_walk_policy_is_refused() -> None:
     assert Fast(impl="c", control="position").dt == pytest.approx(0.016)
 
 
-def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
-    state = fresh
+def test_bad_actions_are_named(gate: QuadrupedEnv) -> None:
+    state = initial(gate)
     refuses(r"action: shape \(2, 3\); expected \(2, 12\)", gate.step, state, jnp.zeros((2, 3)))
     refuses(r"action: dtype int32", gate.step, state, jnp.zeros((2, 12), jnp.int32))
     refuses(r"action: contains NaN", gate.step, state, jnp.full((2, 12), jnp.nan))
@@ -306,10 +304,10 @@ def test_bad_actions_are_named(gate: QuadrupedEnv, fresh: State) -> None:
         )
 
 
-def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any) -> None:
+def test_actions_beyond_their_bounds_act_as_at_them(gate: QuadrupedEnv, gate_step: Any) -> None:
     action = jnp.tile(jnp.array([0.5, 3.0, -1e6]), (2, 4))
-    after = gate_step(fresh, action)
-    clipped = gate_step(fresh, jnp.clip(action, -1.0, 1.0))
+    after = gate_step(initial(gate), action)
+    clipped = gate_step(initial(gate), jnp.clip(action, -1.0, 1.0))
     jax.tree.map(
         np.testing.assert_array_equal,
         (after.data.ctrl, after.obs),
@@ -318,7 +316,8 @@ def test_actions_beyond_their_bounds_act_as_at_them(fresh: State, gate_step: Any
     assert (
         np.abs(
             np.asarray(
-                gate_step(fresh, 0.9 * jnp.clip(action, -1.0, 1.0)).data.ctrl - after.data.ctrl
+                gate_step(initial(gate), 0.9 * jnp.clip(action, -1.0, 1.0)).data.ctrl
+                - after.data.ctrl
             )
         ).max()
         > 0
@@ -351,25 +350,6 @@ def test_making_and_stepping_imports_no_foreign_library_and_no_other_task() -> N
     assert out.strip().splitlines()[-1] == "[]"
     assert set(mqe_jax.tasks()) == set(TASKS)
     assert type(make("go1bridgewrestling", impl="c", control="position")) is TASKS["go1wrestling"]
-
-
-def test_captured_constants_are_arguments_in_compiled_code(
-    gate: QuadrupedEnv, fresh: State
-) -> None:
-    action = jnp.zeros((2, 12))
-    assistance = jnp.float32(0.5)
-    after = jax.jit(
-        lambda state: jax.lax.scan(
-            lambda state, _: (gate.step(state, action), None), state, None, 2
-        )[0]
-    )
-    assert int(after(fresh).step) == 2
-    assert (
-        jax.eval_shape(
-            lambda key: gate.reset(key, assistance), jax.random.PRNGKey(0)
-        ).assistance.shape
-        == ()
-    )
 
 
 def test_a_layout_slices_packs_and_splits() -> None:
@@ -487,11 +467,11 @@ def test_a_mistake_in_a_task_names_the_method(mistake: str) -> None:
         )
 
 
-def test_bad_recordings_are_named(gate: QuadrupedEnv, fresh: State, tmp_path: Any) -> None:
+def test_bad_recordings_are_named(gate: QuadrupedEnv, tmp_path: Any) -> None:
     refuses(r"none.npz: cannot be read", replay.load_recording, tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("nothing")
     refuses(r"text.npz: damaged, or not a recording", replay.load_recording, tmp_path / "text.npz")
-    states = jax.tree.map(lambda x: jnp.stack([x, x]), fresh)
+    states = jax.tree.map(lambda x: jnp.stack([x, x]), initial(gate))
     states = dataclasses.replace(states, data=states.data.replace(qpos=states.data.qpos + 0.5))
     replay.save_recording(tmp_path / "gate.npz", gate, states, jnp.zeros((2, 2, 12)))
     recording = replay.load_recording(tmp_path / "gate.npz")

@@ -305,22 +305,8 @@ NO = jnp.array(False)
 FOOTBALL = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
 
 
-envs = pytest.fixture(scope="module")(lambda: {task: made(task) for task in FOOTBALL})
-
-
-@pytest.fixture(scope="module")
-def drawn(envs: dict[str, Any]) -> dict[str, State]:
-    keys = jax.random.split(jax.random.PRNGKey(0), 64)
-    return {task: jax.jit(jax.vmap(env.reset))(keys) for task, env in envs.items()}
-
-
-@pytest.fixture(scope="module")
-def fresh(drawn: dict[str, State]) -> dict[str, State]:
-    return jax.device_put(jax.tree.map(lambda x: x[0], jax.device_get(drawn)))
-
-
-duel = pytest.fixture(scope="module")(lambda envs: envs["go1football-1vs1"])
-attack = pytest.fixture(scope="module")(lambda envs: envs["go1football-defender"])
+duel = pytest.fixture(scope="module")(lambda: made("go1football-1vs1"))
+attack = pytest.fixture(scope="module")(lambda: made("go1football-defender"))
 
 
 def with_ball(
@@ -344,9 +330,9 @@ def standing(env: QuadrupedEnv, state: State, places: Any, roll: float = 0.0) ->
 
 
 @pytest.mark.parametrize("task", FOOTBALL)
-def test_everything_starts_as_listed(envs: dict[str, Any], drawn: Any, task: str) -> None:
-    env = envs[task]
-    states = drawn[task]
+def test_everything_starts_as_listed(task: str) -> None:
+    env = made(task)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 64))
     robots = jax.jit(jax.vmap(env.read))(states.data)
     listed = {
         "go1football-defender": ([(4, -2), (4, 2), (10, 0)], [0, 0, 1], (5, -2.1)),
@@ -409,9 +395,9 @@ def turned(places: Any) -> np.ndarray:
     return np.array([(14 - x, -y, yaw + np.pi) for x, y, yaw in places])
 
 
-def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> None:
-    env = envs["go1football-2vs2"]
-    state = with_ball(env, standing(env, fresh[env.name], PLACES), (6.3, 1.1), (0.8, -0.3, 0.1))
+def test_observations_are_what_is_listed() -> None:
+    env = made("go1football-2vs2")
+    state = with_ball(env, standing(env, initial(env), PLACES), (6.3, 1.1), (0.8, -0.3, 0.1))
     obs = observation(env, state)
     info = [[x, y, 0.31, 0, 0, yaw] for x, y, yaw in PLACES]
     ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
@@ -429,15 +415,15 @@ def test_observations_are_what_is_listed(envs: dict[str, Any], fresh: Any) -> No
         obs[3], [0, 1, *other[3], *other[2], *other[0], *other[1], *ball], atol=1e-5
     )
 
-    env = envs["go1football-1vs1"]
-    state = with_ball(env, standing(env, fresh[env.name], PLACES[:2]), (6.3, 1.1))
+    env = made("go1football-1vs1")
+    state = with_ball(env, standing(env, initial(env), PLACES[:2]), (6.3, 1.1))
     obs = observation(env, state)
     np.testing.assert_allclose(
         obs[1], [1, *other[1], *other[0], 7.7, -1.1, 0.1, 0, 0, 0], atol=1e-5
     )
 
-    env = envs["go1football-defender"]
-    state = with_ball(env, standing(env, fresh[env.name], PLACES[:3]), (6.3, 1.1), (0.8, -0.3, 0.1))
+    env = made("go1football-defender")
+    state = with_ball(env, standing(env, initial(env), PLACES[:3]), (6.3, 1.1), (0.8, -0.3, 0.1))
     obs = observation(env, state)
     ball = [6.3, 1.1, 0.1, 0.8, -0.3, 0.1]
     np.testing.assert_allclose(obs[0], [1, 0, *info[0], *info[1], *ball], atol=1e-5)
@@ -454,10 +440,8 @@ GOALS = {
 @pytest.mark.parametrize(
     ("ball", "goals"), [(ball, goals) for goals, balls in GOALS.items() for ball in balls]
 )
-def test_goals_at_both_ends(
-    duel: Any, fresh: Any, ball: tuple[float, float], goals: tuple[int, int]
-) -> None:
-    state = with_ball(duel, fresh[duel.name], ball)
+def test_goals_at_both_ends(duel: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
+    state = with_ball(duel, initial(duel), ball)
     robots = duel.read(state.data)
     np.testing.assert_array_equal(duel.leading(state, robots), np.array(goals, bool))
     assert bool(duel.ending(state, robots)) == any(goals)
@@ -471,10 +455,10 @@ def test_goals_at_both_ends(
     assert outcome.draw.tolist() == [sum(goals) == 0] * 2
 
 
-def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh: Any) -> None:
+def test_match_rewards_add_up_as_worked_out_by_hand() -> None:
     """Before: the ball in the middle, 5 m from both goals. After: as each comment says."""
-    env = envs["go1football-2vs2"]
-    state = fresh[env.name]
+    env = made("go1football-2vs2")
+    state = initial(env)
     before = with_ball(
         env, standing(env, state, [(4, -2, 0), (5, 0, 0), (10, 0, 0), (10, -4, 0)]), (7.0, 0.0)
     )
@@ -497,9 +481,9 @@ def test_match_rewards_add_up_as_worked_out_by_hand(envs: dict[str, Any], fresh:
     assert abs(expected + 10) < 5  # the goal is most of it
 
 
-def test_match_endings(duel: Any, fresh: Any) -> None:
+def test_match_endings(duel: Any) -> None:
     places = [(4, 0, 0), (10, 0, np.pi)]
-    state = standing(duel, fresh[duel.name], places)
+    state = standing(duel, initial(duel), places)
     play = stepped(duel, state)
     assert not play.terminated and not play.truncated
     late = stepped(duel, dataclasses.replace(state, step=jnp.int32(duel.max_steps - 1)))
@@ -519,8 +503,8 @@ def test_match_endings(duel: Any, fresh: Any) -> None:
         np.testing.assert_allclose(goal.reward[0], -goal.reward[1], atol=1e-6)
 
 
-def test_attack_rewards_and_success(attack: Any, fresh: Any) -> None:
-    state = standing(attack, fresh[attack.name], [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
+def test_attack_rewards_and_success(attack: Any) -> None:
+    state = standing(attack, initial(attack), [(4, -2, 0), (4, 2, 0), (10, 0, np.pi)])
     for ball, expected in (((9.0, 0.0), 3 * np.exp(-1)), ((12.3, 0.4), 10 + 3 * np.exp(-0.5 / 3))):
         reward = terms_of(attack, state, with_ball(attack, state, ball))[1]
         np.testing.assert_allclose(reward, [expected] * 2, atol=1e-4)
@@ -568,11 +552,9 @@ touch it in turn."""
         if task == FOOTBALL[2] or 3 not in touching
     ],
 )
-def test_passes_and_goals_of_both(
-    envs: dict[str, Any], fresh: Any, task: str, touching: tuple[int, ...]
-) -> None:
-    env = envs[task]
-    state = fresh[task]
+def test_passes_and_goals_of_both(task: str, touching: tuple[int, ...]) -> None:
+    env = made(task)
+    state = initial(env)
     speed = 0.0
     corners = [(3, -4, 0), (3, 4, 0), (11, 4, 0), (11, -4, 0)][: len(env.kick_off)]
     for robot in (None, *(step for each in touching for step in (each, None)), "goal"):
@@ -591,8 +573,8 @@ def test_passes_and_goals_of_both(
     )
 
 
-def test_an_idle_defender_gets_standing_commands(attack: Any, fresh: Any) -> None:
-    state = with_ball(attack, fresh[attack.name], (8.0, -2.0))
+def test_an_idle_defender_gets_standing_commands(attack: Any) -> None:
+    state = with_ball(attack, initial(attack), (8.0, -2.0))
     idle: Any = make("go1football-defender", impl="c", control="position", defender_idle=True)
     robots = attack.read(state.data)
     rest = idle.controller.default_commands

@@ -24,7 +24,6 @@ from mqe_jax.train.checkpoint import latest, read_file, save_checkpoint, save_tr
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import write_config
 from mqe_jax.train.learner import TrainState, make_learner
-from mqe_jax.train.networks import Network
 from mqe_jax.train.stages import Stages
 from tests.acting import seats
 from tests.inputs import refuses
@@ -75,9 +74,7 @@ class NotedHappo(Turns, Noted):
         return ratio
 
 
-def noted_happo(network: Network, config: TrainConfig) -> Stages:
-    turns: Any = NotedHappo
-    return turns(network, config, random_order=True)
+HAPPO: Any = NotedHappo
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -85,7 +82,9 @@ def test_two_agents_learn_to_split_a_sign(variant: str) -> None:
     env = Probe(show_hidden, pay_sum_and_difference, num_envs=32)
     config = small(**VARIANTS[variant])
     if variant == "happo":
-        config = override(config, {"stages": registered(noted_happo)})
+        config = override(
+            config, {"stages": registered(functools.partial(HAPPO, random_order=True))}
+        )
     metrics = updated(env, config, 60)[1][-1]
     assert float(metrics["average_step_reward"]) > -0.06  # at first about -0.5
     assert float(metrics["ended"]["episode_length"]) == 4.0
