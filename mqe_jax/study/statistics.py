@@ -1,7 +1,7 @@
 """Statistics over few runs, such as interquartile means and bootstrap intervals.
 
 Scores are float arrays (runs, tasks). A statistic maps scores with any leading axes (..., runs,
-tasks) to (...). Numbers equal those of the `rliable` package (tests/test_study_report.py).
+tasks) to (...). Numbers equal those of the `rliable` package (tests/test_study.py).
 
 Sources: Agarwal et al. 2021, arXiv 2108.13264 (the statistics); Gorsane et al. 2022, arXiv
 2209.10485 (their use in MARL).
