@@ -213,9 +213,6 @@ def test_every_task_is_registered() -> None:
     assert "SingleEnv<mqe/go1gate-v0>" in out.stdout
 
 
-ENDS = 3
-
-
 def match(task: str = "go1wrestling", **settings: Any) -> Any:
     return mqe_jax.make(task, impl="c", control="position", episode_length=ENDS * 0.02, **settings)
 
