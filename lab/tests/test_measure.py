@@ -135,7 +135,10 @@ def test_measurements_that_cannot_be_made_are_named(
     tmp_path: Path, change: str, message: str
 ) -> None:
     part = {"measure": "evaluate", "tasks": ["go1gate"], **yaml.safe_load(change)}
-    refuses(re.escape(message), measuring.plan, build(measuring.Measurement, part), tmp_path)
+    refuses(
+        re.escape(message),
+        lambda: measuring.plan(build(measuring.Measurement, part), tmp_path),
+    )
 
 
 def test_arguments_of_a_task_override_the_parts_and_patterns_stand_for_files(
