@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -20,7 +21,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 
 import mqe_jax
-from mqe_jax.adapters import task_env
+from mqe_jax.adapters import task_env, team_reward
 from mqe_jax.adapters.gymnasium import SingleEnv, VectorEnv, register
 from mqe_jax.adapters.host import HostEnvs
 from mqe_jax.adapters.opponent import TeamEnv
@@ -288,16 +289,55 @@ def test_an_opponent_may_see_another_group() -> None:
     np.testing.assert_allclose(found.data.qpos, expected.data.qpos, atol=1e-5)
 
 
+def test_an_opponent_knows_which_robots_take_part() -> None:
+    """Its actions say what it knows; the match gets them."""
+
+    class Counting:
+        task = "go1wrestling"
+        agents = 2
+        groups = ("policy",)
+
+        def initial_memory(self, num_envs: int) -> Any:
+            return ()
+
+        def act(self, obs: Any, memory: Any, key: Any) -> Any:
+            present = jnp.sum(obs.active, axis=1)[:, None, None]
+            return jnp.broadcast_to(0.3 * present, (*obs.active.shape, 12)), memory
+
+    env = match(num_agents=4, fewest_agents=2)
+    team: Any = TeamEnv(env, Counting())
+    states = jax.jit(jax.vmap(team.reset))(jax.random.split(jax.random.PRNGKey(0), 6))
+    present = np.asarray(states.active).sum(axis=1)
+    assert {*present.tolist()} == {1, 2} and states.active.shape == (6, 2)
+    own = jnp.zeros((6, 2, 12))
+    rivals = jnp.broadcast_to(0.3 * present[:, None, None], own.shape)
+    wholes = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 6))
+    step = jax.jit(jax.vmap(env.step))
+    expected = step(wholes, jnp.concatenate([own, rivals], axis=1))
+    found = jax.jit(jax.vmap(team.step))(states, own)
+    np.testing.assert_allclose(found.data.qpos, expected.data.qpos, atol=1e-5)
+    np.testing.assert_allclose(found.obs, expected.obs[:, :2], atol=1e-5)
+    np.testing.assert_array_equal(found.active, states.active)
+
+
+def test_a_team_is_rewarded_for_those_who_take_part() -> None:
+    env: Any = SimpleNamespace(teams=((0, 1), (2, 3)))
+    reward = np.array([[1.0, 3.0, 9.0, 9.0], [1.0, 0.0, 9.0, 9.0]])
+    active = np.array([[True] * 4, [True, False, True, False]])
+    np.testing.assert_array_equal(team_reward(env, reward, active), [2.0, 1.0])
+    np.testing.assert_array_equal(team_reward(env, jnp.asarray(reward), active), [2.0, 1.0])
+
+
 def test_opponents_of_one_form_share_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
     """As do opponents of one name."""
     traced = []
-    step = TeamEnv.step
+    step = TeamEnv.advance
 
     def counted(env: TeamEnv, state: Any, action: Any) -> Any:
         traced.append(env)
         return step(env, state, action)
 
-    monkeypatch.setattr(TeamEnv, "step", counted)
+    monkeypatch.setattr(TeamEnv, "advance", counted)
     env = match("go1tug")
     policies = [new_policy(versus(mqe_jax.VectorEnv(env, 2), ["idle"]), seed) for seed in (0, 1)]
     ended = []

@@ -19,6 +19,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax.envs import tasks
+from mqe_jax.envs.plane import Go1Plane
 from tests.inputs import refuses
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
@@ -102,6 +103,112 @@ def test_brax_wrap_names_what_it_does_not_take() -> None:
         randomization_fn=lambda system: system,
     )
     refuses("env: object is not", brax.wrap, type("Foreign", (), {"unwrapped": object()})())
+
+
+class Moment(Go1Plane):
+    """Its end, after three steps, lasts one step."""
+
+    name = "moment"
+
+    def ending(self, state: Any, robot_state: Any) -> jax.Array:
+        return state.step == 3
+
+
+def test_an_end_within_the_repetitions_of_an_action_is_an_end() -> None:
+    brax = adapter("brax")
+    params = Moment.Params(episode_length=1.0)
+    env = brax.wrap(brax.Env(Moment(params, impl="c", control="position")), 20, action_repeat=2)
+
+    @jax.jit
+    def play(key: jax.Array) -> Any:
+        def one(state: Any, _: None) -> Any:
+            state = env.step(state, jnp.zeros((1, 24)))
+            task = state.pipeline_state
+            return state, (state.done, task.step, state.reward, task.reward.mean(1))
+
+        return jax.lax.scan(one, env.reset(jax.random.split(key, 1)), None, 4)[1]
+
+    done, step, reward, last = play(jax.random.PRNGKey(0))
+    np.testing.assert_array_equal(done[:, 0], [0, 1, 0, 1])
+    np.testing.assert_array_equal(step[:, 0], [2, 0, 2, 0])
+    np.testing.assert_allclose(reward[1], last[1])  # of one step
+
+
+SENSED: dict[str, Any] = {
+    "impl": "c",
+    "control": "position",
+    "episode_length": 0.1,
+    "senses": [
+        {"name": "proprioception", "drift": 0, "yaw_drift": 0, "pipeline": {"all": {"delay": 2}}}
+    ],
+}
+
+
+@pytest.mark.parametrize("library", ["gymnasium", "pettingzoo", "brax", "jaxmarl"])
+def test_agents_see_what_their_sensors_measure(library: str) -> None:
+    """Also after a reset; readings are late, so that each must be taken once."""
+    its = adapter(library)
+    env = sensing_env()
+    size = env.group_sizes["onboard"]
+    key = jax.random.PRNGKey(3)
+    expected = sensing()
+    found = []
+    if library == "gymnasium":
+        gym = its.VectorEnv(env, 1, autoreset_mode="SameStep")
+        assert gym.single_observation_space.shape == (2, size)
+        found = [gym.reset(seed=3)[0][0]]
+        for _ in range(5):
+            obs, *_, infos = gym.step(np.ones((1, 2, 12)))
+            found.append(infos["final_obs"][0] if "final_obs" in infos else obs[0])
+    if library == "pettingzoo":
+        parallel = its.parallel_env(env)
+        assert parallel.observation_space("robot_0").shape == (size,)
+        found = [[*parallel.reset(seed=3)[0].values()]]
+        for _ in range(5):
+            actions = dict.fromkeys(parallel.agents, np.ones(12))
+            found.append([*parallel.step(actions)[0].values()])
+    if library == "brax":
+        wrapped = its.wrap(its.Env(env), 5)
+        assert wrapped.observation_size == 2 * size
+        state = jax.jit(wrapped.reset)(key[None])
+        found = [state.obs.reshape(2, size)]
+        step = jax.jit(wrapped.step)
+        for _ in range(5):
+            state = step(state, jnp.ones((1, 24)))
+            found.append(state.info[its.FINAL_OBS].reshape(2, size))
+        assert np.abs(state.obs.reshape(2, size) - found[-1]).max() > 1e-3
+    if library == "jaxmarl":
+        multi = its.Env(env)
+        assert multi.observation_space("robot_0").shape == (size,)
+        obs, state = multi.reset(key)
+        found = [[*obs.values()]]
+        for _ in range(5):
+            _, state, *_ = multi.step(state.key, state, dict.fromkeys(multi.agents, jnp.ones(12)))
+            found.append(state.final_groups["onboard"])
+    for own, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(own, other, atol=1e-4)
+
+
+@functools.cache
+def sensing_env() -> Any:
+    return mqe_jax.make("go1plane", num_envs=1, **SENSED)
+
+
+@functools.cache
+def sensing() -> list[Any]:
+    """What the sensors measure in an episode of five steps in which all actions are 1."""
+    env = sensing_env()
+
+    def observe(state: Any) -> Any:
+        return env.with_observations(state, ["onboard"])
+
+    state = jax.jit(lambda key: observe(env.begin(key)))(jax.random.PRNGKey(3))
+    step = jax.jit(lambda state: observe(env.advance(state, jnp.ones((2, 12)))))
+    readings = [state.groups["onboard"]]
+    for _ in range(5):
+        state = step(state)
+        readings.append(state.groups["onboard"])
+    return readings
 
 
 def test_brax_names_wrong_arguments() -> None:
@@ -340,6 +447,21 @@ def test_a_copy_is_a_new_environment_with_the_same_settings(zoo: Any) -> None:
     np.testing.assert_array_equal(
         copies[0].reset(seed=1)[0]["robot_0"], env.reset(seed=1)[0]["robot_0"]
     )
+
+
+def test_robots_that_are_parked_are_no_agents(zoo: Any) -> None:
+    env = zoo.parallel_env("go1plane", num_agents=3, fewest_agents=1, control="position", **SHORT)
+    found = set()
+    for seed in range(10):
+        obs, infos = env.reset(seed=seed)
+        assert env.agents == [*obs] == [*infos] == env.possible_agents[: len(obs)]
+        assert all(np.any(row) for row in obs.values())
+        for results in env.step(dict.fromkeys(env.agents, np.zeros(12))):
+            assert [*results] == env.agents
+        found.add(len(obs))
+        if len(obs) < 3:
+            refuses("actions: for", env.step, dict.fromkeys(env.possible_agents, np.zeros(12)))
+    assert found == {1, 2, 3} and len(env.possible_agents) == 3
 
 
 def test_bad_input_is_named(zoo: Any) -> None:

@@ -147,6 +147,29 @@ def test_networks_memories_and_controls_agree(
     assert export_error(new_policy(env, control, **network), env) < 2e-5
 
 
+def test_agents_that_see_each_other_know_who_takes_part() -> None:
+    """In the simulation, for plain observations and in a graph, whose parked robots have zeros."""
+    env = make("go1gate", impl="c", control="torque", num_agents=3, fewest_agents=1, num_envs=1)
+    policy = new_policy(env, "torque", name="mat", heads=2)
+    key = jax.random.PRNGKey(0)
+    varied = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(key, x.shape), policy.params)
+    policy = dataclasses.replace(policy, params=varied)
+    active = np.arange(3) < np.array([[1], [2], [3]])
+    obs = np.random.default_rng(0).normal(size=(3, 3, env.observation_size)).astype(np.float32)
+    obs[~active] = 0.0
+    expected, _ = policy.act(Observations({"policy": jnp.asarray(obs)}, jnp.asarray(active)), ())
+    alone, _ = policy.act(obs, ())
+    np.testing.assert_allclose(alone, expected, atol=1e-6)
+    session = onnxruntime.InferenceSession(to_onnx(policy, env).SerializeToString())
+    (found,) = session.run(["action"], {"obs": obs})
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    everyone, _ = policy.act(Observations({"policy": jnp.asarray(obs)}), ())
+    assert np.abs(everyone - expected)[active].max() > 2e-4
+    refuses("network: 'mat' .* their own readings only", robot_onnx, policy, env)
+    command = make("go1gate", impl="c", num_agents=3, fewest_agents=1, num_envs=1)
+    refuses("fewest_agents.* need one size", TaskFunctions, command)
+
+
 @pytest.mark.parametrize(
     ("skill", "commands", "memory"),
     [

@@ -216,14 +216,14 @@ def test_published_trainings_can_start(
 ) -> None:
     """They are planned and checked with all of their settings, but not begun."""
     monkeypatch.chdir(ROOT)
-    plan = sweeping.sweep
+    plan = sweeping._run
     begun = []
 
-    def start(file: Path, folder: Path, **options: Any) -> Any:
-        begun.extend(plan(file, folder, **options, dry_run=True)["left"]["jobs"])
+    def start(*options: Any) -> Any:
+        begun.extend(plan(*options, dry_run=True)["left"]["jobs"])
         raise Started
 
-    monkeypatch.setattr(sweeping, "sweep", start)
+    monkeypatch.setattr(sweeping, "_run", start)
     monkeypatch.setattr(exploiting, "_meet", lambda *given: np.ones((len(given[2]), 3), int))
     settings = published(part)
     for item in measuring.plan(settings, tmp_path, impl="c"):

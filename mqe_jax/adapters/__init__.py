@@ -12,15 +12,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gymnasium.spaces import Box
 
 from mqe_jax import envs, names
 from mqe_jax.acting.seats import Policy
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
+from mqe_jax.core.precision import single
 from mqe_jax.core.settings import checked
+from mqe_jax.core.types import Level, RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
+from mqe_jax.envs.observation import box
 from mqe_jax.envs.registry import task_id
+from mqe_jax.envs.state import with_final
+from mqe_jax.sensors.suite import ONBOARD
 
 
 def missing(library: str, error: ImportError) -> InputError:
@@ -77,9 +83,36 @@ def agent_names(env: TaskEnv) -> list[str]:
     return [f"robot_{i}" for i in range(env.num_agents)]
 
 
-def team_reward(env: TaskEnv, reward: Any) -> Any:
-    """Returns the mean reward (...) of team 0, all agents in cooperative tasks, from (..., A)."""
-    return reward[..., np.array(env.teams[0])].mean(-1)
+def team_reward(env: TaskEnv, reward: Any, active: Any) -> Any:
+    """Returns the mean reward (...) of team 0, all agents in cooperative tasks, from (..., A).
+
+    Only agents that are `active` (..., A) count.
+    """
+    team = np.array(env.teams[0])
+    return reward[..., team].mean(-1, where=active[..., team])
+
+
+def seen_group(env: TaskEnv) -> str:
+    """Returns the group of observations that agents see: `onboard` with sensors, else `policy`."""
+    return ONBOARD if env.params.senses else "policy"
+
+
+def seen_space(env: TaskEnv) -> Box:
+    """Returns the space of what all agents see (A, O)."""
+    return box(np.inf, (env.num_agents, env.group_sizes[seen_group(env)]))
+
+
+@single
+@checked
+def begin(env: Any, key: RandomKey, assistance: Level = 0.0) -> Any:
+    """Returns an initial state with what agents see; see `QuadrupedEnv.reset`."""
+    return with_final(env.with_observations(env.begin(key, assistance), [seen_group(env)]))
+
+
+@single
+def advance(env: Any, state: Any, action: jax.Array) -> Any:
+    """Returns the state after an environment step with what agents see; see `QuadrupedEnv.step`."""
+    return with_final(env.with_observations(env.advance(state, action), [seen_group(env)]))
 
 
 def select(

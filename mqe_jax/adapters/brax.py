@@ -17,14 +17,22 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax import envs
-from mqe_jax.adapters import missing, task_env, team_reward
+from mqe_jax.adapters import (
+    advance,
+    begin,
+    missing,
+    seen_group,
+    select,
+    task_env,
+    team_reward,
+)
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import checked
-from mqe_jax.core.types import RandomKeys
+from mqe_jax.core.types import RandomKeys, where_rows
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
@@ -50,12 +58,13 @@ def register() -> None:
 class Env(BraxEnv):
     """One environment: observation (A * O,), action (A * action_size,) in [-1, 1].
 
-    Agents follow each other in both.
+    Agents follow each other in both. They see what their sensors measure, if the task has any
+    (`senses`).
 
-    With an `opponent`, A counts the agents of team 0 and the reward is their mean. `done` is 1 on
-    termination; time limits are left to Brax's EpisodeWrapper. `info["truncation"]` is 1 in the
-    step that reaches the time limit, `info[FINAL_OBS]` the observation at the end of the step.
-    `pipeline_state` is the task's `State`.
+    With an `opponent`, A counts the agents of team 0. The reward is the mean of team 0's agents
+    that take part. `done` is 1 on termination; time limits are left to Brax's EpisodeWrapper.
+    `info["truncation"]` is 1 in the step that reaches the time limit, `info[FINAL_OBS]` the
+    observation at the end of the step. `pipeline_state` is the task's `State`.
     """
 
     def __init__(self, task: str | QuadrupedEnv, **overrides: Any) -> None:
@@ -65,11 +74,12 @@ class Env(BraxEnv):
         """
         self.env: TaskEnv = task_env(task, **overrides)
         self.episode_length: int = self.env.max_steps
+        self.group = seen_group(self.env)  # of observations
 
     @single
     def reset(self, rng: jax.Array) -> State:
-        state = self.env.reset(rng)
-        obs = state.obs.reshape(-1)
+        state = begin(self.env, rng)
+        obs = state.groups[self.group].reshape(-1)
         info = {"truncation": jnp.zeros(()), FINAL_OBS: obs}
         pipeline: Any = state  # any pytree, although Brax's annotation is narrower
         zero = jnp.zeros(())
@@ -84,13 +94,14 @@ class Env(BraxEnv):
                 "action size"
             )
         before: Any = state.pipeline_state
-        after = self.env.step(before, action.reshape(self.env.num_agents, self.env.action_size))
-        obs = after.obs.reshape(-1)
+        action = action.reshape(self.env.num_agents, self.env.action_size)
+        after = advance(self.env, before, action)
+        obs = after.groups[self.group].reshape(-1)
         info = {**state.info, "truncation": after.truncated.astype(jnp.float32), FINAL_OBS: obs}
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=after,
             obs=obs,
-            reward=team_reward(self.env, after.reward),
+            reward=team_reward(self.env, after.reward, after.active),
             done=after.terminated.astype(jnp.float32),
             # Wrappers may have added entries.
             metrics={**state.metrics, **info_of(after)},
@@ -99,7 +110,7 @@ class Env(BraxEnv):
 
     @property
     def observation_size(self) -> int:
-        return self.env.num_agents * self.env.observation_size
+        return self.env.num_agents * self.env.group_sizes[self.group]
 
     @property
     def action_size(self) -> int:
@@ -108,6 +119,24 @@ class Env(BraxEnv):
     @property
     def backend(self) -> str:
         return self.env.impl
+
+
+class Hold(Wrapper):
+    """Keeps an environment as it is once its episode ends within the repetitions of an action."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Steps the environments (N,) whose episodes go on; the others have a reward of 0."""
+        after = self.env.step(state, action)
+        task: Any = self.env.unwrapped.env  # pyright: ignore[reportAttributeAccessIssue]
+        ended = state.done.astype(bool)
+        pair: Any = (state.pipeline_state, after.pipeline_state)
+        own = jax.vmap(functools.partial(select, task))(ended, *pair)
+        names = ("obs", "done", "metrics", "info")
+        kept = {
+            name: where_rows(ended, getattr(state, name), getattr(after, name)) for name in names
+        }
+        reward = jnp.where(ended, 0.0, after.reward)
+        return after.replace(pipeline_state=own, reward=reward, **kept)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class AutoReset(Wrapper):
@@ -133,16 +162,18 @@ class AutoReset(Wrapper):
         info = {**state.info, "steps": jnp.where(state.done, 0.0, state.info["steps"])}
         cleared = state.replace(done=jnp.zeros_like(state.done), info=info)  # pyright: ignore[reportAttributeAccessIssue]
         after = self.env.step(cleared, action)
-        task: Any = self.env.unwrapped.env  # pyright: ignore[reportAttributeAccessIssue]
+        adapter: Any = self.env.unwrapped
+        task = adapter.env
+        group = adapter.group
 
         def restart(own: TaskState, done: jax.Array) -> TaskState:
             # EpisodeWrapper may end an episode earlier than the task's time limit.
             truncated = done.astype(bool) & ~own.terminated
-            return autoreset(task, dataclasses.replace(own, truncated=truncated))
+            return autoreset(task, dataclasses.replace(own, truncated=truncated), groups=[group])
 
         reached: Any = after.pipeline_state
         own = jax.vmap(restart)(reached, after.done)
-        obs = own.obs.reshape(*after.done.shape, -1)
+        obs = own.groups[group].reshape(*after.done.shape, -1)
         return after.replace(pipeline_state=own, obs=obs)  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -153,7 +184,10 @@ def wrap(
     action_repeat: PositiveInt = 1,
     randomization_fn: Callable[..., Any] | None = None,
 ) -> Wrapper:
-    """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, new episodes."""
+    """Wraps an `Env` for Brax's trainers, as `wrap_env_fn`: batch, time limit, new episodes.
+
+    An episode that ends within the repetitions of an action ends there.
+    """
     inner = getattr(env, "unwrapped", env)
     if not isinstance(inner, Env):
         raise InputError(f"env: {type(inner).__name__} is not a mqe_jax.adapters.brax.Env")
@@ -161,7 +195,10 @@ def wrap(
         raise InputError(
             "randomization_fn: not supported; pass randomization=... to the Env instead"
         )
-    return AutoReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+    batch = VmapWrapper(env)
+    if action_repeat > 1:
+        batch = Hold(batch)
+    return AutoReset(EpisodeWrapper(batch, episode_length, action_repeat))
 
 
 register()

@@ -4,8 +4,9 @@ Importing this module registers every task as `mqe/TASK-v0`, for `gymnasium.make
 `gymnasium.make_vec`. Gymnasium 1.x does not load plug-ins;
 `gymnasium.make_vec("mqe_jax.adapters.gymnasium:mqe/go1gate-v0")` also imports this module.
 
-The reward is the mean over the agents of team 0: all agents in cooperative tasks. `info` holds the
-metrics of the step and, as `info["agent_rewards"]`, the rewards of all agents (A,).
+Observations are those of sensors, if the task has any (`senses`). The reward is the mean over the
+agents of team 0 that take part: all agents in cooperative tasks. `info` holds the metrics of the
+step and, as `info["agent_rewards"]`, the rewards of all agents (A,).
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from mqe_jax import envs
-from mqe_jax.adapters import task_env, team_reward
+from mqe_jax.adapters import seen_space, task_env, team_reward
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, Pixels, PositiveInt, Seed
@@ -64,7 +65,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.env = task_env(task, **overrides)
         self.action_space = self.env.action_space
-        self.observation_space = self.env.observation_space
+        self.observation_space = seen_space(self.env)
         named = not isinstance(task, QuadrupedEnv)
         self._host = HostEnvs(self.env, 1, render_mode, render_size, named=named)
 
@@ -80,7 +81,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         out = self._host.step([action])
         info: dict[str, Any] = {name: value[0] for name, value in out.info.items()}
         info["agent_rewards"] = out.reward[0]
-        reward = float(team_reward(self.env, out.reward.astype(float))[0])
+        reward = float(team_reward(self.env, out.reward.astype(float), out.active)[0])
         return out.obs[0], reward, bool(out.terminated[0]), bool(out.truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -129,7 +130,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = num_envs
         self.metadata = {**SingleEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = self.env.action_space
-        self.single_observation_space = self.env.observation_space
+        self.single_observation_space = seen_space(self.env)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         named = not isinstance(task, QuadrupedEnv)
@@ -187,7 +188,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             infos = _mask_infos(metrics, ~self._ended)
         self._ended = ended.copy()
-        reward = team_reward(self.env, out.reward.astype(float))
+        reward = team_reward(self.env, out.reward.astype(float), out.active)
         return out.obs, reward, out.terminated, out.truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:

@@ -13,7 +13,9 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
 from mqe_jax.acting.seats import Seats
-from mqe_jax.adapters import select
+from mqe_jax.adapters import advance as step
+from mqe_jax.adapters import begin as start
+from mqe_jax.adapters import seen_group, select
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Seed
@@ -35,9 +37,10 @@ class Step(NamedTuple):
     The arrays are writable copies.
     """
 
-    obs: Any  # (N, A, O)
+    obs: Any  # (N, A, O), of the group that agents see
     final_obs: Any  # (N, A, O)
     reward: Any  # (N, A)
+    active: Any  # which agents take part (N, A) bool
     terminated: Any  # (N,) bool
     truncated: Any  # (N,) bool
     info: dict[str, Any]  # metrics and outcome by name, (N,) each
@@ -110,7 +113,7 @@ class HostEnvs:
         numbers = np.array([check("seed", 0 if seed is None else seed, Seed) for seed in seeds])
         chosen = np.ones(self.num_envs, bool) if mask is None or self.state is None else mask
         self.state = self._programs[0](numbers.astype(np.uint32), seeded, chosen, self.state)
-        return np.array(self.state.obs)
+        return np.array(self.state.groups[seen_group(self.env)])
 
     def step(self, action: ArrayLike, reset: AutoresetMode = AutoresetMode.DISABLED) -> Step:
         """Steps all environments with actions (N, A, action_size), clipped to [-1, 1].
@@ -176,9 +179,9 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
     ) -> State:
         env = env_of(seats)
         if state is None:
-            return env.reset(jax.random.PRNGKey(seed))
+            return start(env, jax.random.PRNGKey(seed))
         key, reset_key = jax.random.split(state.key)
-        fresh = env.reset(jnp.where(seeded, jax.random.PRNGKey(seed), reset_key))
+        fresh = start(env, jnp.where(seeded, jax.random.PRNGKey(seed), reset_key))
         fresh = dataclasses.replace(fresh, key=jnp.where(seeded, fresh.key, key))
         return select(env, chosen, fresh, state)
 
@@ -186,25 +189,27 @@ def _compile(kind: _Kind) -> tuple[Callable[..., State], Callable[..., tuple[Sta
         seats: Seats | None, reset: AutoresetMode, state: State, action: jax.Array
     ) -> tuple[State, Step]:
         env = env_of(seats)
-        shown = env.step(state, action)
+        shown = step(env, state, action)
         after = shown
         if reset is not AutoresetMode.DISABLED:
             ended = shown if reset is AutoresetMode.SAME_STEP else state
             # A new episode continues the PRNG stream, as in `autoreset`.
             key, reset_key = jax.random.split(ended.key)
-            fresh = dataclasses.replace(env.reset(reset_key, shown.assistance), key=key)
+            fresh = dataclasses.replace(start(env, reset_key, shown.assistance), key=key)
             after = select(env, ended.terminated | ended.truncated, fresh, shown)
         if reset is AutoresetMode.NEXT_STEP:
             shown = after
-        step = Step(
-            obs=after.obs,
-            final_obs=shown.final_obs,
+        group = seen_group(env)
+        out = Step(
+            obs=after.groups[group],
+            final_obs=shown.final_groups[group],
             reward=shown.reward,
+            active=shown.active,
             terminated=shown.terminated,
             truncated=shown.truncated,
             info=info_of(shown),
         )
-        return after, step
+        return after, out
 
     def steps(
         seats: Seats | None, state: State, action: jax.Array, reset: AutoresetMode

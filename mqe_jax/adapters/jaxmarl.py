@@ -15,7 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax import envs
-from mqe_jax.adapters import agent_names, missing, select, task_env
+from mqe_jax.adapters import (
+    advance,
+    agent_names,
+    begin,
+    missing,
+    seen_group,
+    select,
+    task_env,
+)
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
 from mqe_jax.core.errors import InputError, short_repr
@@ -63,6 +71,9 @@ class Env(MultiAgentEnv):
 
     Its state is the task's `State`, whose `final_obs` is kept by a reset.
 
+    Agents see what their sensors measure, if the task has any (`senses`). `state.active` (A,) says
+    which take part.
+
     Infos have one value per agent (A,), the shape that JaxMARL's baselines expect: `truncation`,
     and the metrics. Dones are true on termination and on truncation.
     """
@@ -82,7 +93,8 @@ class Env(MultiAgentEnv):
         super().__init__(self.env.num_agents)
         size = self.env.action_size
         self.agents = agent_names(self.env)
-        seen = Box(-jnp.inf, jnp.inf, (self.env.observation_size,))
+        self.group = seen_group(self.env)  # of observations
+        seen = Box(-jnp.inf, jnp.inf, (self.env.group_sizes[self.group],))
         self.observation_spaces = dict.fromkeys(self.agents, seen)
         self.action_table: np.ndarray | None = None  # the action of each integer
         if discrete:
@@ -102,7 +114,7 @@ class Env(MultiAgentEnv):
     def reset(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, key: RandomKey
     ) -> tuple[Arrays, State]:
-        state = self.env.reset(key)
+        state = begin(self.env, key)
         return self.get_obs(state), state
 
     def step(  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -131,7 +143,7 @@ class Env(MultiAgentEnv):
         _, after, rewards, dones, infos = self.step_env(key, state, actions)
         task: Any = self.env
         if reset_state is None:
-            after = autoreset(task, after)
+            after = autoreset(task, after, groups=[self.group])
         else:
             after = select(self.env, dones["__all__"], reset_state, after, kept=("final_groups",))
         return self.get_obs(after), after, rewards, dones, infos
@@ -143,7 +155,7 @@ class Env(MultiAgentEnv):
     ) -> tuple[Arrays, State, Arrays, Arrays, dict[str, Any]]:
         """Advances by one environment step without a reset; the key replaces the state's key."""
         action = jnp.stack([self._continuous(action) for action in self._checked(actions).values()])
-        after = self.env.step(dataclasses.replace(state, key=key), action)
+        after = advance(self.env, dataclasses.replace(state, key=key), action)
         done = after.terminated | after.truncated
         values = {"truncation": after.truncated.astype(jnp.float32), **info_of(after)}
         infos = {name: jnp.broadcast_to(x, (self.num_agents,)) for name, x in values.items()}
@@ -153,7 +165,7 @@ class Env(MultiAgentEnv):
 
     def get_obs(self, state: State) -> Arrays:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Returns the agents' observations (O,)."""
-        return {agent: state.obs[i] for i, agent in enumerate(self.agents)}
+        return {agent: state.groups[self.group][i] for i, agent in enumerate(self.agents)}
 
     @functools.partial(jax.jit, static_argnums=0)
     def get_avail_actions(  # pyright: ignore[reportIncompatibleVariableOverride]

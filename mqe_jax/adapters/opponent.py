@@ -35,6 +35,7 @@ class TeamEnvState(State):
     Observations, rewards and metrics are those of team 0.
     """
 
+    everyone: jax.Array  # which agents of both teams take part (2 T,) bool
     rival_groups: dict[str, jax.Array]
     """Observations of all agents (2 T, O_g) by the groups that the opponent sees."""
     rival_memory: tuple[Memory]  # recurrent state of the opponent, leading axis 1
@@ -112,6 +113,7 @@ class TeamEnv:
         agents = self.match.num_agents
         state = TeamEnvState(
             **vars(match),
+            everyone=match.active,
             rival_groups={name: jnp.zeros((agents, sizes[name])) for name in self.seats.groups},
             rival_memory=self.seats.initial_memory(1),
         )
@@ -120,6 +122,10 @@ class TeamEnv:
     @single
     def step(self, state: State, action: jax.Array) -> TeamEnvState:
         """Advances by one environment step with the actions of team 0 (T, action_size)."""
+        return with_final(self.with_observations(self.advance(state, action)))
+
+    def advance(self, state: State, action: jax.Array) -> TeamEnvState:
+        """Returns the state of `step`, still with the observations of the state before."""
         check("state", state, TeamEnvState)
         shape = (self.num_agents, self.match.action_size)
         if jnp.shape(action) != shape:
@@ -127,19 +133,22 @@ class TeamEnv:
                 f"action: shape {jnp.shape(action)}; expected {shape} (agents, action size)"
             )
         own: Any = state  # a `TeamEnvState`; the match's step keeps its further fields
+        own = dataclasses.replace(own, active=own.everyone)
         key = jax.random.fold_in(own.key, keys.OPPONENT)
-        seen = Observations({name: x[None] for name, x in own.rival_groups.items()})
+        groups = {name: x[None] for name, x in own.rival_groups.items()}
+        seen = Observations(groups, own.active[None])
         action = jnp.asarray(action, jnp.float32)
         both = jnp.concatenate([action, jnp.zeros_like(action)])[None]
         both, memory = self.seats.act(seen, own.rival_memory, key, both)
         after: Any = self.match.advance(own, both[0])
-        return with_final(self.with_observations(dataclasses.replace(after, rival_memory=memory)))
+        return self._of_team(dataclasses.replace(after, rival_memory=memory))
 
     def with_observations(self, state: TeamEnvState, groups: Sequence[str] = ()) -> TeamEnvState:
         """Returns the state with its observations of the group `policy` and further groups.
 
         Those that the opponent sees are among them.
         """
+        state = dataclasses.replace(state, active=state.everyone)
         seen: Any = self.match.with_observations(state, (*groups, *self.seats.groups))
         rival_groups = {name: seen.groups[name] for name in self.seats.groups}
         return dataclasses.replace(self._of_team(seen), rival_groups=rival_groups)

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.utils import EzPickle
 
 from mqe_jax import envs
-from mqe_jax.adapters import agent_names, missing, task_env
+from mqe_jax.adapters import agent_names, missing, seen_space, task_env
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.core.errors import InputError, short_repr
 from mqe_jax.core.limits import Pixels, PositiveInt
@@ -56,6 +56,9 @@ def env(task: str | QuadrupedEnv = "go1gate", **settings: Any) -> AECEnv[str, np
 
 class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     """One environment as a parallel environment; all agents end together.
+
+    Its `agents` are those that take part in the episode. They see what their sensors measure, if
+    the task has any (`senses`).
 
     A copied or unpickled instance is a new environment with the same settings, as SuperSuit's
     vectorisers require.
@@ -101,8 +104,8 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         self.possible_agents = agent_names(self.task)
         self.agents: list[str] = []
         self.teams = tuple(tuple(self.possible_agents[i] for i in team) for team in self.task.teams)
-        self._observation_spaces = self._by_agent(_rows(self.task.observation_space))
-        self._action_spaces = self._by_agent(_rows(self.task.action_space))
+        spaces = (_rows(seen_space(self.task)), _rows(self.task.action_space))
+        self._observation_spaces, self._action_spaces = map(self._by_name, spaces)
         size = (self.task.privileged_observation_size,)
         self.state_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)
         self._generator = np.random.default_rng()
@@ -122,7 +125,9 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Starts an episode; without a seed the PRNG stream continues."""
         obs = self._host.reset([seed], self._generator)[0]
-        self.agents = list(self.possible_agents)
+        assert self._host.state is not None
+        active = self._by_name(np.asarray(self._host.state.active[0]))
+        self.agents = [agent for agent in self.possible_agents if active[agent]]
         return self._by_agent(obs), {agent: {} for agent in self.agents}
 
     def step(self, actions: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -134,7 +139,9 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
                 f"actions: for {short_repr(list(actions))}; expected one for each of "
                 f"{', '.join(self.agents)}"
             )
-        out = self._host.step([[actions[agent] for agent in self.agents]])
+        parked = np.zeros(self.task.action_size)
+        every = [actions.get(agent, parked) for agent in self.possible_agents]
+        out = self._host.step([every])
         terminated = bool(out.terminated[0])
         truncated = bool(out.truncated[0])
         metrics = {name: float(value[0]) for name, value in out.info.items()}
@@ -162,8 +169,14 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
     def close(self) -> None:
         """No-op: no resources are held."""
 
-    def _by_agent(self, values: Iterable[Any]) -> dict[str, Any]:
+    def _by_name(self, values: Iterable[Any]) -> dict[str, Any]:
+        """Returns the values of all possible agents by name."""
         return dict(zip(self.possible_agents, values, strict=True))
+
+    def _by_agent(self, values: Iterable[Any]) -> dict[str, Any]:
+        """Returns those of the agents that take part."""
+        every = self._by_name(values)
+        return {agent: every[agent] for agent in self.agents}
 
 
 def _rows(space: gymnasium.spaces.Box) -> list[gymnasium.spaces.Box]:

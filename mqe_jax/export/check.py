@@ -11,7 +11,7 @@ import onnx
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.types import observations
 from mqe_jax.envs import QuadrupedEnv
-from mqe_jax.export.policy import SENSED, input_shapes, policy_step, to_onnx
+from mqe_jax.export.policy import SENSED, fill_arrays, input_shapes, policy_step, to_onnx
 from mqe_jax.export.translate import Function, translate
 from mqe_jax.train.policy import TrainedPolicy
 
@@ -67,7 +67,7 @@ def check_errors(model: onnx.ModelProto, inputs: Arrays, expected: Arrays, where
 def record_actions(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tuple[Arrays, Arrays]:
     """Returns inputs and outputs of `policy_step` by name, leading axis T.
 
-    Actions are means. Opponents are idle.
+    Actions are the policy's means in the simulation. Opponents are idle.
     """
     shapes = input_shapes(policy, env)
     group = policy.needs.group
@@ -75,9 +75,12 @@ def record_actions(policy: TrainedPolicy, env: QuadrupedEnv, steps: int) -> tupl
     @jax.jit
     def advance(state: Any, memory: dict[str, Any]) -> tuple[Any, Any, Any]:
         sensed = dict(zip(SENSED, env.read(state.data).proprioception, strict=True))
-        sensed = {"obs": observations(state).group(group), **sensed}
+        seen = jax.tree.map(lambda x: x[: policy.agents], observations(state))
+        sensed = {"obs": seen.group(group), **sensed}
         inputs = {name: x[: policy.agents] for name, x in sensed.items() if name in shapes} | memory
         outputs = policy_step(policy, env, inputs)
+        own = fill_arrays("memory", policy.initial_memory(), inputs)
+        outputs["action"], _ = policy.act(seen, own)
         action = jnp.zeros((env.num_agents, env.action_size))
         action = action.at[: policy.agents].set(outputs["action"])
         return inputs, outputs, env.with_observations(env.advance(state, action), [group])

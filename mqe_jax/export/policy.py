@@ -1,8 +1,8 @@
 """A team's policy as one function and its ONNX graph, with the skill in `command` control.
 
 Every input and output has a leading batch axis N. The input `obs` (N, A, O) is the policy's group
-of observations. Recurrent states are initialised to zero, and each output `next_X` is the input `X`
-of the next step. Of a match, the graph is that of team 0.
+of observations; a robot that takes no part has zeros. Recurrent states are initialised to zero, and
+each output `next_X` is the input `X` of the next step. Of a match, the graph is that of team 0.
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|

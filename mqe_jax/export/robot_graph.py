@@ -70,6 +70,10 @@ def _one_robot(policy: TrainedPolicy) -> TrainedPolicy:
     """
     if policy.agents == 1:
         return policy
+    network = policy.config.network
+    if network.mixes_agents:
+        allowed = "one whose robots act on their own readings only (--per-robot)"
+        fail("network", network.name, allowed)
     needs = dataclasses.replace(policy.needs, dims=policy.dims._replace(agents=1, values=1))
     expected = template(needs.dims, policy.config.network)["params"]
     if shapes_of(policy.params) != shapes_of(expected):

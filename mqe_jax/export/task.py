@@ -47,7 +47,8 @@ Arrays = Mapping[str, Any]
 class TaskFunctions:
     """The functions of a task, of one environment, without domain randomisation.
 
-    InputError for another control mode than `command`, or an actuator network.
+    InputError for another control mode than `command`, an actuator network, or episodes of several
+    sizes.
 
     Example:
         ```python
@@ -67,6 +68,10 @@ class TaskFunctions:
             )
         if env.params.actuator_network is not None:
             raise InputError("actuator_network: not allowed; graphs of tasks need PD control")
+        if env.varies:
+            raise InputError(
+                "fewest_agents, fewest_sheep: not allowed; graphs of tasks need one size"
+            )
         parts = [part.name for part in env.controller.skill.parts]
         if env.controller.npc and env.npc_skill not in parts:
             raise InputError(

@@ -175,10 +175,15 @@ def environments(
     return Cast(env, eval_env, league, teacher, tuple(digests), start)
 
 
-def check_start(config: TrainConfig, seeds: int = 1, impl: str = "auto") -> None:
-    """Raises an InputError if a training of seeds could not start."""
+def check_start(
+    config: TrainConfig,
+    seeds: int = 1,
+    impl: str = "auto",
+    task: QuadrupedEnv | None = None,
+) -> None:
+    """Raises an InputError if a training of seeds could not start; see `environments`."""
     check_loggers(config.loggers)
-    cast = environments(config, seeds, impl=impl)
+    cast = environments(config, seeds, task=task, impl=impl)
     learner.make_learner(cast.env, config, league=cast.league, teacher=cast.teacher)
     _check_start(cast, config)
 

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import secrets
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from mqe_jax.core.files import write_atomically
 from mqe_jax.core.limits import Positive, Seed
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import checked, to_mapping
+from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.registry import task_id
 from mqe_jax.presets import Layers
 from mqe_jax.runs import cast
@@ -71,27 +73,46 @@ def sweep(
         NonFiniteError: at the end, if the first training that failed became non-finite.
     """
     settings = sweeps.load_sweep(Path(file), part)
-    folder = Path(folder)
-    began = time.monotonic()
     for task in settings.tasks:
         task_id(task)
+    options = {"cells": cells, "seeds": seeds, "time_limit": time_limit, "dry_run": dry_run}
+    return _run(settings, Path(folder), impl, **options)
+
+
+def _run(
+    settings: Sweep,
+    folder: Path,
+    impl: str,
+    env: QuadrupedEnv | None = None,
+    *,
+    cells: Sequence[str] = (),
+    seeds: Sequence[int] = (),
+    time_limit: float | None = None,
+    dry_run: bool = False,
+) -> dict[str, Any]:
+    """Runs a sweep, of a passed environment if there is one; see `sweep`.
+
+    Nobody knows whether another environment is the same, so that such a sweep does not resume.
+    """
+    began = time.monotonic()
+    passed = {} if env is None else {"environment": secrets.token_hex(4)}
 
     def config_of(cell: Cell, layers: Layers) -> TrainConfig:
         named = {"config": settings.config and settings.config.replace("{task}", cell.task)}
         if cell.algorithm != "default":
             named["algorithm"] = cell.algorithm
-        return names.settings(cell.task, named, layers=layers)
+        return names.settings(env or cell.task, named, layers=layers)
 
     def stop() -> bool:
         return time_limit is not None and time.monotonic() - began > 60.0 * time_limit
 
     sweeps.prepare(settings, folder, write=False)
-    check = functools.partial(cast.check_start, impl=impl)
-    jobs = sweeps.plan(settings, folder, config_of, cells, seeds, check)
+    check = functools.partial(cast.check_start, impl=impl, task=env)
+    jobs = sweeps.plan(settings, folder, config_of, cells, seeds, check, passed)
     if dry_run:
         return {"left": _estimate(folder, jobs), "report": []}
     sweeps.prepare(settings, folder)
-    make = functools.partial(cast.environments, impl=impl)
+    make = functools.partial(cast.environments, impl=impl, task=env)
 
     def report_failure(job, error):
         return echo(f"mqe: {_names([job])} failed: {one_line(error)}")
@@ -112,15 +133,18 @@ def sweep(
     return {"left": _estimate(folder, left), "report": [str(file) for file in files]}
 
 
-def train_runs(plan: Sweep, folder: Path, file: str, impl: str) -> list[Path]:
-    """Trains all runs of a sweep and returns their folders, cell by cell.
+def train_runs(
+    plan: Sweep, folder: Path, file: str, impl: str, env: QuadrupedEnv | None = None
+) -> list[Path]:
+    """Trains all runs of a sweep, by default of its tasks; returns their folders, cell by cell.
 
     It also writes the sweep to a file.
 
     InputError if trainings failed or are left to other processes.
     """
     write_atomically(folder / file, yaml.safe_dump(to_mapping(plan), sort_keys=False).encode())
-    if left := sweep(folder / file, folder, impl=impl)["left"]["jobs"]:
+    settings = sweeps.load_sweep(folder / file)
+    if left := _run(settings, folder, impl, env)["left"]["jobs"]:
         raise InputError(
             f"folder: {folder} has {len(left)} unfinished trainings; the same command resumes them"
         )

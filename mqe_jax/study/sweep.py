@@ -182,21 +182,23 @@ def plan(
     cells: Sequence[str] = (),
     seeds: Sequence[int] = (),
     check: Callable[[TrainConfig, int], object] = lambda config, seeds: None,
+    passed: Mapping[str, Any] = FrozenMapping(),
 ) -> list[Job]:
     """Returns the remaining jobs of a sweep, in the order of training.
 
     They are of the cells that `select` returns for `cells`. `seeds` are some of the sweep's, all if
     empty. `config_of(cell, layers)` returns the settings of a cell, with the sweep's changes.
     `check(config, seeds)` raises an InputError for settings with which so many seeds could not
-    start; no cell is trained before. Seeds whose newest checkpoints differ are trained in separate
-    jobs. InputError for a cell whose runs come from other settings, files or another version.
+    start; no cell is trained before. The results also come from what is `passed`. Seeds whose
+    newest checkpoints differ are trained in separate jobs. InputError for a cell whose runs come
+    from other settings, files or another version.
     """
     if unknown := set(seeds) - set(sweep.seeds):
         fail("seeds", min(unknown), f"one of the sweep's: {', '.join(map(str, sweep.seeds))}")
     jobs = []
     for cell in select(sweep, cells):
         config = config_of(cell, sweep.layers(cell))
-        comes_from = provenance(settings=override(config, {"seed": 0}))
+        comes_from = provenance(settings=override(config, {"seed": 0}), **passed)
         wanted = [seed for seed in sweep.seeds if not seeds or seed in seeds]
         left = [seed for seed in wanted if not is_finished(_run(folder, cell, seed))]
         size = sweep.seeds_together or len(sweep.seeds)

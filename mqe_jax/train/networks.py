@@ -86,8 +86,9 @@ class Network(NamedTuple):
       takes all agents in parallel.
 
     `active` marks the agents that take part; None: all. The observations of the others are 0; a
-    network in which agents see each other must leave them out. `chunk_length` is the number of
-    steps of truncated backpropagation through time, 1 for feed-forward networks.
+    network in which agents see each other (`NetworkSettings.mixes_agents`) must leave them out.
+    `chunk_length` is the number of steps of truncated backpropagation through time, 1 without a
+    recurrent state.
     """
 
     init: Callable[[jax.Array], Params]
@@ -116,6 +117,11 @@ class NetworkSettings:
     @property
     def any_size(self) -> bool:
         """Whether a policy fits any number of agents, and of entities in a block."""
+        return False
+
+    @property
+    def mixes_agents(self) -> bool:
+        """Whether an agent's action depends on the observations or actions of others."""
         return False
 
     def features(self, dims: EnvDims) -> Features | None:
@@ -298,6 +304,10 @@ class Mat(GaussianSettings):
     @property
     def critic_reads(self) -> tuple[str, ...]:
         return ("obs",)
+
+    @property
+    def mixes_agents(self) -> bool:
+        return True
 
     def build(self, dims: EnvDims) -> Network:
         return load("mqe_jax.train.mat:network")(self, dims)

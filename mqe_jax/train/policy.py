@@ -207,7 +207,9 @@ class TrainedPolicy:
     ) -> tuple[jax.Array, Memory]:
         """Returns actions in [-1, 1] and the next memory.
 
-        `obs` (N, A, O) or (A, O) gives actions (N, A, D) or (A, D). It may also be `Observations`.
+        `obs` (N, A, O) or (A, O) gives actions (N, A, D) or (A, D). It may also be `Observations`,
+        which say who takes part. In an array, an agent whose numbers are all 0 takes no part if the
+        network mixes agents (`NetworkSettings.mixes_agents`).
         `memory` is the recurrent state; the caller resets it to `initial_memory` at an episode's
         start. Without a key, the action is the mean.
 
@@ -217,7 +219,10 @@ class TrainedPolicy:
         group = self.needs.group
         seen = Observations.at(obs, group)
         given = check_obs(seen.group(group), self.dims.agents, self.dims.observation)
-        return self.actor.act(Observations({group: given}, seen.active), memory, key)
+        active = seen.active
+        if seen is not obs and self.config.network.mixes_agents:
+            active = jnp.any(given != 0.0, axis=-1)
+        return self.actor.act(Observations({group: given}, active), memory, key)
 
 
 @functools.lru_cache(maxsize=32)
