@@ -126,7 +126,7 @@ def test_evaluations_come_with_the_run() -> None:
     ] and alone.absolute is not None
     alone.save("saved")
     written = mqe_jax.learn("fake", FEW | evaluation, run_dir="run")
-    assert Path("run", "curve.png").stat().st_size
+    assert all(Path(folder, "curve.png").stat().st_size for folder in ("saved", "run"))
     for other in (mqe_jax.load_run("saved"), written):
         assert (other.evaluations, other.absolute) == (alone.evaluations, alone.absolute)
 

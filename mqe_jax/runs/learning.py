@@ -89,6 +89,7 @@ class Run:
         check_run(path)
         save_policy(path, self.policy)  # first: it rejects weights that are not finite
         write_config(path, self.config)
+        curves.save_figure(self.plot(), path / "curve.png")
         log = CsvLog(path, 0)
         for values in zip(*self.metrics.values(), strict=True):
             log.write(dict(zip(self.metrics, map(float, values), strict=True)))
