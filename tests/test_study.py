@@ -556,7 +556,7 @@ def test_a_cell_that_fails_is_named_and_the_others_are_trained(
             raise InputError("opponents: this one cannot be read")
         trained.append(configs[0].ppo.ratio)
 
-    monkeypatch.setattr(cast, "environments", lambda config, seeds, impl: Cast(PROBE, PROBE))
+    monkeypatch.setattr(cast, "environments", lambda *_, **named: Cast(PROBE, PROBE))
     monkeypatch.setattr(sweeps, "train_seeds", train)
     monkeypatch.setattr("mqe_jax.study.report.report", lambda folder: [])
     said = mqe(f"sweep {tmp_path}/small.yaml --folder {tmp_path}/study", code=2).err
@@ -595,7 +595,7 @@ def test_the_commands_say_what_is_left_and_report(
     tmp_path: Path, monkeypatch: Any, mqe: Any
 ) -> None:
     load(tmp_path)
-    monkeypatch.setattr(cast, "environments", lambda config, seeds, impl: Cast(PROBE, PROBE))
+    monkeypatch.setattr(cast, "environments", lambda *_, **named: Cast(PROBE, PROBE))
     study = tmp_path / "study"
     sweep = f"sweep {tmp_path}/small.yaml --folder {study}"
     out = mqe(f"{sweep} --dry-run").out
