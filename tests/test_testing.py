@@ -11,6 +11,10 @@ from mqe_jax.testing import check_task
 
 
 def spawn_in_wall(env: Any) -> Any:
+    return [(x, y - 0.7, yaw) for x, y, yaw in env.compiled.layout.spawn]
+
+
+def spawn_outside(env: Any) -> Any:
     return [(x, y - 1.4, yaw) for x, y, yaw in env.compiled.layout.spawn]
 
 
@@ -27,6 +31,7 @@ def unfair_score(env: Any, before: Any, after: Any, collision: Any) -> Any:
     ("base", "method", "fault", "said"),
     [
         (Go1Gate, "spawn_poses", spawn_in_wall, "robot0/.* starts .* m inside barrier/side_right"),
+        (Go1Gate, "spawn_poses", spawn_outside, "its middle is 0.65 m outside of the outer walls"),
         (Go1Gate, "rewards", infinite_reward, "rewards: a number is NaN or infinite"),
         (Go1Gate, "outcome", lambda *_: {"success": 2.0}, "success is not between 0 and 1"),
         (Go1Gate, "acting", lambda *_: jnp.zeros(2, bool), "actions do not change the robots"),

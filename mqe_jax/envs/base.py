@@ -106,6 +106,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         self.objects = self.compiled.objects
         for name, (places, noise) in self.spreads.items():
             room = self.compiled.layout.room(places)
+            if room < 0.0:
+                raise InputError(f"{name}: its middle is {-room:.2f} m outside of the outer walls")
             if noise > room:
                 allowed = f"at most {room:.2f}, the distance to the nearest outer wall"
                 fail(name, getattr(self.params, name), allowed)
