@@ -5,9 +5,10 @@ and `fit` lets a policy act in it. `table` does all four for those who play. `se
 first two for those who learn.
 """
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, overload
 
@@ -43,6 +44,7 @@ from mqe_jax.train.needs import Needs
 from mqe_jax.train.policy import (
     POLICY_FILE,
     TrainedPolicy,
+    needed_imports,
     read_policy,
 )
 
@@ -244,7 +246,8 @@ def table(
         given = merge(merge(params, parameters_of(name, policies)), given)
     if sensors and not sensors_of({**params, **given}.get("senses", ())):
         given["senses"] = ONBOARD
-    made = environment(place, given, impl=impl, num_envs=num_envs)
+    with imports_of(read.get(run or ""), run or ""):
+        made = environment(place, given, impl=impl, num_envs=num_envs)
     sources = {"policy": first}
     if len(made.teams) > 1:
         sources["opponent"] = "idle" if second is None else second
@@ -302,7 +305,21 @@ def target(task: str | Path | QuadrupedEnv, read: Read | None = None) -> Target:
     policy = read_policy(source)
     if read is not None:
         read[source] = policy
-    return Target(task_id(policy.task), policy.config.env, source)
+    with imports_of(policy, source):
+        return Target(task_id(policy.task), policy.config.env, source)
+
+
+@contextlib.contextmanager
+def imports_of(policy: TrainedPolicy | None, run: str) -> Iterator[None]:
+    """Adds to an InputError the flags of `mqe` that import what the training of a run imported."""
+    try:
+        yield
+    except InputError as error:
+        flags = "" if policy is None else needed_imports(policy.metadata)
+        if policy is None or not flags:
+            raise
+        unknown = f"run: the task {policy.task!r} of {run} is not registered"
+        raise InputError(f"{error if policy.task in TASKS else unknown}: add {flags}") from None
 
 
 def _usual_policy(name: str, params: Params) -> str:

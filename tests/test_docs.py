@@ -24,7 +24,7 @@ import pytest
 import mqe_jax
 from mqe_jax import cli, names
 from mqe_jax.acting.evaluate import Evaluator
-from mqe_jax.cli.arguments import COMMANDS, parse
+from mqe_jax.cli.arguments import COMMANDS, parse, take_imports
 from mqe_jax.core.settings import override
 from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_SCRIPTED
@@ -231,8 +231,10 @@ def accepted(words: list[str]) -> bool:
         "...": "go1gate",
         **dict.fromkeys(("N", "I", "GPU", "SEED"), "1"),
     }
+    standing |= {"reach": "go1gate", "race": "go1tug"}  # which a page registers
+    _, words = take_imports(words[1:])
     try:
-        return bool(parse([standing.get(word, word) for word in words[1:]]))
+        return bool(parse([standing.get(word, word) for word in words]))
     except SystemExit as stop:
         return stop.code == 0
 
@@ -308,6 +310,10 @@ def example(script_folder: None) -> Any:
     module = importlib.import_module("new_task")
     yield module
     del sys.modules["new_task"], TASKS["go1catch"], SCRIPTED["go1catch"]
+
+
+def test_the_match_of_the_guide_is_that_of_the_example_package() -> None:
+    assert blocks(read("docs/new_match.md"), "python")[0] == read("examples/race/race.py")
 
 
 def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: Any) -> None:

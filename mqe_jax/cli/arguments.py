@@ -13,7 +13,9 @@ from mqe_jax.core.errors import known_name
 from mqe_jax.core.settings import TEXT, fail, is_text
 from mqe_jax.envs.registry import find_task, task_id
 
-FIRST_STEPS = """mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
+HINT = """`mqe COMMAND --help` explains every argument. With any command, --import FILE|MODULE
+imports what registers your own tasks, robots, sensors, networks or algorithms."""
+FIRST_STEPS = f"""mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 
 First steps:
   mqe tasks                                   list the tasks
@@ -25,7 +27,7 @@ First steps:
   mqe play-site -o page                       a web page on which the shipped policies play
   mqe bench go1gate                           environment steps per second on this machine
 
-`mqe COMMAND --help` explains every argument."""
+{HINT}"""
 COMMANDS: dict[str, Any] = {
     "tasks": commands.Tasks,
     "zoo": commands.Zoo,
@@ -57,7 +59,27 @@ def overview(group: str = "") -> str:
         if name.startswith(group):
             lines.append(f"  {name:12} {about}")
     listed = "\n".join(lines)
-    return f"usage: mqe COMMAND ...\n\n{listed}\n\n`mqe COMMAND --help` explains every argument."
+    usage = "usage: mqe [--import FILE|MODULE] COMMAND ..."
+    return f"{usage}\n\n{listed}\n\n{HINT}"
+
+
+def take_imports(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Returns the values of `--import`, which may stand anywhere, and the other arguments.
+
+    InputError for a missing value.
+    """
+    names = []
+    others = []
+    words = iter(arguments)
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if flag != "--import":
+            others.append(word)
+            continue
+        names.append(value if equals else next(words, ""))
+        if not is_text(names[-1]) or not names[-1] or names[-1].startswith("-"):
+            fail("import", names[-1], "a Python file or a module")
+    return names, others
 
 
 def _check_words(arguments: Sequence[str]) -> None:
@@ -91,6 +113,7 @@ def parse(arguments: Sequence[str]) -> Any:
     known_name("unknown command", name, COMMANDS)
     if name == "train":
         if rest and not rest[0].startswith("-"):
+            programs.find_packages(rest[0])
             task_id(rest[0])
         from mqe_jax.cli.train import parse_train
 
@@ -104,6 +127,7 @@ def parse(arguments: Sequence[str]) -> Any:
     command = tyro.cli(COMMANDS[name], prog=f"mqe {name}", args=rest, config=options)
     target = getattr(command, "target", None) or getattr(command, "task", None)
     if isinstance(target, str):
+        programs.find_packages(target)
         find_task(target)  # before JAX and MuJoCo are imported, which take seconds
     return command
 

@@ -53,7 +53,8 @@ class Export:
         from mqe_jax.export.policy import shapes
         from mqe_jax.export.robot_graph import verify_robot
 
-        env = names.environment(task, policy.config.env)
+        with names.imports_of(policy, str(self.run_dir)):
+            env = names.environment(task, policy.config.env)
         if self.per_robot:
             model, error = verify_robot(policy if self.sampled else policy.acting(True), env)
         else:

@@ -17,6 +17,7 @@ import tyro
 from mqe_jax.core import interrupts
 from mqe_jax.core.devices import PEER, PEER_ENDED
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.imports import IMPORTED
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail, settings_class
@@ -73,7 +74,9 @@ class Launch:
         """
         if os.name != "posix":
             raise InputError(f"launch: {sys.platform} is not supported; it needs Linux or macOS")
-        code = _supervise(self.command, self._members(), together=not self._sweeps)
+        imports = [word for name in IMPORTED for word in ("--import", name)]
+        command = (*imports, *self.command)
+        code = _supervise(command, self._members(), together=not self._sweeps)
         if code:
             raise SystemExit(code)
 

@@ -49,7 +49,8 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
     """Runs a command; returns the exit code and the message for standard error, if any."""
     # Imported after `interrupts.install`.
     import mqe_jax
-    from mqe_jax.cli.arguments import FIRST_STEPS, parse
+    from mqe_jax.cli import programs
+    from mqe_jax.cli.arguments import FIRST_STEPS, parse, take_imports
 
     if not arguments:
         print(FIRST_STEPS)
@@ -58,12 +59,13 @@ def _attempt(arguments: Sequence[str]) -> tuple[int, str]:
         print(f"mqe {mqe_jax.__version__}")
         return 0, ""
     try:
-        command = parse(arguments)
+        names, words = take_imports(arguments)
         if "MQE_PROCESS" in os.environ:
             from mqe_jax.cli.launch import join
 
-            join()
-        _run(command)
+            join()  # before an import, which may compute
+        programs.add_imports(names)
+        _run(parse(words))
     except SystemExit as stop:
         if not stop.code:
             raise

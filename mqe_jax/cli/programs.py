@@ -6,6 +6,7 @@ import importlib
 import os
 import platform
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,27 @@ def hasten() -> None:
     """Makes the start of a command faster: fewer searches for garbage, no plug-ins of pydantic."""
     gc.set_threshold(50_000, 20, 100)
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+
+
+def add_imports(names: Sequence[str]) -> None:
+    """Imports the values of `--import`, in single precision; errors as `core.imports.add`."""
+    if not names:
+        return
+    import_mujoco()
+    from mqe_jax.core import imports
+    from mqe_jax.core.precision import single  # imports JAX
+
+    for name in names:
+        single(imports.add)(name)
+
+
+def find_packages(target: str) -> None:
+    """Imports packages that register tasks, if a target may be a task of theirs."""
+    from mqe_jax.envs.registry import ALIASES, TASKS, load_packages, packages
+
+    if target not in (*TASKS, *ALIASES) and os.sep not in target and packages():
+        import_mujoco()
+        load_packages()
 
 
 def import_mujoco() -> None:

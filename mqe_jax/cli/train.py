@@ -11,7 +11,7 @@ import pydantic
 import tyro
 
 from mqe_jax.cli.options import DumpDiverged, TaskOptions
-from mqe_jax.core import interrupts
+from mqe_jax.core import imports, interrupts
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import SeedCount
 from mqe_jax.core.literal import echo
@@ -107,7 +107,8 @@ class Train(TaskOptions):
         for folder, run in zip(folders, runs, strict=True):
             if jax.process_count() == 1:
                 echo(f"mqe: {folder} reaches {_reached(run, folder, self.impl)}")
-            echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: mqe eval {folder}")
+            command = f"mqe eval {folder} {imports.flags(imports.IMPORTED)}"
+            echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: {command}")
         echo(f"mqe: {run_dir / 'curve.png'} has the curve")
 
 

@@ -5,7 +5,14 @@ from typing import TYPE_CHECKING, Any
 from mqe_jax.core.lazy import load
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.settings import checked, override
-from mqe_jax.envs.registry import ALIASES, SCRIPTED, TASKS, register_task, task_id
+from mqe_jax.envs.registry import (
+    ALIASES,
+    SCRIPTED,
+    TASKS,
+    load_packages,
+    register_task,
+    task_id,
+)
 
 if TYPE_CHECKING:
     from mqe_jax.envs.autoreset import VectorEnv
@@ -31,13 +38,14 @@ def __getattr__(name: str) -> Any:
 
 
 def tasks() -> tuple[str, ...]:
-    """Returns the ids of all registered tasks.
+    """Returns the ids of all registered tasks, those of installed packages included.
 
     Example:
         ```python
         print(mqe_jax.tasks())  # ('go1plane', 'go1gate', ...)
         ```
     """
+    load_packages()
     return tuple(TASKS)
 
 

@@ -1,22 +1,27 @@
 """Registry of tasks and their scripted policies; a new task is one line in `SHIPPED`.
 
 A task's module is imported when its class is asked for, so that listing tasks imports neither JAX
-nor MuJoCo.
+nor MuJoCo. Installed packages register tasks by entry points (`load_packages`).
 """
 
 from __future__ import annotations
 
+import functools
 import os
 from collections import UserDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
+from mqe_jax.core import imports
 from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.lazy import load
+from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import checked, fail
 
 if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
     import jax
 
     from mqe_jax.envs.base import QuadrupedEnv
@@ -135,6 +140,8 @@ SHIPPED = {
 # Alternative ids, from the released system.
 ALIASES = {"go1bridgewrestling": "go1wrestling"}
 
+_LOADED: set[EntryPoint] = set()
+
 
 class _Tasks(UserDict[str, Any]):
     """Task classes by id, of which the shipped ones are imported on demand."""
@@ -212,8 +219,37 @@ def register_task(
     return task
 
 
+@functools.cache
+def packages() -> tuple[EntryPoint, ...]:
+    """Returns the entry points `mqe_jax.tasks` of installed packages, without importing them."""
+    from importlib.metadata import entry_points  # 20 ms
+
+    return tuple(entry_points(group="mqe_jax.tasks"))
+
+
+def load_packages() -> None:
+    """Imports the entry points of installed packages, once; a class of tasks is registered.
+
+    A line on standard error names a package that fails.
+    """
+    for entry in packages():
+        if entry in _LOADED:
+            continue
+        _LOADED.add(entry)
+        try:
+            found = entry.load()
+            if isinstance(found, type):
+                register_task(found)
+        except (Exception, SystemExit) as error:
+            owner = entry.dist.name if entry.dist else entry.value
+            why = imports.reason(error)
+            echo(f"mqe: warning: the package {owner} does not register its tasks: {why}")
+
+
 def task_id(name: str) -> str:
     """Returns the id for which an id or an alias stands; InputError for an unknown one.
+
+    An unknown id imports the packages of `load_packages`.
 
     Example:
         ```python
@@ -222,8 +258,11 @@ def task_id(name: str) -> str:
         print(task_id("go1bridgewrestling"))  # go1wrestling
         ```
     """
-    own = "or one that register_task adds in this process"
-    return known_name("task: unknown id", ALIASES.get(name, name), (*TASKS, own))
+    name = ALIASES.get(name, name)
+    if name not in TASKS:
+        load_packages()
+    own = "or one that register_task adds in this process (mqe: --import FILE)"
+    return known_name("task: unknown id", name, (*TASKS, own))
 
 
 def find_task(target: str) -> str | None:
@@ -231,6 +270,10 @@ def find_task(target: str) -> str | None:
 
     InputError for an unknown id.
     """
-    if ALIASES.get(target, target) not in TASKS and (os.sep in target or Path(target).exists()):
-        return None
+    if ALIASES.get(target, target) not in TASKS:
+        if os.sep in target:
+            return None
+        load_packages()
+        if target not in TASKS and Path(target).exists():
+            return None
     return task_id(target)

@@ -13,6 +13,7 @@ import yaml
 from mqe_jax import names
 from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.files import write_atomically
+from mqe_jax.core.imports import IMPORTED
 from mqe_jax.core.limits import Positive, Seed
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import checked, to_mapping
@@ -95,7 +96,9 @@ def _run(
     Nobody knows whether another environment is the same, so that such a sweep does not resume.
     """
     began = time.monotonic()
-    passed = {} if env is None else {"environment": secrets.token_hex(4)}
+    passed: dict[str, Any] = {} if env is None else {"environment": secrets.token_hex(4)}
+    if IMPORTED:
+        passed["imports"] = [*IMPORTED]
 
     def config_of(cell: Cell, layers: Layers) -> TrainConfig:
         named = {"config": settings.config and settings.config.replace("{task}", cell.task)}

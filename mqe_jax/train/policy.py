@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from annotated_types import Ge
 
+from mqe_jax.core import imports
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.files import check_folder, check_locks, digest
 from mqe_jax.core.precision import single
@@ -321,6 +322,12 @@ def read_policy(run: str | Path) -> TrainedPolicy:
     return policy_in(read_file(file, kind="policy"))
 
 
+def needed_imports(metadata: Mapping[str, Any]) -> str:
+    """Returns the flags of `mqe` for imports of a policy's training that this process lacks."""
+    names = check("imports", metadata.get("imports", ()), tuple[str, ...])
+    return imports.flags(name for name in names if name not in imports.IMPORTED)
+
+
 def policy_path(run: str | Path) -> Path:
     """Returns the policy file of a run folder, or a policy file itself."""
     path = Path(run)
@@ -346,6 +353,7 @@ def policy_in(stored: Stored) -> TrainedPolicy:
         deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, AttributeError, InputError) as error:
-        raise InputError(f"{stored.path}: its settings cannot be read ({error})") from None
+        hint = f": add {needed}" if (needed := needed_imports(stored.metadata)) else ""
+        raise InputError(f"{stored.path}: its settings cannot be read ({error}){hint}") from None
     tree = stored.tree(template(needs.dims, config.network), half=True)
     return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)

@@ -1,0 +1,146 @@
+"""Tasks of one's own from a file, `mqe --import`, and from installed packages."""
+
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mqe_jax
+from mqe_jax.cli import launch, train
+from mqe_jax.core import imports
+from mqe_jax.envs import TASKS, registry
+
+RACE = Path(__file__).parents[1] / "examples" / "race" / "race.py"
+FEW = (
+    "--impl c --control position --set episode_length=0.1 --num-envs 8 --rollout-steps 4 "
+    "--total-steps 32 --ppo.minibatches 1 --network.hidden-sizes 8 --network.no-recurrent"
+)
+
+
+@pytest.fixture
+def forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """A function after which nothing is imported, as in another process; in a folder with race.py.
+
+    It also forgets installed packages.
+    """
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    shutil.copy(RACE, tmp_path)
+
+    def clear() -> None:
+        for name in ("race", "broken", "names", "names.race"):
+            sys.modules.pop(name, None)
+        TASKS.pop("race", None)
+        imports.IMPORTED.clear()
+        registry.packages.cache_clear()
+        registry._LOADED.clear()
+
+    clear()
+    yield clear
+    clear()
+
+
+def test_a_run_asks_for_the_import_of_its_task(forget: Any, mqe: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(train, "_EPISODES", 4)
+    said = mqe(f"--import race.py train race {FEW}").err
+    assert "evaluate it with: mqe eval runs/race --import race.py\n" in said
+    onnx = "export runs/race --onnx a.onnx"
+    for command in ("eval runs/race", "render runs/race -o a.png", onnx):
+        forget()
+        said = mqe(command, code=2).err
+        assert said == "mqe: run: the task 'race' of runs/race is not registered: " + (
+            "add --import race.py\n"
+        )
+    few = "--episodes 2 --num-envs 2 --impl c"
+    assert "policy               runs/race" in mqe(f"eval runs/race --import=race.py {few}").out
+    assert mqe(f"--import race.py --import ./race.py eval runs/race {few}").out  # both once
+
+
+def test_a_sweep_resumes_with_the_same_file_only(forget: Any, mqe: Any) -> None:
+    Path("few.yaml").write_text(
+        "{tasks: [race], algorithms: [default], seeds: [0], settings: {num_envs: 8, "
+        "rollout_steps: 4, total_steps: 32, ppo.minibatches: 1, evaluation.every: none, "
+        "network: {hidden_sizes: [8], recurrent: false}, "
+        "env: {control: position, episode_length: 0.1}}}"
+    )
+    sweep = "sweep few.yaml --impl c --import race.py"
+    mqe(sweep)
+    assert '"jobs": []' in mqe(f"{sweep} --json").out
+    Path("race.py").write_text(Path("race.py").read_text() + "\n")
+    assert "race.py: has changed since the results in" in mqe(sweep, code=2).err
+
+
+def test_processes_of_a_training_import_the_same(forget: Any, mqe: Any, monkeypatch: Any) -> None:
+    started: list[Any] = []
+
+    def supervise(command: Any, *_: Any, together: bool) -> int:
+        started.append(command)
+        return 0
+
+    monkeypatch.setattr(launch, "_supervise", supervise)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    mqe("launch --processes 2 train race --import race.py")
+    assert started == [("--import", "race.py", "train", "race")]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("absent.py", None, "import: no file 'absent.py'"),
+        ("absent", None, "import: no module 'absent'"),
+        ("race", None, "import: no module 'race'; did you mean race.py?"),
+        ("", None, "import: '' is not allowed; it must be a Python file or a module"),
+        ("broken.py", "a = 1\nb = c\n", "NameError: name 'c' is not defined (broken.py, line 2)"),
+        (
+            "broken.py",
+            "import race\nx = race.Race.nam\n",
+            "has no attribute 'nam' (broken.py, line",
+        ),
+        (
+            "broken.py",
+            "import absent\n",
+            "broken.py: ModuleNotFoundError: No module named 'absent'",
+        ),
+        ("json.py", "", "json is the name of another module"),
+    ],
+)
+def test_what_cannot_be_imported(
+    name: str, content: str | None, said: str, forget: Any, mqe: Any
+) -> None:
+    if content is not None:
+        Path(name).write_text(content)
+    err = mqe("tasks --import", name, code=2).err
+    assert said in err and err.count("\n") == 1
+
+
+def install(name: str, module: str, folder: Path) -> None:
+    """Writes what pip writes about a package with a task."""
+    about = folder / f"{name}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[mqe_jax.tasks]\nrace = {module}\n")
+
+
+@pytest.mark.parametrize("module", ["race", "race:Race", "names.race"])
+def test_installed_packages_register_tasks(
+    module: str, forget: Any, tmp_path: Path, capfd: Any
+) -> None:
+    sys.path.append(str(tmp_path))
+    install("mqe_race", module, tmp_path)
+    install("mqe_broken", "broken", tmp_path)
+    Path("broken.py").write_text("raise OSError('no\\nweights')")
+    Path("names").mkdir()
+    shutil.copy("race.py", "names/race.py")
+    Path("names/__init__.py").touch()
+    assert mqe_jax.make("go1gate", impl="c").name == "go1gate"
+    assert registry._LOADED == set() and capfd.readouterr().err == ""
+    assert mqe_jax.make("race", impl="c").teams == ((0,), (1,))
+    assert capfd.readouterr().err == (
+        "mqe: warning: the package mqe_broken does not register its tasks: OSError: no weights "
+        "(broken.py, line 1)\n"
+    )
+    imports.add(f"{module.partition(':')[0].replace('.', '/')}.py")  # the same file
+    assert mqe_jax.tasks().count("race") == 1
