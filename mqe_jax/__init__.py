@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mqe_jax.runs.exploiting import exploitability
     from mqe_jax.runs.learning import Run, learn, learn_seeds, load_run
     from mqe_jax.runs.playing import Clip, evaluate, render, tournament
+    from mqe_jax.runs.recording import record
     from mqe_jax.runs.sweeping import sweep
     from mqe_jax.runs.throughput import bench
     from mqe_jax.train.config import TrainConfig
@@ -51,6 +52,7 @@ __all__ = [
     "load_run",
     "make",
     "make_learner",
+    "record",
     "render",
     "sweep",
     "tasks",
@@ -71,6 +73,7 @@ _HOMES = {
     "exploitability": "runs.exploiting",
     "load_policy": "names",
     "make_learner": "runs.cast",
+    "record": "runs.recording",
     "sweep": "runs.sweeping",
     "train_skill": "walk.training",
     "versus": "names",

@@ -367,6 +367,17 @@ def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:
     )
 
 
+@pytest.mark.usefixtures("small")
+def test_a_policy_is_cloned_from_a_data_set(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("minari")
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "clone.py"))
+    mqe_jax.record("go1gate", folder="gate", episodes=2)
+    seen, actions = example["read"]("gate")
+    assert seen.shape == (2 * 20 * 2, 16) and actions.shape == (2 * 20 * 2, 3)
+    policy = example["clone"](seen, actions, steps=300)
+    assert np.mean((policy(seen) - actions) ** 2) < 0.3 * actions.var()
+
+
 @pytest.mark.soak
 def test_self_play_trains_against_a_snapshot_and_a_scripted_opponent() -> None:
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "self_play.py"))

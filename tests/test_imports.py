@@ -28,6 +28,7 @@ CHECKING = {
     "runs.exploiting",
     "runs.learning",
     "runs.playing",
+    "runs.recording",
     "runs.sweeping",
     "runs.throughput",
     "selfplay.league.crossplay",

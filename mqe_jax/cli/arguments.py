@@ -7,7 +7,7 @@ from typing import Any
 
 import tyro
 
-from mqe_jax.cli import commands, exploit, export, programs, render, skill, study, view
+from mqe_jax.cli import commands, exploit, export, programs, record, render, skill, study, view
 from mqe_jax.core import limits
 from mqe_jax.core.errors import known_name
 from mqe_jax.core.settings import TEXT, fail, is_text
@@ -35,6 +35,7 @@ COMMANDS: dict[str, Any] = {
     "train": "Train a policy on a task, into a run folder.",
     "eval": commands.Eval,
     "render": render.Render,
+    "record": record.Record,
     "view": view.View,
     "export": export.Export,
     "play-site": export.PlaySite,
