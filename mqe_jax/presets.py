@@ -138,15 +138,17 @@ def _has_sensors(env: Mapping[str, Any]) -> bool:
 
 def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     """Returns the layers of a shipped name or a file."""
-    shipped = ["demo", "laptop", "league", "sizes"]
+    shipped = ["demo", "laptop", "league", "sizes", "student"]
     for file in ("paper", "tuned"):
         shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
     name = path_text(check("config", config, PathText))
     if name == "demo":  # of the gate, whatever the task
         return _layers_of("go1gate", "laptop")
     if name in shipped:
-        changes = name in ("laptop", "sizes")  # of the default settings
+        changes = name in ("laptop", "sizes", "student")  # of the default settings
         below = _layers_of(task, default_name(task)) if changes else []
+        if name == "student":
+            below += [_Layer.of("", _parts("onboard")), _Layer.of("", {"imitation.teacher": task})]
         file, _, part = name.partition("/")
         parts = [_parts(file)["common"], _parts(file).get(part or task, {})]
         layers = below + [_Layer.of("", values) for values in parts]

@@ -173,11 +173,12 @@ TARGETS = {
     "report": ["a"],
     "tournament": ["go1tug", "idle", "random", "-o", "cup"],
     "exploit": ["go1tug", "idle"],
+    "record": ["go1gate", "-o", "data"],
 }
 """Positional and needed arguments of each command."""
 
 
-LONG = ("view", "skill train", "skill eval", "tournament", "exploit")
+LONG = ("view", "skill train", "skill eval", "tournament", "exploit", "record")
 """Commands that run for long where a text happens to be allowed; they get numbers only, which never
 are."""
 

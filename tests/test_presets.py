@@ -60,7 +60,7 @@ def shipped() -> list[str | None]:
         for part in load_yaml(CONFIG_FOLDER / f"{file}.yaml")
         if part != "common"
     ]
-    return [None, "demo", "laptop", "league", "sizes", *parts]
+    return [None, "demo", "laptop", "league", "sizes", "student", *parts]
 
 
 def digests() -> dict[str, str]:
@@ -83,7 +83,7 @@ def test_shipped_settings_are_the_stored_ones() -> None:
     assert digests() == json.loads(STORED.read_text())
 
 
-@pytest.mark.parametrize("name", [None, "league", "sizes"])
+@pytest.mark.parametrize("name", [None, "league", "sizes", "student"])
 @pytest.mark.parametrize("task", SHIPPED)
 def test_tasks_have_the_parameters_of_shipped_settings(task: str, name: str | None) -> None:
     build(TASKS[task].Params, resolve(task, name).training_env)
@@ -193,6 +193,22 @@ def test_sensors_beside_settings_that_do_not_read_them_are_refused() -> None:
     assert reading.group == "onboard"
     own = TrainConfig(env={"senses": "onboard"})
     assert names.settings("go1gate", own, env={"senses": ["lidar"]}).group == "policy"
+
+
+@pytest.mark.parametrize("task", ["go1gate", "go1tug"])
+def test_a_student_imitates_the_shipped_policy_on_sensors(task: str) -> None:
+    config = parse_train([task, "--config", "student"]).settings
+    senses = parse_train([task, "--senses", "onboard"]).settings
+    assert (config.group, config.env["senses"]) == (senses.group, senses.env["senses"])
+    assert config.network == override(senses.network, {"log_std_init": -1.2})
+    assert config.imitation.teacher == task and config.imitation.weight == 4.0
+    assert config.total_steps <= 400_000
+    assert not config.curriculum.assistance and config.curriculum.demonstrator is None
+    assert config.opponents == (("scripted", "newest") if task == "go1tug" else ())
+    changes = {"imitation.teacher": "runs/own", "env": {"senses": ["lidar"]}}
+    other = resolve(task, "student", layers={"": changes})
+    assert (other.imitation.teacher, other.env["senses"]) == ("runs/own", ["lidar"])
+    assert other.group == "onboard"
 
 
 def test_what_policies_need_lies_below_all_other_parameters() -> None:
