@@ -1,5 +1,7 @@
 """Tasks of one's own from a file, `mqe --import`, and from installed packages."""
 
+import json
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -12,8 +14,11 @@ import mqe_jax
 from mqe_jax.cli import launch, train
 from mqe_jax.core import imports
 from mqe_jax.envs import TASKS, registry
+from mqe_jax.envs.registry import SHIPPED
+from mqe_jax.presets import default_name
 
 RACE = Path(__file__).parents[1] / "examples" / "race" / "race.py"
+GROUPS = ("rewards", "randomization")
 FEW = (
     "--impl c --control position --set episode_length=0.1 --num-envs 8 --rollout-steps 4 "
     "--total-steps 32 --ppo.minibatches 1 --network.hidden-sizes 8 --network.no-recurrent"
@@ -144,3 +149,33 @@ def test_installed_packages_register_tasks(
     )
     imports.add(f"{module.partition(':')[0].replace('.', '/')}.py")  # the same file
     assert mqe_jax.tasks().count("race") == 1
+
+
+def test_a_task_of_ones_own_is_listed_and_shown(forget: Any, mqe: Any) -> None:
+    assert "race                  Race               1 vs 1" in mqe("tasks --import race.py").out
+    shown = mqe("tasks race --set episode_length=3").out
+    assert "Two robots race to x = 4 m." in shown and "lead=1                  Per m that" in shown
+    assert re.search(r"^  ends after +3 s, a roll above", shown, re.MULTILINE)
+    assert "mqe train race --config laptop --import race.py\n" in shown
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_a_shipped_task_is_shown(task: str, mqe: Any) -> None:
+    shown = mqe(f"tasks {task} --long").out
+    env = mqe_jax.make(task, impl="c")
+    names = [block.name for block in env.observation_layout.blocks]
+    assert all(f"\n  {name} (" in shown for name in names)
+    assert all(f"\n  {name}=" in shown for name in vars(env.params.rewards))
+    assert all(f"\n  {name}" in shown for name in vars(env.params) if name not in GROUPS)
+    assert f" {default_name(task)}: " in shown
+    assert max(map(len, shown.splitlines())) <= 80
+    found = json.loads(mqe(f"tasks {task} --json").out)
+    assert sum(block["width"] for block in found["observation"]) == env.observation_size
+    assert all(x["meaning"] for x in [*found["rewards"], *found["parameters"]])
+
+
+def test_sensors_are_shown_and_flags_need_a_task(mqe: Any) -> None:
+    shown = mqe("tasks go1gate --senses onboard --control position").out
+    assert "\nSensors: blocks (width)\n  gravity (3) " in shown
+    assert "12 numbers from -1 to 1, control position" in shown
+    assert "robot: is for a task; name one: mqe tasks TASK" in mqe("tasks --robot go2", code=2).err

@@ -9,14 +9,12 @@ the site says how to build it.
 """
 
 import contextlib
-import dataclasses
 import functools
-import inspect
 import io
 import posixpath
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ import griffe
 import latex2mathml.converter
 from mkdocs.structure.files import File
 
+from mqe_jax.envs.facts import Field
 from mqe_jax.policies import zoo
 
 ROOT = Path(__file__).parents[1]
@@ -203,15 +202,12 @@ def overview(tasks: Mapping[str, Any]) -> str:
 
 def task_page(task: Any) -> str:
     """Returns the page of a task."""
-    from mqe_jax.envs import SCRIPTED, TaskParams
+    from mqe_jax.envs import SCRIPTED
+    from mqe_jax.envs.facts import facts
 
     env = task(num_envs=1, impl="c")
     name = task.name
-    bodies = (
-        inspect.cleandoc(cls.__doc__ or "").partition("\n")[2].strip() for cls in task.__mro__
-    )
-    body = next(filter(None, bodies))  # that of a base class if the task's is one line
-    body = re.sub(r"see `\w+Rewards`", "the terms below", body)
+    about = facts(env)
     policy = "scripted" if name in SCRIPTED else "forward"
     if name in zoo.names():
         policy = "shipped"
@@ -228,14 +224,10 @@ def task_page(task: Any) -> str:
         f"mqe view {name}{flags}": "live, in the browser",
         f"mqe train {name}": "train a policy",
     }
-    units = {command.name: command.unit for command in env.controller.skill.commands}
-    ranges = [
-        f"`{name}` {low:g} to {high:g} {units[name]}"
-        for name, (low, high) in env.params.action_ranges().items()
-    ]
+    ranges = [f"`{name}` {text}" for name, text in about.actions.items()]
     width = max(map(len, commands))
     lines = "\n".join(f"{command:{width}}  # {text}" for command, text in commands.items())
-    facts = [
+    lead = [
         f"- Robots: {' vs '.join(str(len(team)) for team in env.teams)}.",
         f"- Action: commands of the skill `{env.params.skill}` ({', '.join(ranges)}). "
         "With control `position` or `torque`, 12 numbers.",
@@ -249,16 +241,14 @@ def task_page(task: Any) -> str:
         *media,
         f"```bash\n{lines}\n```",
         "[Settings of the training, and what to expect](../results/settings.md).",
-        "\n".join([*facts, body]),
+        "\n".join([*lead, about.about]),
         f"## Observation of an agent\n\n{env.observation_size} numbers:",
         "| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),
         f"A critic may also see the privileged observation, {env.privileged_observation_size} "
         "numbers.",
-        "## Reward terms\n\n"
-        + _fields(type(env.params.rewards), "weight", given=vars(env.params.rewards)),
+        "## Reward terms\n\n" + _table(about.rewards, "weight"),
         "Set a weight with `--set rewards.NAME=VALUE` or `make(task, rewards={...})`.",
-        "## Parameters\n\n"
-        + _fields(type(env.params), "default", skip=_shared(type(env.params), TaskParams)),
+        "## Parameters\n\n" + _table(about.parameters, "default"),
         "Set one with `--set NAME=VALUE` or `make(task, NAME=VALUE)`. "
         "All tasks share [further parameters](../reference/envs.params.md).",
     ]
@@ -269,54 +259,14 @@ def _clip(name: str) -> str | None:
     return f"../clips/{name}.webp" if (ROOT / "docs" / "clips" / f"{name}.webp").is_file() else None
 
 
-def _meanings(cls: type[Any]) -> dict[str, str]:
-    """Returns the docstrings of a class's own fields by name."""
-    members = _package()[f"{cls.__module__}.{cls.__qualname__}"[8:]].members
-    return {name: x.docstring.value for name, x in members.items() if x.docstring}
+def _table(fields: Sequence[Field], column: str) -> str:
+    """Returns a table of parameters or reward terms."""
+    rows = [f"| `{x.name}` | {_shown(x.value)} | {_cell(x.meaning)} |" for x in fields]
+    return "\n".join([f"| name | {column} | meaning |", "|---|---|---|", *rows])
 
 
-def _fields(
-    kind: type[Any], column: str, skip: tuple[str, ...] = (), given: Mapping[str, Any] | None = None
-) -> str:
-    """Returns a table of a settings class's fields, those of its base last.
-
-    Docstrings give the meanings.
-
-    Values are defaults, or those `given`.
-    """
-    meanings = [_meanings(cls) for cls in kind.__mro__ if cls is not object]
-    values: dict[str, Any] = {
-        f.name: f.default for f in dataclasses.fields(kind) if f.name not in skip
-    }
-    values |= given or {}
-    rows = []
-    for name in sorted(values, key=lambda name: name in meanings[-1]):
-        value = values[name]
-        if dataclasses.is_dataclass(value):  # an object of the scene
-            texts = _meanings(type(value))
-            for field in dataclasses.fields(value):
-                part = f"{name}.{field.name}"
-                rows.append(_row(part, getattr(value, field.name), texts[field.name]))
-        else:
-            rows.append(_row(name, value, next((own[name] for own in meanings if name in own), "")))
-    return f"| name | {column} | meaning |\n|---|---|---|\n" + "\n".join(rows)
-
-
-def _row(name: str, value: Any, text: str) -> str:
-    meaning = " ".join(text.split()).replace("|", "\\|")
-    return f"| `{name}` | {_shown(value)} | {meaning} |"
-
-
-def _shared(kind: type[Any], base: type[Any]) -> tuple[str, ...]:
-    """Returns the fields that a settings class shares with another one, and groups of settings.
-
-    Shared fields have the same default.
-    """
-    known = {field.name: field.default for field in dataclasses.fields(base)}
-    same = [
-        f.name for f in dataclasses.fields(kind) if f.name in known and f.default == known[f.name]
-    ]
-    return ("rewards", "randomization", *same)
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
 
 
 @functools.cache
@@ -325,6 +275,4 @@ def _package() -> Any:
 
 
 def _shown(value: Any) -> str:
-    if value is dataclasses.MISSING:
-        return ""
     return f"{value:g}" if isinstance(value, float) else f"`{value}`"

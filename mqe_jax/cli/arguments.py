@@ -18,7 +18,7 @@ imports what registers your own tasks, robots, sensors, networks or algorithms."
 FIRST_STEPS = f"""mqe: multi-agent quadruped tasks in JAX on MuJoCo MJX
 
 First steps:
-  mqe tasks                                   list the tasks
+  mqe tasks                                   list the tasks (mqe tasks TASK shows one)
   mqe render go1gate -o gate.gif              render a task, with its shipped policy (mqe zoo)
   mqe train go1gate --config demo             train two robots at a gate (minutes on a CPU)
   mqe eval runs/go1gate                       evaluate the trained policy

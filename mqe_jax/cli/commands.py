@@ -7,10 +7,11 @@ import contextlib
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from mqe_jax.cli import programs
 from mqe_jax.cli.options import (
     DumpDiverged,
     Json,
@@ -22,6 +23,7 @@ from mqe_jax.cli.options import (
     print_columns,
     print_table,
 )
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, Episodes, Horizon
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail, settings_class
@@ -38,17 +40,36 @@ _RATES = {
 
 
 @settings_class
-class Tasks:
-    """List the tasks with their robots, sizes and time limits; --long adds observation sizes."""
+class Tasks(TaskOptions):
+    """List the tasks with their robots and sizes; with TASK, show its parameters and rewards."""
 
+    task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
+    """Id of a task, which is shown: scene, observation, rewards, parameters, training."""
     json: Json = False
     long: Long = False
-    light: ClassVar[bool] = True
+
+    @property
+    def light(self) -> bool:
+        """Whether the command needs neither JAX nor MuJoCo."""
+        return self.task is None
 
     def run(self) -> dict[str, Any]:
-        """Lists the tasks with their default parameters, without importing JAX or MuJoCo."""
-        from mqe_jax.envs.registry import SHIPPED
+        """Lists the tasks, the shipped ones without importing JAX or MuJoCo, or shows one."""
+        from mqe_jax.envs.registry import listed
 
+        if self.task is not None:
+            from mqe_jax.cli import task_card
+            from mqe_jax.envs import make
+
+            about = task_card.describe(make(self.task, impl=self.impl, **self.overrides()))
+            if not self.json:
+                task_card.show(about, long=self.long)
+            return about
+        given = next(iter(self.overrides()), "impl" if self.impl != "auto" else None)
+        if given:
+            raise InputError(f"{given}: is for a task; name one: mqe tasks TASK")
+        programs.find_packages("")
+        tasks = listed()
         rows = [
             {
                 "task": name,
@@ -61,15 +82,15 @@ class Tasks:
                 "time_limit_s": task.time_limit,
                 "shipped_policy": (_ZOO / f"{name}.safetensors").is_file(),
             }
-            for name, task in SHIPPED.items()
+            for name, task in tasks.items()
         ]
         if self.json:
             return {"tasks": rows}
         columns = {
             "task": [row["task"] for row in rows],
             "title": [row["title"] for row in rows],
-            "robots": [" vs ".join(map(str, task.teams)) for task in SHIPPED.values()],
-            "sizes": [" to ".join(map(str, task.sizes or ())) for task in SHIPPED.values()],
+            "robots": [" vs ".join(map(str, task.teams)) for task in tasks.values()],
+            "sizes": [" to ".join(map(str, task.sizes or ())) for task in tasks.values()],
             "time, s": [f"{row['time_limit_s']:g}" for row in rows],
         }
         if self.long:
@@ -82,7 +103,7 @@ class Tasks:
         else:
             print_columns(columns, left=4)
             print("\nsizes: numbers N of robots for --set num_agents=N; in matches N must be even")
-            print("Watch one: mqe render go1gate -o gate.gif")
+            print("Read about one: mqe tasks go1gate. Watch it: mqe render go1gate -o gate.gif")
         return {"tasks": rows}
 
 

@@ -246,6 +246,17 @@ def load_packages() -> None:
             echo(f"mqe: warning: the package {owner} does not register its tasks: {why}")
 
 
+def listed() -> dict[str, Shipped]:
+    """Returns what `mqe tasks` lists: of shipped tasks from here, of others from an environment."""
+    found = dict(SHIPPED)
+    for name in TASKS.keys() - SHIPPED.keys():
+        env = TASKS[name](num_envs=1, impl="c")
+        teams = tuple(len(team) for team in env.teams)
+        sizes = env.observation_size, env.privileged_observation_size
+        found[name] = Shipped("", None, env.title, teams, *sizes, env.params.episode_length)
+    return found
+
+
 def task_id(name: str) -> str:
     """Returns the id for which an id or an alias stands; InputError for an unknown one.
 
