@@ -74,6 +74,27 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
+@functools.cache
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub names them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.M)
+    headings = re.findall(r"^#+ +(.+)$", text, re.MULTILINE)
+    plain = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings]
+    return {re.sub(r"[^\w\- ]", "", heading).strip().replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("page", [*NAMES, "CHANGELOG.md"])
+def test_links_lead_to_files_of_the_repository(page: str) -> None:
+    """Also in a clone, which has no generated pages; and to headings that exist."""
+    text = re.sub(r"^```.*?^```|`[^`\n]*`", "`", read(page), flags=re.DOTALL | re.MULTILINE)
+    links = re.findall(r"\]\(([^)\s]+)\)|(?:src|href)=\"([^\"]+)\"", text)
+    for link in filter(lambda x: not re.match(r"\w+:", x), map("".join, links)):
+        path, _, heading = link.partition("#")
+        file = (ROOT / page).parent / path if path else ROOT / page
+        assert file.exists() and (file == ROOT / page or file.resolve().is_relative_to(ROOT)), link
+        assert not heading or heading in anchors(file), link
+
+
 def test_drawings_are_made_from_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every drawing is on a page, and drawing twice gives the same bytes."""
     drawings = importlib.import_module("drawings")

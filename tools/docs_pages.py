@@ -2,10 +2,10 @@
 
 Generated: the pages `FILES`, one page per task (clip, sizes, observation, rewards, parameters) with
 an overview, and the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes
-MathML. Links to files outside docs/ lead to the repository's address, `[project.urls]` in
-pyproject.toml. If it is not set they become paths: the built site then needs neither the repository
-nor another host. The page of `mqe play-site` is part of the site if it is in build/play; otherwise
-the site says how to build it.
+MathML. Links to modules lead to their reference pages, other links to files outside docs/ to the
+repository's address, `[project.urls]` in pyproject.toml. If it is not set they become paths: the
+built site then needs neither the repository nor another host. The page of `mqe play-site` is part
+of the site if it is in build/play; otherwise the site says how to build it.
 """
 
 import contextlib
@@ -40,9 +40,7 @@ SETTINGS = {
 
 def on_files(files: Any, config: Any) -> Any:
     """Adds the generated pages, and the files of the page of `mqe play-site`."""
-    named = "API reference"
-    (reference,) = (section[named] for section in config["nav"] if named in section)
-    modules = {path: f"mqe_jax.{Path(path).stem}" for path in reference}
+    modules = {path: f"mqe_jax.{Path(path).stem}" for path in _reference(config)}
     made = pages()
     for path, module in modules.items():
         made[path] = reference_page(module, {*modules.values()})
@@ -55,6 +53,13 @@ def on_files(files: Any, config: Any) -> Any:
             path = f"play/{file.relative_to(PLAY).as_posix()}"
             files.append(File.generated(config, path, abs_src_path=str(file)))
     return files
+
+
+def _reference(config: Any) -> list[str]:
+    """Returns the reference pages in the navigation."""
+    named = "API reference"
+    (pages,) = (section[named] for section in config["nav"] if named in section)
+    return pages
 
 
 def repository() -> str:
@@ -76,13 +81,15 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Converts links and formulas of a page; the page about playing gets its link."""
     if page.file.src_uri == "play.md":
         markdown = play_link(markdown, _playable())
-    return formulas(links(markdown, repository(), posixpath.dirname(page.file.src_uri)))
+    folder = posixpath.dirname(page.file.src_uri)
+    return formulas(links(markdown, repository(), folder, _reference(config)))
 
 
-def links(markdown: str, address: str = "", folder: str = "") -> str:
+def links(markdown: str, address: str = "", folder: str = "", reference: Sequence[str] = ()) -> str:
     """Leads links to files outside docs/ to the repository's address.
 
-    The page is in a folder of docs/. Notebooks get links to Colab and Kaggle too, if the address is
+    Links to modules lead to their pages of the reference. The page is in a folder of docs/.
+    Notebooks get links to Colab and Kaggle too, if the address is
     on GitHub. Without an address links become the file's name and path.
     """
 
@@ -94,6 +101,9 @@ def links(markdown: str, address: str = "", folder: str = "") -> str:
         name, mark, heading = path.partition("#")
         if name in FILES:
             return f"[{text}]({posixpath.relpath(FILES[name], folder or '.')}{mark}{heading})"
+        module = re.sub(r"(/__init__)?\.py$", "", name).removeprefix("mqe_jax/").replace("/", ".")
+        if f"reference/{module}.md" in reference:
+            return f"[{text}]({posixpath.relpath(f'reference/{module}.md', folder or '.')})"
         if not address:
             named = path.endswith(text.replace("\\", "").rstrip("/"))
             return text if named else f"{text} (`{path}`)"
