@@ -259,10 +259,13 @@ def test_tasks_are_listed_and_typos_named_without_jax_and_mujoco() -> None:
     assert max(map(len, lines)) <= 80
     assert (listed["go1gate"]["sizes"], listed["go1tug"]["sizes"]) == ([1, 64], None)
     rows = [line.split() for line in lines if line.startswith("go1")]
-    short, long = ({row[0]: row for row in half} for half in (rows[:13], rows[13:]))
+    tables = (rows[:13], rows[13:26], rows[26:])
+    short, long, trainings = ({row[0]: row for row in part} for part in tables)
     assert short["go1gate"] == ["go1gate", "Narrow", "Gate", "2", "1", "to", "64", "10"]
     assert long["go1gate"] == ["go1gate", "2", "1", "to", "64", "10", "16", "93", "shipped"]
     assert long["go1plane"][-1] == "none"
+    level = listed["go1gate"]["trainings"]["laptop"]["level"]
+    assert trainings["go1gate"][2] == f"{100 * level:.1f}" and "go1plane" not in trainings
     assert long["go1football-2vs2"][1:4] == ["2", "vs", "2"]
     errors = [line for line in done.stderr.splitlines() if line.startswith("mqe: ")]
     assert (

@@ -341,7 +341,7 @@ def rows(run: Path) -> list[dict[str, str]]:
     """Returns the rows of a run's metrics.csv without the columns of times."""
     with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
         return [
-            {k: v for k, v in row.items() if k not in ("seconds", "fps")}
+            {k: v for k, v in row.items() if k not in ("seconds", "fps", "processor_seconds")}
             for row in csv.DictReader(file)
         ]
 

@@ -24,11 +24,14 @@ from mqe_jax.cli.options import (
     print_table,
 )
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.files import read_json
 from mqe_jax.core.limits import Environments, Episodes, Horizon
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail, settings_class
 
 _ZOO = Path(__file__).parents[1] / "policies" / "zoo"
+_LEVELS = Path(__file__).parents[1] / "envs" / "levels.json"
+"""Minutes and level of trainings by task and device, which `python -m lab.laptop` measures."""
 _RATES = {
     "Success, % of the episodes (95% interval)": {"success": "success"},
     "Wins, % of the matches on both sides (95% interval)": {
@@ -70,7 +73,8 @@ class Tasks(TaskOptions):
             raise InputError(f"{given}: is for a task; name one: mqe tasks TASK")
         programs.find_packages("")
         tasks = listed()
-        rows = [
+        levels = read_json(_LEVELS)
+        rows: list[dict[str, Any]] = [
             {
                 "task": name,
                 "title": task.title,
@@ -81,6 +85,7 @@ class Tasks(TaskOptions):
                 "sizes": task.sizes,
                 "time_limit_s": task.time_limit,
                 "shipped_policy": (_ZOO / f"{name}.safetensors").is_file(),
+                "trainings": levels.get(name, {}),
             }
             for name, task in tasks.items()
         ]
@@ -99,12 +104,27 @@ class Tasks(TaskOptions):
                 columns[name] = [str(row[name]) for row in rows]
             columns["policy"] = ["shipped" if row["shipped_policy"] else "none" for row in rows]
             print_columns(columns, left=3)
-            print("\nobservation: numbers that an agent sees; privileged: that a critic may see")
+            print("\nobservation: numbers that an agent sees; privileged: that a critic may see\n")
+            print_columns(_levels(levels), left=1)
+            print(
+                "\nMinutes of a training and its success, wins against scripted or share of sheep"
+            )
+            print("without assistance, %. laptop: --config laptop on two CPU cores; gpu: default")
         else:
             print_columns(columns, left=4)
             print("\nsizes: numbers N of robots for --set num_agents=N; in matches N must be even")
             print("Read about one: mqe tasks go1gate. Watch it: mqe render go1gate -o gate.gif")
         return {"tasks": rows}
+
+
+def _levels(levels: dict[str, Any]) -> dict[str, list[str]]:
+    """Returns the columns of the table of what trainings reach."""
+    columns = {"task": list(levels)}
+    for device in ("laptop", "gpu"):
+        known = [devices.get(device) for devices in levels.values()]
+        columns[f"{device}, min"] = [f"{one['minutes']:.1f}" if one else "" for one in known]
+        columns[f"{device}, %"] = [f"{100 * one['level']:.1f}" if one else "" for one in known]
+    return columns
 
 
 @settings_class

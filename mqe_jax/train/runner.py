@@ -139,6 +139,7 @@ class Training:
         self.resumed = checkpoints[0] is not None
         self._saved = self.env_steps if self.resumed else -1
         self._start_time = time.perf_counter() - first[0][1]
+        self._processor_time = time.process_time()  # at the last row of metrics.csv
         self._monitor = None
         if self._config.evaluation.every is not None and processes.leads:
             self._monitor = Monitor(cast.eval_env, self._config)
@@ -220,11 +221,14 @@ class Training:
         after, metrics = self._update(self._state)
         metrics, finite = jax.device_get((metrics, _all_finite(learned_state(after))))
         updates = self.env_steps // self._config.steps_per_update + 1
+        before = self._processor_time
+        self._processor_time = time.process_time()
         rows = []
         for i in range(len(self._configs)):
             own = jax.tree.map(lambda x: x[i], metrics)  # noqa: B023
             row = row_of(updates, own, self._config, self._start_time, began)
             row["fps"] *= len(self._configs)
+            row["processor_seconds"] = self._processor_time - before
             if not finite or not all(math.isfinite(row[name]) for name in _METRICS):
                 folder = self._folders[i] if self._folders else None
                 _check_finite(

@@ -1,0 +1,196 @@
+"""Trains every task with the settings `laptop`, measures the teams and fills the table of
+docs/first_hour.md.
+
+`python -m lab.laptop` takes about nine hours of two CPU cores; the same command resumes. It trains
+lab/laptop.yaml, one seed of all tasks after the other, and evaluates 256 episodes of each team
+without assistance, in matches against the scripted team on both sides. After each seed it writes
+results/laptop.csv, the table, and the file that `mqe tasks --long` shows. `--table` only writes the
+table and that file, from results/laptop.csv and, for GPUs, results/trainings.csv.
+"""
+
+import argparse
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lab.measure import Measurement, measure, plan
+from lab.paper_page import filled
+from mqe_jax.core.errors import InputError, NonFiniteError, one_line
+from mqe_jax.core.files import parsing, write_atomically
+from mqe_jax.core.literal import echo
+from mqe_jax.envs.registry import SHIPPED
+from mqe_jax.runs.sweeping import sweep
+from mqe_jax.study.runs import is_finished, read_curve, table
+from mqe_jax.study.sweep import load_sweep
+from mqe_jax.train.logs import CSV_FILE
+
+ROOT = Path(__file__).parents[1]
+FILE = ROOT / "lab" / "laptop.yaml"
+LAPTOP = ROOT / "results" / "laptop.csv"
+GPU = ROOT / "results" / "trainings.csv"
+LEVELS = ROOT / "mqe_jax" / "envs" / "levels.json"
+PAGE = ROOT / "docs" / "first_hour.md"
+CORES = 2
+"""Cores of the laptop: a training takes its processor minutes divided by them."""
+EPISODES = 256
+
+Row = Mapping[str, Any]
+
+
+def train(folder: Path, seed: int, tasks: Sequence[str], impl: str = "auto") -> list[Row]:
+    """Trains tasks with a seed and measures those that are finished; returns a row of each.
+
+    What is trained or measured already is not done again. A training that fails is reported.
+    InputError for a folder whose runs come from other settings.
+    """
+    options: dict[str, Any] = {"cells": [f"{task}/*" for task in tasks], "seeds": [seed]}
+    sweep(FILE, folder, **options, impl=impl, dry_run=True)  # checks all trainings
+    try:
+        sweep(FILE, folder, **options, impl=impl)
+    except (InputError, NonFiniteError) as error:
+        echo(f"lab: {one_line(error)}")
+    runs = {task: folder / "runs" / task / "default" / f"seed{seed}" for task in tasks}
+    runs = {task: run for task, run in runs.items() if is_finished(run)}
+    if not runs:
+        return []
+    against = {"opponent": "scripted", "sides": "both"}
+    part = Measurement(
+        measure="evaluate",
+        tasks=tuple(runs),
+        arguments={"episodes": EPISODES},
+        by_task={
+            task: {"policy": str(run)} | (against if len(SHIPPED[task].teams) > 1 else {})
+            for task, run in runs.items()
+        },
+        variants={f"seed{seed}": {}},
+    )
+    measure(part, folder, impl)
+    found = {item.task: item.result() for item in plan(part, folder, impl)}
+    return [_row(task, seed, runs[task], result) for task, result in found.items() if result]
+
+
+def _row(task: str, seed: int, run: Path, result: Mapping[str, Any]) -> Row:
+    curve = read_curve(run / CSV_FILE)
+    name = "win_rate" if "win_rate" in result else "success_rate"
+    low, high = result["intervals"][name]
+    return {
+        "task": task,
+        "seed": seed,
+        "env_steps": curve["env_steps"][-1],
+        "processor_minutes": curve["processor_seconds"].sum() / 60,
+        "episodes": result["episodes"],
+        "rate": result[name],
+        "low": low,
+        "high": high,
+        "source": "lab.laptop",
+    }
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Reads a table of trainings; numbers that are missing are NaN."""
+    with path.open(encoding="utf-8", newline="") as file, parsing(path, "a table of trainings"):
+        return [
+            {
+                name: text if name in ("task", "source") else float(text or "nan")
+                for name, text in row.items()
+            }
+            for row in csv.DictReader(file)
+        ]
+
+
+def keep(rows: Sequence[Row]) -> None:
+    """Writes rows into results/laptop.csv, in place of those of the same tasks and seeds."""
+    every = {(row["task"], int(row["seed"])): row for row in [*read(LAPTOP), *rows]}
+    order = list(SHIPPED)
+    ordered = sorted(every.items(), key=lambda item: (order.index(item[0][0]), item[0][1]))
+    write_atomically(LAPTOP, table([row for _, row in ordered]).encode())
+
+
+def levels() -> dict[str, dict[str, Any]]:
+    """Returns minutes and level of each task by device, `laptop` and `gpu`.
+
+    Minutes are the mean of the trainings whose time is known; `level` is the mean rate, `worst` and
+    `best` those of single trainings. A device on which no time is known is left out.
+    """
+    laptop, gpu = read(LAPTOP), read(GPU)
+    times = {
+        "laptop": (laptop, "processor_minutes", CORES),
+        "gpu": (gpu, "gpu_minutes", 1),
+    }
+    found: dict[str, dict[str, Any]] = {}
+    for task in SHIPPED:
+        for device, (rows, column, share) in times.items():
+            own = [row for row in rows if row["task"] == task]
+            known = [row[column] / share for row in own if math.isfinite(row[column])]
+            if not known:
+                continue
+            rates = [row["rate"] for row in own]
+            found.setdefault(task, {})[device] = {
+                "minutes": round(float(np.mean(known)), 1),
+                "level": round(float(np.mean(rates)), 4),
+                "worst": min(rates),
+                "best": max(rates),
+                "trainings": len(rates),
+            }
+    return found
+
+
+def markdown(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """Returns the table of the tasks with a level on a laptop."""
+    lines = [
+        "| task | laptop, minutes | laptop, % | GPU, minutes | GPU, % |",
+        "|---|---|---|---|---|",
+    ]
+    for task, devices in found.items():
+        if "laptop" not in devices:
+            continue
+        cells = [f"`{task}`"]
+        for device in ("laptop", "gpu"):
+            one = devices.get(device)
+            cells += ["", ""] if one is None else [f"{one['minutes']:g}", _percent(one)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _percent(one: Mapping[str, Any]) -> str:
+    mean, worst, best = (f"{100 * one[name]:.1f}" for name in ("level", "worst", "best"))
+    return f"{mean} ({worst} to {best})".replace("100.0", "100")
+
+
+def update() -> None:
+    """Writes the table of docs/first_hour.md and the file of `mqe tasks --long`."""
+    found = levels()
+    page = filled(PAGE.read_text("utf-8"), {"levels": markdown(found)})
+    write_atomically(LEVELS, (json.dumps(found, indent=1) + "\n").encode())
+    write_atomically(PAGE, page.encode())
+
+
+def main() -> None:
+    """Trains, measures and tabulates what the command line names."""
+    settings = load_sweep(FILE)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--folder", type=Path, default=Path("runs/laptop"))
+    parser.add_argument("--tasks", nargs="+", default=settings.tasks, choices=settings.tasks)
+    parser.add_argument("--seeds", nargs="+", type=int, default=settings.seeds)
+    parser.add_argument("--impl", default="auto", help="physics engine")
+    parser.add_argument("--table", action="store_true", help="only write the table")
+    given = parser.parse_args()
+    for seed in [] if given.table else given.seeds:
+        if rows := train(given.folder, seed, given.tasks, given.impl):
+            keep(rows)
+            update()
+    update()
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (InputError, OSError) as error:
+        raise SystemExit(f"error: {one_line(error)}") from None
