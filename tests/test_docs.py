@@ -159,12 +159,21 @@ def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch) -> None:
             load_policy("go1gate"), make("go1gate")
         )
         Path("robot.onnx").write_bytes(graph.SerializeToString())
+    programs = blocks(read(page), "python")
+    saved = re.search(r"[Ss]ave this (?:one|file) as\s`(\w+)\.py`", read(page))
+    if saved:  # which later blocks import
+        Path(f"{saved[1]}.py").write_text(programs.pop(0))
+        monkeypatch.syspath_prepend(str(Path.cwd()))
     try:
-        for block in blocks(read(page), "python"):
+        for block in programs:
             exec(compile(block, page, "exec", dont_inherit=True), namespace)
+        for name in [name for name in namespace if name.startswith("test_")]:
+            namespace[name]()
     finally:
         for name in {*TASKS} - tasks:
             del TASKS[name]
+        if saved:
+            del sys.modules[saved[1]]
 
 
 SOURCES = {
