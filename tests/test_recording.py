@@ -61,13 +61,18 @@ def test_episodes_are_whole_and_aligned(short: mqe_jax.QuadrupedEnv) -> None:
 def test_an_interrupted_recording_keeps_whole_episodes(
     short: mqe_jax.QuadrupedEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    signals = iter([0, signal.SIGINT, signal.SIGINT])  # after each block
+
     @contextlib.contextmanager
     def interrupted() -> Iterator[Any]:
-        yield lambda: signal.SIGINT
+        yield lambda: next(signals)
 
     monkeypatch.setattr(interrupts, "defer", interrupted)
     with pytest.raises(interrupts.Interrupted, match="interrupted; own has 2 episodes"):
         mqe_jax.record(short, pull, "idle", folder="own", episodes=5, num_envs=2)
+    with pytest.raises(interrupts.Interrupted, match="interrupted; no episode was complete"):
+        mqe_jax.record(short, pull, "idle", folder="none", episodes=5, num_envs=2)
+    assert not Path("none").exists()
     assert [len(episode) for episode in read("own")] == [60, 60]
     refuses("^folder: 'own' is not allowed", mqe_jax.record, short, folder="own")
 

@@ -19,6 +19,7 @@ from mqe_jax.core import interrupts
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_folder
 from mqe_jax.core.limits import Environments, Episodes, Seed
+from mqe_jax.core.precision import single
 from mqe_jax.core.settings import Parameters, checked, fail, to_mapping
 from mqe_jax.core.types import Outcome, active_of, mean_of_team, observations
 from mqe_jax.core.version import __version__
@@ -30,6 +31,7 @@ _BLOCK = 50
 """Environment steps of a compiled call."""
 
 
+@single
 @checked
 def record(
     task: str | Path | QuadrupedEnv,
@@ -108,13 +110,15 @@ def record(
         shown = bar.add_task(about["task"], total=episodes)
         storage = None
         for ended in _episodes(batch, playing.seats, episodes, jax.random.PRNGKey(seed)):
-            storage = storage or _create(minari, place, playing.env, about)
-            storage.update_episodes([minari.EpisodeBuffer(**fields) for fields in ended])
+            if ended:
+                storage = storage or _create(minari, place, playing.env, about)
+                storage.update_episodes([minari.EpisodeBuffer(**fields) for fields in ended])
             counts["episodes"] += len(ended)
             counts["steps"] += sum(len(fields["rewards"]) for fields in ended)
             bar.update(shown, completed=counts["episodes"])
             if stopped() and counts["episodes"] < episodes:
-                raise interrupts.Interrupted(f"{place} has {counts['episodes']} episodes")
+                kept = f"{place} has {counts['episodes']} episodes"
+                raise interrupts.Interrupted(kept if storage else "no episode was complete")
     return {**about, "folder": str(place), **counts}
 
 
@@ -180,7 +184,7 @@ class _Step(NamedTuple):
 def _episodes(
     batch: VectorEnv, seats: Seats, episodes: int, key: jax.Array
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yields the episodes that have ended since, as fields of Minari's `EpisodeBuffer`.
+    """Yields after every block the episodes that ended, as fields of Minari's `EpisodeBuffer`.
 
     Each environment contributes its first episodes, as in `evaluate_batch`.
     """
@@ -232,8 +236,7 @@ def _episodes(
                 parts[i] = []
             last = max(ends, default=0)
             parts[i].append(jax.tree.map(lambda x, i=i, b=last: x[b:, i], rows))
-        if ended:
-            yield ended
+        yield ended
         if not left.any():
             return
 
