@@ -1,11 +1,12 @@
-"""Trains every task with the settings `laptop`, measures the teams and fills the table of
-docs/first_hour.md.
+"""Trains every task on two CPU cores, measures the teams and fills tables of the documentation.
 
-`python -m lab.laptop` takes about nine hours of two CPU cores; the same command resumes. It trains
+`python -m lab.laptop` takes about nine hours of two cores; the same command resumes. It trains
 lab/laptop.yaml, one seed of all tasks after the other, and evaluates 256 episodes of each team
 without assistance, in matches against the scripted team on both sides. After each seed it writes
-results/laptop.csv, the table, and the file that `mqe tasks --long` shows. `--table` only writes the
-table and that file, from results/laptop.csv and, for GPUs, results/trainings.csv.
+results/laptop.csv, the table of docs/first_hour.md, and the file that `mqe tasks --long` shows.
+`python -m lab.laptop --config student` does the same with lab/student.yaml, results/student.csv and
+the table of docs/sensors.md, in about an hour. `--table` only writes tables and file from the
+results.
 """
 
 import argparse
@@ -20,21 +21,24 @@ import numpy as np
 
 from lab.measure import Measurement, measure, plan
 from lab.paper_page import filled
+from mqe_jax.acting.results import Rate
 from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.files import parsing, write_atomically
 from mqe_jax.core.literal import echo
 from mqe_jax.envs.registry import SHIPPED
+from mqe_jax.policies import zoo
 from mqe_jax.runs.sweeping import sweep
 from mqe_jax.study.runs import is_finished, read_curve, table
 from mqe_jax.study.sweep import load_sweep
 from mqe_jax.train.logs import CSV_FILE
 
 ROOT = Path(__file__).parents[1]
-FILE = ROOT / "lab" / "laptop.yaml"
-LAPTOP = ROOT / "results" / "laptop.csv"
-GPU = ROOT / "results" / "trainings.csv"
+CONFIGS = ("laptop", "student")
+"""Settings that are measured: sweeps are lab/CONFIG.yaml, results RESULTS/CONFIG.csv."""
+RESULTS = ROOT / "results"
 LEVELS = ROOT / "mqe_jax" / "envs" / "levels.json"
-PAGE = ROOT / "docs" / "first_hour.md"
+PAGES = {"levels": ROOT / "docs" / "first_hour.md", "students": ROOT / "docs" / "sensors.md"}
+"""Pages by the section that has the table."""
 CORES = 2
 """Cores of the laptop: a training takes its processor minutes divided by them."""
 EPISODES = 256
@@ -42,16 +46,18 @@ EPISODES = 256
 Row = Mapping[str, Any]
 
 
-def train(folder: Path, seed: int, tasks: Sequence[str], impl: str = "auto") -> list[Row]:
-    """Trains tasks with a seed and measures those that are finished; returns a row of each.
+def train(
+    file: Path, folder: Path, seed: int, tasks: Sequence[str], impl: str = "auto"
+) -> list[Row]:
+    """Trains tasks of a sweep with a seed, measures what is finished; returns a row of each.
 
     What is trained or measured already is not done again. A training that fails is reported.
     InputError for a folder whose runs come from other settings.
     """
     options: dict[str, Any] = {"cells": [f"{task}/*" for task in tasks], "seeds": [seed]}
-    sweep(FILE, folder, **options, impl=impl, dry_run=True)  # checks all trainings
+    sweep(file, folder, **options, impl=impl, dry_run=True)  # checks all trainings
     try:
-        sweep(FILE, folder, **options, impl=impl)
+        sweep(file, folder, **options, impl=impl)
     except (InputError, NonFiniteError) as error:
         echo(f"lab: {one_line(error)}")
     runs = {task: folder / "runs" / task / "default" / f"seed{seed}" for task in tasks}
@@ -103,12 +109,12 @@ def read(path: Path) -> list[dict[str, Any]]:
         ]
 
 
-def keep(rows: Sequence[Row]) -> None:
-    """Writes rows into results/laptop.csv, in place of those of the same tasks and seeds."""
-    every = {(row["task"], int(row["seed"])): row for row in [*read(LAPTOP), *rows]}
+def keep(file: Path, rows: Sequence[Row]) -> None:
+    """Writes rows into a table of trainings, in place of those of the same tasks and seeds."""
+    every = {(row["task"], int(row["seed"])): row for row in [*read(file), *rows]}
     order = list(SHIPPED)
     ordered = sorted(every.items(), key=lambda item: (order.index(item[0][0]), item[0][1]))
-    write_atomically(LAPTOP, table([row for _, row in ordered]).encode())
+    write_atomically(file, table([row for _, row in ordered]).encode())
 
 
 def levels() -> dict[str, dict[str, Any]]:
@@ -117,10 +123,9 @@ def levels() -> dict[str, dict[str, Any]]:
     Minutes are the mean of the trainings whose time is known; `level` is the mean rate, `worst` and
     `best` those of single trainings. A device on which no time is known is left out.
     """
-    laptop, gpu = read(LAPTOP), read(GPU)
     times = {
-        "laptop": (laptop, "processor_minutes", CORES),
-        "gpu": (gpu, "gpu_minutes", 1),
+        "laptop": (read(RESULTS / "laptop.csv"), "processor_minutes", CORES),
+        "gpu": (read(RESULTS / "trainings.csv"), "gpu_minutes", 1),
     }
     found: dict[str, dict[str, Any]] = {}
     for task in SHIPPED:
@@ -162,30 +167,52 @@ def _percent(one: Mapping[str, Any]) -> str:
     return f"{mean} ({worst} to {best})".replace("100.0", "100")
 
 
+def students() -> str:
+    """Returns the table of students beside their teachers, the shipped policies."""
+    every = read(RESULTS / "student.csv")
+    lines = ["| task | minutes | student, % | teacher, % |", "|---|---|---|---|"]
+    for task in dict.fromkeys(row["task"] for row in every):
+        rows = [row for row in every if row["task"] == task]
+        minutes = np.mean([row["processor_minutes"] for row in rows]) / CORES
+        rate = Rate.of(float(np.mean([row["rate"] for row in rows])), EPISODES * len(rows))
+        card = zoo.card(task).results
+        teacher = card["win/scripted" if "win/scripted" in card else "success"].rate
+        lines.append(f"| `{task}` | {minutes:.1f} | {rate.percent} | {teacher.percent} |")
+    return "\n".join(lines)
+
+
+def tables() -> dict[str, str]:
+    """Returns the tables by the section of their page."""
+    return {"levels": markdown(levels()), "students": students()}
+
+
 def update() -> None:
-    """Writes the table of docs/first_hour.md and the file of `mqe tasks --long`."""
-    found = levels()
-    page = filled(PAGE.read_text("utf-8"), {"levels": markdown(found)})
-    write_atomically(LEVELS, (json.dumps(found, indent=1) + "\n").encode())
-    write_atomically(PAGE, page.encode())
+    """Writes the tables of `PAGES` and the file of `mqe tasks --long`."""
+    write_atomically(LEVELS, (json.dumps(levels(), indent=1) + "\n").encode())
+    for section, content in tables().items():
+        text = filled(PAGES[section].read_text("utf-8"), {section: content})
+        write_atomically(PAGES[section], text.encode())
 
 
 def main() -> None:
     """Trains, measures and tabulates what the command line names."""
-    settings = load_sweep(FILE)
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--folder", type=Path, default=Path("runs/laptop"))
-    parser.add_argument("--tasks", nargs="+", default=settings.tasks, choices=settings.tasks)
-    parser.add_argument("--seeds", nargs="+", type=int, default=settings.seeds)
+    parser.add_argument("--config", default="laptop", choices=CONFIGS)
+    parser.add_argument("--folder", type=Path, help="default: runs/CONFIG")
+    parser.add_argument("--tasks", nargs="+", help="default: all of the sweep")
+    parser.add_argument("--seeds", nargs="+", type=int, help="default: all of the sweep")
     parser.add_argument("--impl", default="auto", help="physics engine")
-    parser.add_argument("--table", action="store_true", help="only write the table")
+    parser.add_argument("--table", action="store_true", help="only write the tables")
     given = parser.parse_args()
-    for seed in [] if given.table else given.seeds:
-        if rows := train(given.folder, seed, given.tasks, given.impl):
-            keep(rows)
-            update()
+    file = ROOT / "lab" / f"{given.config}.yaml"
+    settings = load_sweep(file)
+    folder = given.folder or Path("runs") / given.config
+    for seed in [] if given.table else given.seeds or settings.seeds:
+        rows = train(file, folder, seed, given.tasks or settings.tasks, given.impl)
+        keep(RESULTS / f"{given.config}.csv", rows)
+        update()
     update()
 
 

@@ -1,6 +1,7 @@
 """The table of what a laptop reaches: its data, and the command that measures it and resumes."""
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,26 +17,40 @@ from mqe_jax.study.sweep import load_sweep
 METRICS = "env_steps,average_step_reward,processor_seconds\n64,0.5,60\n128,0.6,30\n"
 
 
-def test_page_and_package_have_the_measured_levels() -> None:
-    found = laptop.levels()
-    page = laptop.PAGE.read_text("utf-8")
-    assert filled(page, {"levels": laptop.markdown(found)}) == page, "python -m lab.laptop --table"
-    assert json.loads(laptop.LEVELS.read_text("utf-8")) == found
-    assert {*load_sweep(laptop.FILE).tasks} == {*found}
+HEAD = "task,seed,env_steps,processor_minutes,episodes,rate,low,high,source\n"
 
 
-def test_a_task_without_a_time_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of results, without those of a laptop."""
+    shutil.copy(laptop.RESULTS / "trainings.csv", tmp_path)
+    monkeypatch.setattr(laptop, "RESULTS", tmp_path)
+    return tmp_path
+
+
+def test_pages_and_package_have_the_measured_levels() -> None:
+    for section, table in laptop.tables().items():
+        page = laptop.PAGES[section].read_text("utf-8")
+        assert filled(page, {section: table}) == page, "run python -m lab.laptop --table"
+    assert json.loads(laptop.LEVELS.read_text("utf-8")) == laptop.levels()
+
+
+def test_sweeps_have_the_settings_that_they_are_named_after() -> None:
+    for name in laptop.CONFIGS:
+        sweep = load_sweep(laptop.ROOT / "lab" / f"{name}.yaml")
+        assert (sweep.config, sweep.seeds_together) == (name, 1)
+        assert {*laptop.levels()} >= {*sweep.tasks}
+
+
+def test_a_task_without_a_time_is_left_out(results: Path) -> None:
     rows = "go1gate,0,64,24,256,0.5,0.4,0.6,x\ngo1gate,1,64,nan,256,1,0.9,1,x\n"
-    head = "task,seed,env_steps,processor_minutes,episodes,rate,low,high,source\n"
-    file = tmp_path / "laptop.csv"
-    file.write_text(f"{head}{rows}go1tug,0,64,nan,256,1,0.9,1,x\n")
-    monkeypatch.setattr(laptop, "LAPTOP", file)
+    (results / "laptop.csv").write_text(f"{HEAD}{rows}go1tug,0,64,nan,256,1,0.9,1,x\n")
     table = laptop.markdown(laptop.levels()).splitlines()
     assert len(table) == 3 and table[2].startswith("| `go1gate` | 12 | 75.0 (50.0 to 100) | 5.7 |")
 
 
 def test_a_second_call_measures_only_new_teams(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     evaluated: list[Any] = []
     trained = ["go1gate"]
@@ -66,21 +81,21 @@ def test_a_second_call_measures_only_new_teams(
     monkeypatch.setattr(laptop, "sweep", sweep)
     monkeypatch.setattr(laptop, "is_finished", lambda run: (run / "metrics.csv").is_file())
     monkeypatch.setattr(playing, "evaluate", evaluate)
-    file = tmp_path / "laptop.csv"
-    file.write_text("task,seed,env_steps,processor_minutes,episodes,rate,low,high,source\n")
-    monkeypatch.setattr(laptop, "LAPTOP", file)
+    table = results / "laptop.csv"
+    table.write_text(HEAD)
+    file = laptop.ROOT / "lab" / "laptop.yaml"
     tasks = ("go1gate", "go1tug")
     run = tmp_path / "runs"
-    assert [row["task"] for row in laptop.train(tmp_path, 1, tasks)] == ["go1gate"]
+    assert [row["task"] for row in laptop.train(file, tmp_path, 1, tasks)] == ["go1gate"]
     trained.append("go1tug")
-    rows = laptop.train(tmp_path, 1, tasks)
+    rows = laptop.train(file, tmp_path, 1, tasks)
     assert evaluated == [
         ("go1gate", f"{run}/go1gate/default/seed1", None, "first", 256),
         ("go1tug", f"{run}/go1tug/default/seed1", "scripted", "both", 256),
     ]
     for _ in range(2):
-        laptop.keep(rows)
-    kept = laptop.read(file)
+        laptop.keep(table, rows)
+    kept = laptop.read(table)
     assert [(row["task"], row["processor_minutes"]) for row in kept] == [
         ("go1gate", 1.5),
         ("go1tug", 1.5),
