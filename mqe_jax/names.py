@@ -319,7 +319,7 @@ def imports_of(policy: TrainedPolicy | None, run: str) -> Iterator[None]:
         if policy is None or not flags:
             raise
         unknown = f"run: the task {policy.task!r} of {run} is not registered"
-        raise InputError(f"{error if policy.task in TASKS else unknown}: add {flags}") from None
+        raise InputError(f"{error if policy.task in TASKS else unknown}; add {flags}") from None
 
 
 def _usual_policy(name: str, params: Params) -> str:

@@ -1,5 +1,6 @@
 """Tasks of one's own from a file, `mqe --import`, and from installed packages."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -13,9 +14,11 @@ import pytest
 import mqe_jax
 from mqe_jax.cli import launch, train
 from mqe_jax.core import imports
+from mqe_jax.core.settings import override
 from mqe_jax.envs import TASKS, registry
 from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.presets import default_name
+from mqe_jax.train.policy import save_policy
 
 RACE = Path(__file__).parents[1] / "examples" / "race" / "race.py"
 GROUPS = ("rewards", "randomization")
@@ -56,12 +59,26 @@ def test_a_run_asks_for_the_import_of_its_task(forget: Any, mqe: Any, monkeypatc
     for command in ("eval runs/race", "render runs/race -o a.png", onnx):
         forget()
         said = mqe(command, code=2).err
-        assert said == "mqe: run: the task 'race' of runs/race is not registered: " + (
+        assert said == "mqe: run: the task 'race' of runs/race is not registered; " + (
             "add --import race.py\n"
         )
     few = "--episodes 2 --num-envs 2 --impl c"
     assert "policy               runs/race" in mqe(f"eval runs/race --import=race.py {few}").out
     assert mqe(f"--import race.py --import ./race.py eval runs/race {few}").out  # both once
+
+
+def test_a_run_asks_for_what_else_its_import_registered(forget: Any, mqe: Any) -> None:
+    policy = mqe_jax.load_policy("go1gate")
+    config = override(policy.config, {"env.robot": "own"})
+    for names, said in {
+        ("own.py", "my robots.py"): "robot: unknown name 'own'; allowed: go1, go2; "
+        "add --import own.py --import 'my robots.py'\n",
+        3: "run/policy.safetensors: its settings cannot be read (imports: 3 is not allowed; "
+        "it must be a list)\n",
+    }.items():
+        about = {**policy.metadata, "imports": names}
+        save_policy("run", dataclasses.replace(policy, config=config, metadata=about))
+        assert mqe("eval run", code=2).err == f"mqe: {said}"
 
 
 def test_a_sweep_resumes_with_the_same_file_only(forget: Any, mqe: Any) -> None:
@@ -149,6 +166,19 @@ def test_installed_packages_register_tasks(
     )
     imports.add(f"{module.partition(':')[0].replace('.', '/')}.py")  # the same file
     assert mqe_jax.tasks().count("race") == 1
+
+
+def test_the_named_file_runs_and_not_an_installed_one_of_its_name(
+    forget: Any, tmp_path: Path
+) -> None:
+    sys.path.insert(0, str(tmp_path))
+    install("mqe_race", "race", tmp_path)
+    Path("own").mkdir()
+    Path("own/race.py").write_text(RACE.read_text().replace("4 m", "5 m"))
+    imports.add("own/race.py")
+    assert (mqe_jax.make("race", impl="c").__doc__ or "").endswith("5 m.")
+    registry.load_packages()
+    assert (mqe_jax.make("race", impl="c").__doc__ or "").endswith("5 m.")
 
 
 def test_a_task_of_ones_own_is_listed_and_shown(forget: Any, mqe: Any) -> None:

@@ -1,6 +1,7 @@
 """Builds the wheel and its bill of materials, and tries them in an empty environment.
 
-It runs the commands of the README and the quickstart.
+It runs the commands of the README, the quickstart, and the tests of a package with a task of its
+own, examples/race.
 
 `python tools/release.py [--tag TAG]` writes into dist/. All files must name the same version, and
 with a tag that of the tag. The commands run in another folder, from which the source tree cannot be
@@ -40,7 +41,7 @@ def run(*command: object, folder: Path = ROOT) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment["MQE_NOTEBOOK_SMALL"] = "1"  # which shortens notebooks
     subprocess.run(
-        [str(word) for word in command], cwd=folder, env=environment, check=True, timeout=600
+        [str(word) for word in command], cwd=folder, env=environment, check=True, timeout=1800
     )
 
 
@@ -80,6 +81,11 @@ def main() -> None:
             run(programs / "python", "-c", program, folder=folder)
         notebook = ROOT / "examples" / "notebooks" / "quickstart.ipynb"
         run(programs / "jupyter", "execute", notebook, folder=folder)
+        package = folder / "race"
+        shutil.copytree(ROOT / "examples" / "race", package)
+        run(programs / "python", "-m", "pip", "install", "-q", *constraints, "pytest", package)
+        run(programs / "python", "-m", "pytest", package, folder=folder)
+        run(programs / "mqe", "tasks", "race", folder=folder)
         for block in re.findall(r"^```bash\n(.*?)^```", readme, re.DOTALL | re.MULTILINE):
             for line in block.splitlines():
                 words = shlex.split(line, comments=True)

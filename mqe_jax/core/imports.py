@@ -27,7 +27,10 @@ def add(name: str) -> None:
     if file and not path.is_file():
         raise InputError(f"import: no file {name!r}")
     try:
-        importlib.import_module(_module_of(path) if file else name)
+        if file:
+            _import_file(path)
+        else:
+            importlib.import_module(name)
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and error.name == name:
             hint = f"; did you mean {path.name}.py?" if Path(f"{path}.py").is_file() else ""
@@ -37,8 +40,8 @@ def add(name: str) -> None:
         IMPORTED.append(name)
 
 
-def _module_of(path: Path) -> str:
-    """Returns the name of a file's module, under which it is imported once in a process."""
+def _import_file(path: Path) -> None:
+    """Imports a file under the name that Python would find it by, once in a process."""
     folder = path.parent
     parts = [] if path.name == "__init__.py" else [path.stem]
     while (folder / "__init__.py").is_file():
@@ -46,12 +49,22 @@ def _module_of(path: Path) -> str:
         folder = folder.parent
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
-    module = ".".join(parts)
-    spec = importlib.util.find_spec(module)
-    found = spec and spec.origin
-    if found is None or Path(found).resolve() != path:
-        raise InputError(f"{module} is the name of another module, {found}; rename the file")
-    return module
+    name = ".".join(parts)
+    known = sys.modules.get(name)
+    if known is not None and Path(getattr(known, "__file__", None) or "").resolve() == path:
+        return
+    if known is not None or name in sys.stdlib_module_names:
+        raise InputError(f"{name} is the name of another module; rename the file")
+    if len(parts) > 1:
+        importlib.import_module(".".join(parts[:-1]))
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(sys.modules[name])
+    except BaseException:
+        del sys.modules[name]
+        raise
 
 
 def reason(error: BaseException) -> str:

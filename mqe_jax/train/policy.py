@@ -342,7 +342,9 @@ def policy_in(stored: Stored) -> TrainedPolicy:
         raise InputError(
             f"{stored.path}: holds a mixture of policies, which version 0.4 does not read"
         )
+    flags = ""
     try:
+        flags = needed_imports(metadata)
         needed = metadata.pop("needs")
         needs = build(Needs, needed)
         config = build(TrainConfig, without_retired(metadata.pop("config")))
@@ -353,7 +355,7 @@ def policy_in(stored: Stored) -> TrainedPolicy:
         deterministic = check("deterministic", metadata.pop("deterministic", False), bool)
         check("env_steps", metadata.get("env_steps", 0), Annotated[int, Ge(0)])
     except (KeyError, TypeError, AttributeError, InputError) as error:
-        hint = f": add {needed}" if (needed := needed_imports(stored.metadata)) else ""
+        hint = f"; add {flags}" if flags else ""
         raise InputError(f"{stored.path}: its settings cannot be read ({error}){hint}") from None
     tree = stored.tree(template(needs.dims, config.network), half=True)
     return TrainedPolicy(tree["params"], tree["normalizer"], needs, config, metadata, deterministic)
