@@ -23,6 +23,7 @@ from mqe_jax.core.settings import (
     path_text,
 )
 from mqe_jax.envs.registry import ALIASES, SCRIPTED, SHIPPED, TASKS
+from mqe_jax.envs.sets import expand
 from mqe_jax.train.config import TrainConfig, read_settings
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
@@ -83,7 +84,9 @@ class _Layer(NamedTuple):
         """Returns a layer whose dotted names are nested ones."""
         try:
             values = nested(values)
-            check("env", values.get("env", {}), Parameters)
+            for name in ("env", "train_env"):
+                if name in values:
+                    values[name] = expand(check(name, values[name], Parameters))
         except InputError as error:
             raise InputError(f"{prefix}{error}") from None
         return cls(prefix, values)
@@ -138,14 +141,14 @@ def _has_sensors(env: Mapping[str, Any]) -> bool:
 
 def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     """Returns the layers of a shipped name or a file."""
-    shipped = ["demo", "laptop", "league", "sizes", "student"]
+    shipped = ["demo", "laptop", "league", "robust", "sizes", "student"]
     for file in ("paper", "tuned"):
         shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
     name = path_text(check("config", config, PathText))
     if name == "demo":  # of the gate, whatever the task
         return _layers_of("go1gate", "laptop")
     if name in shipped:
-        changes = name in ("laptop", "sizes", "student")  # of the default settings
+        changes = name in ("laptop", "robust", "sizes", "student")  # of the default settings
         below = _layers_of(task, default_name(task)) if changes else []
         if name == "student":
             below += [_Layer.of("", _parts("onboard")), _Layer.of("", {"imitation.teacher": task})]

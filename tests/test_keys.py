@@ -18,6 +18,7 @@ from mqe_jax.core.blocks import Block, entities, image
 from mqe_jax.core.types import replace_fields
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.randomization import Randomization
+from mqe_jax.envs.readings import Reading, Readings
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.opponents import Versus
@@ -45,6 +46,7 @@ NOISY = Randomization(
     action_lag=2,
     push=0.5,
     observation_noise=0.05,
+    readings=Readings(position=Reading(noise=0.1, bias=0.1), dropout=0.1),
 )
 SENSES = (
     Proprioception(),

@@ -60,7 +60,7 @@ def shipped() -> list[str | None]:
         for part in load_yaml(CONFIG_FOLDER / f"{file}.yaml")
         if part != "common"
     ]
-    return [None, "demo", "laptop", "league", "sizes", "student", *parts]
+    return [None, "demo", "laptop", "league", "robust", "sizes", "student", *parts]
 
 
 def digests() -> dict[str, str]:
@@ -83,7 +83,7 @@ def test_shipped_settings_are_the_stored_ones() -> None:
     assert digests() == json.loads(STORED.read_text())
 
 
-@pytest.mark.parametrize("name", [None, "league", "sizes", "student"])
+@pytest.mark.parametrize("name", [None, "league", "robust", "sizes", "student"])
 @pytest.mark.parametrize("task", SHIPPED)
 def test_tasks_have_the_parameters_of_shipped_settings(task: str, name: str | None) -> None:
     build(TASKS[task].Params, resolve(task, name).training_env)

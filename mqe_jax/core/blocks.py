@@ -41,6 +41,9 @@ class Block:
     """What the entries are, one entity after the other; None unless they are of several ones."""
     image: tuple[int, int, int] | None = None
     """Channels, height and width of an image: channel after channel, each row by row."""
+    quantities: tuple[str, ...] = ()
+    """What its entries measure, or those of each entity, by the names of
+    `mqe_jax.envs.readings.Readings`; one for each, or a pattern that repeats."""
 
     @property
     def continuous(self) -> np.ndarray:
@@ -52,11 +55,19 @@ class Block:
 
 
 def entities(
-    name: str, kind: str, count: int, width: int, meaning: str = "", *, masked: bool = False
+    name: str,
+    kind: str,
+    count: int,
+    width: int,
+    meaning: str = "",
+    *,
+    masked: bool = False,
+    quantities: tuple[str, ...] = (),
 ) -> Block:
     """Returns the block of several entities of a kind; `by_entity` fills a masked one."""
     several = Entities(kind, count, width, masked)
-    return Block(name, count * (width + masked), meaning, entities=several)
+    width = count * (width + masked)
+    return Block(name, width, meaning, entities=several, quantities=quantities)
 
 
 def image(name: str, height: int, width: int, meaning: str = "") -> Block:

@@ -15,6 +15,9 @@ SENSING = 7907
 """Into a state's key: the readings of its sensors."""
 NOISE = 7919
 """Into a state's key: the noise of its observations; groups add their number, below 8."""
+READINGS = 7927
+"""Into a state's key: the errors of its readings; into that of a reset: those of an episode. Groups
+add their number."""
 LINEAR = 7933
 """Into the key of a trunk's hidden layers: its layer `linear`."""
 ENCODER = 7937

@@ -316,9 +316,12 @@ def nested(changes: Mapping[str, Any]) -> dict[str, Any]:
     InputError for a name that is given twice.
     """
     made = merge({}, changes)  # which rejects what is nested too deep
-    for name, following in itertools.pairwise(sorted(name for name, _ in leaves(changes))):
+    given = sorted(leaves(changes), key=lambda pair: pair[0])
+    for (name, value), (following, _) in itertools.pairwise(given):
         if name == following:
             raise InputError(f"{name}: is given twice")
+        if following.startswith(f"{name}.") and not is_settings(value):
+            raise InputError(f"{name}: is given as a whole and as {following}")
     return made
 
 

@@ -332,6 +332,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             frozen_steps=self._sample_frozen_steps(freeze_key, assistance, active),
             key=next_key,
             active=active,
+            readings=self._reset_readings(key),
             senses=self.suite.reset() if self.params.senses else (),
         )
         state = dataclasses.replace(state, task=self.reset_task(task_key, state, robot_state))
@@ -343,6 +344,12 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         outcome = dataclasses.replace(outcome, ending=dict.fromkeys(ENDINGS, no))
         outcome = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), outcome)
         return dataclasses.replace(state, outcome=outcome, metrics=metrics)
+
+    def _reset_readings(self, key: jax.Array) -> Any:
+        memories = {}
+        for number, (name, errors) in enumerate(self.reading_errors.items()):
+            memories[name] = errors.reset(jax.random.fold_in(key, keys.READINGS + number))
+        return memories or ()
 
     @single
     def step(self, state: State[S], action: jax.Array) -> State[S]:
@@ -425,6 +432,11 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             if noise:
                 key = jax.random.fold_in(state.key, keys.NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
+            if name in self.reading_errors:
+                key = jax.random.fold_in(state.key, keys.READINGS + number)
+                errors = self.reading_errors[name]
+                obs, memory = errors.apply(obs, state.readings[name], key)
+                state = dataclasses.replace(state, readings={**state.readings, name: memory})
             obs = hide(layout, obs, there) if there else obs
             seen[name] = jnp.where(self.observed(state)[:, None], finite(obs), 0.0)
         privileged = finite(self.observe_privileged(state, robots))

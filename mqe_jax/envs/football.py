@@ -40,7 +40,10 @@ FAR = 1e3  # m; distance of robots that take no part
 _REACH = 0.6  # m; from a trunk's centre to that of a ball that the robot touches
 _IMPULSE = 0.1  # m/s; change of the ball's velocity in a step that only a touch causes
 
-BALL_BLOCKS = (Block("ball", 3, "centre, m"), Block("ball_velocity", 3, "m/s"))
+BALL_BLOCKS = (
+    Block("ball", 3, "centre, m", quantities=("objects",)),
+    Block("ball_velocity", 3, "m/s", quantities=("velocity",)),
+)
 
 
 @settings_class

@@ -14,7 +14,16 @@ import numpy as np
 from mqe_jax.core.settings import fail
 from mqe_jax.core.types import Outcome
 from mqe_jax.envs.base import QuadrupedEnv
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout, entities, one_hot, others
+from mqe_jax.envs.observation import (
+    BASE,
+    BASE_INFO,
+    POSE,
+    Block,
+    ObservationLayout,
+    entities,
+    one_hot,
+    others,
+)
 from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
 from mqe_jax.physics.robots.index import RobotState
@@ -112,10 +121,14 @@ class Match(QuadrupedEnv[S, P]):
         `observe_teams` fills them, if they are not `masked`.
         """
         team = self.num_agents // 2
-        blocks = [one_hot(team, "agent's id within its team"), Block("base", 6, BASE_INFO)]
+        blocks = [one_hot(team, "agent's id within its team"), BASE]
+
+        def robots(name: str, count: int) -> Block:
+            return entities(name, "robot", count, 6, BASE_INFO, masked=masked, quantities=POSE)
+
         if team > 1:
-            blocks.append(entities("teammate", "robot", team - 1, 6, BASE_INFO, masked=masked))
-        blocks.append(entities("opponents", "robot", team, 6, BASE_INFO, masked=masked))
+            blocks.append(robots("teammate", team - 1))
+        blocks.append(robots("opponents", team))
         return tuple(blocks)
 
     def observe_teams(self, robot_state: RobotState) -> dict[str, jax.Array]:
@@ -211,7 +224,7 @@ class Duel(Match[S, P]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        return ObservationLayout((Block("base", 6, BASE_INFO), Block("opponent", 6, BASE_INFO)))
+        return ObservationLayout((BASE, Block("opponent", 6, BASE_INFO, quantities=POSE)))
 
     def observe(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:
         """Blocks (2, width), each in its agent's own frame."""

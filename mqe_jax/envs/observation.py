@@ -115,6 +115,12 @@ class ObservationLayout:
 
 
 BASE_INFO = "position, m, and roll, pitch, yaw, rad; environment frame"
+_POSE = ("height", "tilt", "tilt", "heading")
+OWN_POSE = ("position", "position", *_POSE)
+"""Quantities of `BASE_INFO` of the robot itself."""
+POSE = ("robots", "robots", *_POSE)
+"""Quantities of `BASE_INFO` of another robot."""
+BASE = Block("base", 6, BASE_INFO, quantities=OWN_POSE)
 
 
 def one_hot(agents: int, meaning: str = "agent's id") -> Block:
@@ -122,7 +128,7 @@ def one_hot(agents: int, meaning: str = "agent's id") -> Block:
     return Block("one_hot", agents, meaning, categorical=True)
 
 
-GATE = Block("gate", 2, "centre of the gap, m")
+GATE = Block("gate", 2, "centre of the gap, m", quantities=("objects",))
 
 
 def proprioception_layout(joints: int) -> ObservationLayout:
@@ -138,9 +144,10 @@ def proprioception_layout(joints: int) -> ObservationLayout:
 
 def team_blocks(agents: int) -> tuple[Block, ...]:
     """Returns the first blocks of cooperating robots; `observe_team` fills them."""
-    blocks = [one_hot(agents), Block("base", 6, BASE_INFO)]
+    blocks = [one_hot(agents), BASE]
     if agents > 1:
-        blocks.append(entities("teammate", "robot", agents - 1, 6, f"of each, {BASE_INFO}"))
+        meaning = f"of each, {BASE_INFO}"
+        blocks.append(entities("teammate", "robot", agents - 1, 6, meaning, quantities=POSE))
     return tuple(blocks)
 
 

@@ -23,7 +23,7 @@ from mqe_jax.core.limits import (
     bounds,
 )
 from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, settings_class
-from mqe_jax.envs.randomization import Randomization
+from mqe_jax.envs.randomization import NamedRandomization, Randomization
 from mqe_jax.physics import robots
 from mqe_jax.sensors.suite import Senses
 from mqe_jax.skills import agile  # noqa: F401  (skills register themselves)
@@ -115,8 +115,8 @@ class TaskParams:
     privileged_contact_forces: bool = False
     """Whether the privileged observation includes the contact forces on trunks and feet; their
     sensors cost about 8% of the throughput."""
-    randomization: Randomization = Randomization()
-    """Domain randomisation."""
+    randomization: NamedRandomization = Randomization()
+    """Domain randomisation: ranges by name, or a set of them, `robust`."""
     senses: Senses = ()
     """Sensors, whose readings are the group of observations `onboard`: the set `onboard`, `full`
     (no sensors), or a list of names and mappings of settings.

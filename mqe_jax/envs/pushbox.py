@@ -203,7 +203,10 @@ class Go1PushBox(QuadrupedEnv[PushBoxState, PushBoxParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        box = Block("box", 2, "centre x, y, m"), Block("box_quaternion", 4, "wxyz")
+        box = (
+            Block("box", 2, "centre x, y, m", quantities=("objects",)),
+            Block("box_quaternion", 4, "wxyz", quantities=("rotation",)),
+        )
         return ObservationLayout((*team_blocks(self.num_agents), GATE, *box))
 
     def observe(self, state: State[PushBoxState], robot_state: RobotState) -> dict[str, jax.Array]:

@@ -1,14 +1,17 @@
 """Domain randomisation: physics parameters that differ between environments."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import pydantic
 
 from mqe_jax.core.limits import Angle, Deviation, Lag, TimeLimit, Velocity
 from mqe_jax.core.settings import Factors, Frictions, Offsets, Payloads, Range, fail, settings_class
+from mqe_jax.envs.readings import Readings
+from mqe_jax.envs.sets import randomization_of
 from mqe_jax.physics.robots.index import RobotIndex
 
 if TYPE_CHECKING:
@@ -48,7 +51,14 @@ class Randomization:
     push_period: TimeLimit = 5.0
     """Mean time between pushes, s."""
     observation_noise: Deviation = 0.0
-    """Standard deviation of the noise on observations, except on one-hot blocks."""
+    """Standard deviation of the noise on observations, except on one-hot blocks; one number for
+    all units."""
+    readings: Readings = Readings()
+    """Errors of the observations by what is read."""
+
+
+NamedRandomization = Annotated[Randomization, pydantic.BeforeValidator(randomization_of)]
+"""Type of a field that holds ranges, which may be given as the name of a set."""
 
 
 @jax.tree_util.register_dataclass

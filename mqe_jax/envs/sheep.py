@@ -319,7 +319,8 @@ class Go1SheepEasy(QuadrupedEnv[None, SheepEasyParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        sheep = entities("sheep", "sheep", self.num_sheep, 2, "x, y of each, m")
+        place = ("objects",)
+        sheep = entities("sheep", "sheep", self.num_sheep, 2, "x, y of each, m", quantities=place)
         return ObservationLayout((*team_blocks(self.num_agents), GATE, sheep))
 
     def observe(self, state: State, robot_state: RobotState) -> dict[str, jax.Array]:

@@ -45,7 +45,9 @@ _PLACE = Block(
     categorical=True,
 )
 _NEAR = 2  # entries that `observe_entities` adds to each entity
-_NO_MATES = entities("teammate", "robot", 1, 6 + _NEAR, "none in a team of one", masked=True)
+_NO_MATES = entities(
+    "teammate", "robot", 1, 6 + _NEAR, "none in a team of one", masked=True, quantities=("robots",)
+)
 
 
 def draw(key: jax.Array, fewest: int, most: int, level: jax.Array | float = 0.0) -> jax.Array:
@@ -261,7 +263,10 @@ def entity_layout(layout: ObservationLayout) -> ObservationLayout:
         if of is not None:
             meaning = f"{block.meaning}; x, y from the agent, m"
             width = of.width + _NEAR
-            blocks.append(entities(block.name, of.kind, of.count, width, meaning, masked=True))
+            quantities = block.quantities * (of.width // max(len(block.quantities), 1))
+            several = entities(block.name, of.kind, of.count, width, meaning, masked=True)
+            near = quantities[:1] * _NEAR
+            blocks.append(dataclasses.replace(several, quantities=(*quantities, *near)))
         elif not block.categorical:
             blocks.append(block)
         if block.name == "base" and "teammate" not in layout.names:

@@ -107,6 +107,8 @@ class State(EnvironmentState, Generic[S]):
     """The task's own fields."""
     frozen_steps: jax.Array
     """Initial steps during which each agent's action is replaced by zero (A,) int32."""
+    readings: Any = dataclasses.field(default=(), kw_only=True)
+    """Memory of the readings' errors by group."""
     senses: Any = dataclasses.field(default=(), kw_only=True)
     """What sensors keep between steps (`SensorState`), empty without sensors."""
 

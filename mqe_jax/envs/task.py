@@ -6,6 +6,7 @@ The order is parameters, scene, initial state, observation, reward terms, ending
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic
 
@@ -17,6 +18,7 @@ from mqe_jax.core.returned import weights_of
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs.observation import ObservationLayout, box, proprioception_layout
 from mqe_jax.envs.params import P, TaskParams
+from mqe_jax.envs.readings import ReadingErrors, Readings
 from mqe_jax.envs.reward import fade, weigh
 from mqe_jax.envs.sensing import Sensing
 from mqe_jax.envs.sizes import ENTITIES, entity_layout, observe_entities, robots_there
@@ -231,6 +233,16 @@ class Task(Sensing, Generic[S, P]):
             layouts[ENTITIES] = entity_layout(self.sized_layout)
         return layouts
 
+    @functools.cached_property
+    def reading_errors(self) -> dict[str, ReadingErrors]:
+        """Errors of the readings by group, none without `randomization.readings`."""
+        readings = self.params.randomization.readings
+        if readings == Readings():
+            return {}
+        layouts = self.layouts
+        read = [name for name in ("policy", ENTITIES) if name in layouts]
+        return {name: ReadingErrors(readings, layouts[name], self.num_agents) for name in read}
+
     @property
     def group_sizes(self) -> dict[str, int]:
         """Lengths of an agent's observations by group."""
@@ -239,7 +251,8 @@ class Task(Sensing, Generic[S, P]):
     def describe(self, group: str) -> dict[str, Any]:
         """Returns what policies that see a group need of the task, beside its name and sizes."""
         layout = self.layouts[group]
-        blocks = tuple(dataclasses.replace(block, meaning="") for block in layout.blocks)
+        plain = {"meaning": "", "quantities": ()}
+        blocks = tuple(dataclasses.replace(block, **plain) for block in layout.blocks)
         sensors = self.params.senses if group == ONBOARD else ()
         weights = self.digests.get("skill_weights") if self.control == "command" else None
         return {

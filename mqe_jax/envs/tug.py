@@ -15,7 +15,7 @@ from mqe_jax.core import keys
 from mqe_jax.core.limits import Distance, Length, TimeLimit
 from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.match import Duel
-from mqe_jax.envs.observation import BASE_INFO, Block, ObservationLayout
+from mqe_jax.envs.observation import BASE, Block, ObservationLayout
 from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
@@ -144,12 +144,13 @@ class Go1Tug(Duel[TugState, TugParams]):
 
     @property
     def observation_layout(self) -> ObservationLayout:
+        meaning = "y, m, and its velocity, m/s"
         return ObservationLayout(
             (
-                Block("base", 6, BASE_INFO),
-                Block("cylinder", 2, "y, m, and its velocity, m/s"),
-                Block("distance", 1, "to the cylinder's axis, m"),
-                Block("previous_cylinder", 1, "y one step earlier, m"),
+                BASE,
+                Block("cylinder", 2, meaning, quantities=("objects", "velocity")),
+                Block("distance", 1, "to the cylinder's axis, m", quantities=("objects",)),
+                Block("previous_cylinder", 1, "y one step earlier, m", quantities=("objects",)),
             )
         )
 
