@@ -39,7 +39,7 @@ def forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     shutil.copy(RACE, tmp_path)
 
     def clear() -> None:
-        for name in ("race", "broken", "names", "names.race"):
+        for name in ("race", "broken", "own", "names", "names.race"):
             sys.modules.pop(name, None)
         TASKS.pop("race", None)
         imports.IMPORTED.clear()
@@ -179,6 +179,12 @@ def test_the_named_file_runs_and_not_an_installed_one_of_its_name(
     assert (mqe_jax.make("race", impl="c").__doc__ or "").endswith("5 m.")
     registry.load_packages()
     assert (mqe_jax.make("race", impl="c").__doc__ or "").endswith("5 m.")
+
+
+def test_what_an_import_prints_stays_out_of_the_object(forget: Any, mqe: Any) -> None:
+    Path("own.py").write_text("print('hello')")
+    said = mqe("tasks --json --import own.py")
+    assert json.loads(said.out)["tasks"] and said.err == "hello\n"
 
 
 def test_a_task_of_ones_own_is_listed_and_shown(forget: Any, mqe: Any) -> None:

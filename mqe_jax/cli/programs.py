@@ -5,6 +5,7 @@ import gc
 import importlib
 import os
 import platform
+import sys
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,8 +28,9 @@ def add_imports(names: Sequence[str]) -> None:
     from mqe_jax.core import imports
     from mqe_jax.core.precision import single  # imports JAX
 
-    for name in names:
-        single(imports.add)(name)
+    with contextlib.redirect_stdout(sys.stderr):  # which has the `--json` object alone
+        for name in names:
+            single(imports.add)(name)
 
 
 def find_packages(target: str) -> None:
@@ -37,7 +39,8 @@ def find_packages(target: str) -> None:
 
     if target not in (*TASKS, *ALIASES) and os.sep not in target and packages():
         import_mujoco()
-        load_packages()
+        with contextlib.redirect_stdout(sys.stderr):
+            load_packages()
 
 
 def import_mujoco() -> None:
