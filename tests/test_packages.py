@@ -113,6 +113,7 @@ def test_processes_of_a_training_import_the_same(forget: Any, mqe: Any, monkeypa
     [
         ("absent.py", None, "import: no file 'absent.py'"),
         ("absent", None, "import: no module 'absent'"),
+        (".", None, "import: no file '.'"),
         ("race", None, "import: no module 'race'; did you mean race.py?"),
         ("", None, "import: '' is not allowed; it must be a Python file or a module"),
         ("broken.py", "a = 1\nb = c\n", "NameError: name 'c' is not defined (broken.py, line 2)"),
@@ -208,6 +209,21 @@ def test_a_shipped_task_is_shown(task: str, mqe: Any) -> None:
     found = json.loads(mqe(f"tasks {task} --json").out)
     assert sum(block["width"] for block in found["observation"]) == env.observation_size
     assert all(x["meaning"] for x in [*found["rewards"], *found["parameters"]])
+
+
+def test_a_derived_task_names_the_one_whose_description_it_has(forget: Any, mqe: Any) -> None:
+    Path("own.py").write_text(
+        "from mqe_jax.envs import register_task\nfrom race import Race\n"
+        "class Own(Race):\n    name = 'own'\nregister_task(Own)\n"
+    )
+    Path("race.py").write_text(
+        RACE.read_text().replace('4 m."""', '4 m.\n\n    - End: 10 s.\n    """')
+    )
+    assert (
+        "Derived from race, which is described as:\n- End: 10 s.\n"
+        in mqe("tasks own --import own.py").out
+    )
+    TASKS.pop("own")
 
 
 def test_sensors_are_shown_and_flags_need_a_task(mqe: Any) -> None:

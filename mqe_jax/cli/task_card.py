@@ -31,6 +31,7 @@ def describe(env: QuadrupedEnv) -> dict[str, Any]:
             "title": env.title,
             "aim": about.aim,
             "about": about.about,
+            "about_of": about.about_of,
             "teams": [len(team) for team in env.teams],
             "any_size": env.variable_num_agents,
             "time_limit_s": env.params.episode_length,
@@ -77,7 +78,10 @@ def _trainings(env: QuadrupedEnv) -> list[dict[str, Any]]:
 def show(card: Mapping[str, Any], *, long: bool) -> None:
     """Prints what `describe` returns; with `long`, also the parameters that all tasks share."""
     print(f"{line(card['task'])}: {line(card['title'])}\n")
-    for text in re.split(r"\n(?=- |\n)", f"{card['aim']}\n\n{card['about']}".strip()):
+    about = card["about"]
+    if card["about_of"] != card["task"]:
+        about = f"Derived from {card['about_of']}, which is described as:\n{about}"
+    for text in re.split(r"\n(?=- |\n)", f"{card['aim']}\n\n{about}".strip()):
         if text.startswith("\n"):
             print()
         indent = "  " if text.startswith("- ") else ""

@@ -23,7 +23,7 @@ def add(name: str) -> None:
     InputError naming the file or module, and the line of an error in it.
     """
     path = Path(name).resolve()
-    file = path.suffix == ".py" or os.sep in name
+    file = path.suffix == ".py" or os.sep in name or name.startswith(".")
     if file and not path.is_file():
         raise InputError(f"import: no file {name!r}")
     try:

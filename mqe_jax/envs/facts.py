@@ -37,7 +37,9 @@ class Facts(NamedTuple):
     aim: str
     """What a team has to do."""
     about: str
-    """The rest of the class's docstring, or that of a base class."""
+    """The rest of the class's docstring, or that of the task from which it is derived."""
+    about_of: str
+    """Id of the task that `about` describes."""
     actions: dict[str, str]
     """Range and unit of each command that an action sets, with control `command`."""
     ends: str
@@ -60,15 +62,19 @@ def facts(env: QuadrupedEnv) -> Facts:
         print([term.name for term in facts(mqe_jax.make("go1gate")).rewards])
         ```
     """
-    tasks = [kind for kind in type(env).__mro__ if getattr(kind, "name", "")]  # not their bases
+    kinds = type(env).__mro__
+    tasks = [kind for kind in kinds if kind is kinds[0] or getattr(kind, "name", "")]
     texts = [inspect.cleandoc(vars(kind).get("__doc__") or "").partition("\n") for kind in tasks]
-    about = next((body.strip() for _, _, body in texts if body), "")
+    pairs = zip(tasks, texts, strict=True)
+    described = [(kind.name, body.strip()) for kind, (_, _, body) in pairs if body]
+    of, about = next(iter(described), (env.name, ""))
     usual = vars(TaskParams())
     fields = list(_fields(env.params))
     given = vars(env.params)
     shared = {name for name in usual if given[name] == usual[name]}
     return Facts(
         aim=env.aim or texts[0][0],
+        about_of=of,
         about=re.sub(r"see `\w+Rewards`", "the terms below", about),
         actions=_actions(env),
         ends=_ends(env),
