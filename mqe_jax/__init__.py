@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mqe_jax.runs.learning import Run, learn, learn_seeds, load_run
     from mqe_jax.runs.playing import Clip, evaluate, render, tournament
     from mqe_jax.runs.recording import record
+    from mqe_jax.runs.stress import stress
     from mqe_jax.runs.sweeping import sweep
     from mqe_jax.runs.throughput import bench
     from mqe_jax.train.config import TrainConfig
@@ -54,6 +55,7 @@ __all__ = [
     "make_learner",
     "record",
     "render",
+    "stress",
     "sweep",
     "tasks",
     "tournament",
@@ -74,6 +76,7 @@ _HOMES = {
     "load_policy": "names",
     "make_learner": "runs.cast",
     "record": "runs.recording",
+    "stress": "runs.stress",
     "sweep": "runs.sweeping",
     "train_skill": "walk.training",
     "versus": "names",

@@ -29,6 +29,7 @@ CHECKING = {
     "runs.learning",
     "runs.playing",
     "runs.recording",
+    "runs.stress",
     "runs.sweeping",
     "runs.throughput",
     "selfplay.league.crossplay",

@@ -14,6 +14,7 @@ from mqe_jax.envs import make
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.readings import Reading, ReadingErrors, Readings
+from mqe_jax.envs.sets import randomization_of
 
 ENVS = 128
 READINGS = Readings(
@@ -23,7 +24,10 @@ READINGS = Readings(
     objects=Reading(noise=0.4),
 )
 KEY = jax.random.PRNGKey(3)
-ROBUST: dict[str, Any] = {"randomization": "robust", "joint_mechanics": True}
+ROBUST: dict[str, Any] = {
+    "randomization": {**randomization_of("robust"), "push_period": 0.05},
+    "joint_mechanics": True,
+}
 
 
 def test_errors_have_the_sizes_of_their_quantities_and_a_bias_for_the_episode() -> None:
@@ -115,7 +119,7 @@ def test_every_quantity_of_the_robust_set_changes_what_happens(impl: str) -> Non
     env = make("go1plane", impl=impl, num_envs=1, control="position", **ROBUST)
     usual = make("go1plane", impl="c", control="position", joint_mechanics=True)
     state = jax.jit(env.reset)(KEY)
-    nominal = usual.randomizer.sample(KEY)
+    nominal = dataclasses.replace(usual.randomizer.sample(KEY), errors=jnp.zeros(()))
     step = jax.jit(env.step)
     actions = jax.random.uniform(KEY, (20, 2, env.action_size), minval=-1.0)
 
@@ -123,7 +127,7 @@ def test_every_quantity_of_the_robust_set_changes_what_happens(impl: str) -> Non
         moved = dataclasses.replace(state, randomized=randomized)
         for action in actions:
             moved = step(moved, action)
-        return np.asarray(moved.data.qpos)
+        return np.concatenate([moved.data.qpos, jnp.ravel(moved.obs)])
 
     start = after(nominal)
     for field in dataclasses.fields(nominal):

@@ -4,6 +4,7 @@ Short episodes are not over-represented.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -102,22 +103,41 @@ class Evaluator:
         self._run = jax.jit(run)
 
     @single
-    def __call__(self, seats: Seats, episodes: int, keys: jax.Array) -> list[Result]:
+    def __call__(
+        self,
+        seats: Seats,
+        episodes: int,
+        keys: jax.Array,
+        parts: int = 1,
+        report: Callable[[float], None] = lambda share: None,
+    ) -> list[Result]:
         """Returns the results of B evaluations, for random keys (B, 2).
 
         The arrays of `seats` have a leading axis B. Seats of one form are compiled once. Errors are
-        those of `evaluate_batch`.
+        those of `evaluate_batch`. Environments i, i + parts, ... are a part, with `episodes` and a
+        result of its own; results are by evaluation, then by part. `report` receives the share of
+        episodes that are finished.
         """
-        count = self._env.num_envs
-        quota = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)
+        count = self._env.num_envs // parts
+        shares = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)
+        quota = np.repeat(shares, parts)
         progress = self._begin(seats, keys)
         for done_steps in range(0, self._max_steps, self._block):
             progress = self._run(progress, seats, keys, np.uint32(done_steps), quota)
-            if np.all(np.asarray(progress.finished) >= quota):
+            finished = np.minimum(np.asarray(progress.finished), quota)
+            report(float(finished.sum() / (quota.sum() * len(keys))))
+            if np.all(finished == quota):
                 # Only the sums are indexed: environment states may contain unbatched leaves.
                 sums = jax.device_get(progress._replace(env_state=(), memory=()))
-                each = [jax.tree.map(lambda x: x[i], sums) for i in range(len(keys))]  # noqa: B023
-                return [_result(self._env.name, episodes, own) for own in each]
+                return [
+                    _result(
+                        self._env.name,
+                        episodes,
+                        jax.tree.map(lambda x: x[i, part::parts], sums),  # noqa: B023
+                    )
+                    for i in range(len(keys))
+                    for part in range(parts)
+                ]
         raise InputError(
             f"episodes: {episodes} of {self._env.name} are not finished after {self._max_steps} "
             "steps"

@@ -222,11 +222,20 @@ class Eval(PolicyOptions):
     actions are sampled."""
     opponent_export: RobotFile = None
     """The same for the robots of the opponents."""
+    stress: bool = False
+    """Evaluate under other friction, payload, motors, delay, errors of readings and pushes, each
+    with `--episodes`. A run folder gets a picture, stress.png."""
+    curves: bool = False
+    """With `--stress`, also under disturbances that grow."""
 
     def run(self) -> dict[str, Any]:
         """Evaluates a policy; prints a table, or returns the object for `--json`."""
         from mqe_jax.runs.playing import evaluate
 
+        if self.stress:
+            return self._stress()
+        if self.curves:
+            fail("curves", True, "left out without --stress")
         options = {
             "episodes": self.episodes,
             "num_envs": self.num_envs,
@@ -244,6 +253,29 @@ class Eval(PolicyOptions):
         if not self.json:
             print(result.details() if self.long else result)
         return result.to_dict()
+
+    def _stress(self) -> dict[str, Any]:
+        from mqe_jax.runs.stress import stress
+        from mqe_jax.viz.curves import save_figure
+
+        for name in ("export", "opponent_export", "dump_diverged"):
+            if getattr(self, name) is not None:
+                fail(name, str(getattr(self, name)), "left out with --stress")
+        found = stress(
+            **self.playing,
+            episodes=self.episodes,
+            num_envs=self.num_envs,
+            sides=self.sides,
+            seed=self.seed,
+            curves=self.curves,
+        )
+        if not self.json:
+            print(found)
+        folder = Path(self.target)
+        if folder.is_dir():
+            save_figure(found.plot(), folder / "stress.png")
+            echo(f"mqe: {folder / 'stress.png'} has the picture")
+        return {name: result.to_dict() for name, result in found.results.items()}
 
     @contextlib.contextmanager
     def _robots(self) -> Iterator[dict[str, Any]]:

@@ -22,6 +22,8 @@ LINEAR = 7933
 """Into the key of a trunk's hidden layers: its layer `linear`."""
 ENCODER = 7937
 """Into the key of a trunk: its encoder."""
+CONDITION = 7941
+"""Into the key of a reset: the parameters of a condition."""
 OPPONENT = 7949
 """Into a state's key: the actions of the opponent."""
 RESUMED = 7951

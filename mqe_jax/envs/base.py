@@ -387,7 +387,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         if self.params.randomization.motor_offset:
             target = target + state.randomized.motor_offset
         target = self.sizes.hold(target, state.active)
-        data = self.randomizer.push(state.data, push_key, self.dt)
+        data = self.randomizer.push(state.data, state.randomized.push, push_key, self.dt)
         data = self.step_npcs(data, before.robots, npc_key)
         data = self.sizes.park(data, state.active)
         fields = self.randomizer.fields(state.randomized) | self.fields(state)
@@ -435,7 +435,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             if name in self.reading_errors:
                 key = jax.random.fold_in(state.key, keys.READINGS + number)
                 errors = self.reading_errors[name]
-                obs, memory = errors.apply(obs, state.readings[name], key)
+                obs, memory = errors.apply(obs, state.readings[name], key, state.randomized.errors)
                 state = dataclasses.replace(state, readings={**state.readings, name: memory})
             obs = hide(layout, obs, there) if there else obs
             seen[name] = jnp.where(self.observed(state)[:, None], finite(obs), 0.0)

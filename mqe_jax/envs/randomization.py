@@ -83,6 +83,12 @@ class RandomizedParams:
     """Factor on rotor inertia, damping and dry friction (R,); not in the privileged observation."""
     action_lag: jax.Array
     """Delay of the actuator targets, environment steps () int32."""
+    push: jax.Array
+    """Maximum sudden change of a trunk's horizontal velocity (), m/s; not in the privileged
+    observation."""
+    errors: jax.Array
+    """Factor on the errors of readings (), 0: exact and at once; not in the privileged
+    observation."""
 
 
 class Randomizer:
@@ -133,6 +139,8 @@ class Randomizer:
             motor_offset=uniform(keys[6], offset, self.index.joint_qpos.shape, 0.0),
             joint_mechanics=uniform(keys[5], random.joint_mechanics, (robots,), 1.0),
             action_lag=jax.random.randint(keys[4], (), 0, random.action_lag + 1),
+            push=jnp.full((), random.push, jnp.float32),
+            errors=jnp.ones(()),
         )
 
     def fields(self, params: RandomizedParams) -> dict[str, jax.Array]:
@@ -170,8 +178,11 @@ class Randomizer:
                 fields[name] = as_float(getattr(model, name)) * factor
         return fields
 
-    def push(self, data: "mjx.Data", key: jax.Array, dt: float) -> "mjx.Data":
-        """Changes each trunk's horizontal velocity at random, on average once per `push_period`."""
+    def push(self, data: "mjx.Data", most: jax.Array, key: jax.Array, dt: float) -> "mjx.Data":
+        """Changes each trunk's horizontal velocity by up to `most` (), m/s.
+
+        It does so at random, on average once per `push_period`.
+        """
         random = self.random
         index = self.index
         if not random.push:
@@ -179,7 +190,6 @@ class Randomizer:
         when_key, size_key = jax.random.split(key)
         robots = index.num_robots
         now = jax.random.bernoulli(when_key, dt / random.push_period, (robots, 1))
-        most = random.push
         change = jax.random.uniform(size_key, (robots, 2), minval=-most, maxval=most)
         across = index.base_qvel[:, :2]
         return data.replace(qvel=data.qvel.at[across].add(jnp.where(now, change, 0.0)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core.blocks import Block, Entities
@@ -80,14 +81,19 @@ class ReadingErrors:
         bias = self.bias * jax.random.normal(key, (self.agents, len(self.bias)))
         return bias, self._pipeline.init_memory(self._all, self.agents)
 
-    def apply(self, obs: jax.Array, memory: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Returns observations (A, O) with errors, and the next memory."""
+    def apply(
+        self, obs: jax.Array, memory: Any, key: jax.Array, level: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, Any]:
+        """Returns observations (A, O) with errors, and the next memory.
+
+        The level () is a factor on them; at 0 the observations are exact and at once.
+        """
         bias, queue = memory
         noise_key, loss_key = jax.random.split(key)
-        obs = obs + bias + self.noise * jax.random.normal(noise_key, obs.shape)
-        lost = jax.random.uniform(loss_key, (self.agents, 1)) < self._pipeline.dropout
-        obs, queue = self._pipeline.apply(self._all, obs, queue, lost=lost)
-        return obs, (bias, queue)
+        error = bias + self.noise * jax.random.normal(noise_key, obs.shape)
+        lost = jax.random.uniform(loss_key, (self.agents, 1)) < level * self._pipeline.dropout
+        late, queue = self._pipeline.apply(self._all, obs + level * error, queue, lost=lost)
+        return jnp.where(level > 0, late, obs), (bias, queue)
 
 
 def _deviations(layout: ObservationLayout, readings: Readings, kind: str) -> np.ndarray:
