@@ -61,7 +61,7 @@ def test_results_are_those_of_the_conditions(monkeypatch: pytest.MonkeyPatch) ->
     found = mqe_jax.stress("go1plane", "forward", env=low, impl="c", episodes=4, num_envs=4)
     falls = {name: result.endings["fall"] for name, result in found.results.items()}
     assert falls == {"usual": 0.0, "weak": 1.0}
-    assert found.breaks_first in str(found)
+    assert found.worst in str(found)
     assert found.plot().axes[0].patches
 
 
