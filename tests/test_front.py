@@ -142,10 +142,13 @@ def test_an_interrupt_returns_the_run_so_far(monkeypatch: Any, mqe: Any, capfd: 
 
     with monkeypatch.context() as patch:
         patch.setattr(Training, "_step", interrupt)
-        for folder in (None, "run"):
-            run = mqe_jax.learn("fake", FEW, run_dir=folder)
+        for folder, total in ((None, 40), ("run", 64)):
+            run = mqe_jax.learn("fake", FEW | {"total_steps": total}, run_dir=folder)
             assert run.env_steps == len(run.metrics["success"]) * 32 == 32 and not run.finished
-        assert "interrupted after 32 environment steps" in capfd.readouterr().err
+        told = capfd.readouterr().err
+        assert "interrupted after 32 environment steps" in told
+        assert told.count("total_steps 40 become 64, whole updates of num_envs 4 x rollout") == 1
+        assert "total_steps 64" not in told
         mqe("train fake --run-dir other", *SMALL, code=130)
         assert not Path("other", "curve.png").exists()
     refuses(

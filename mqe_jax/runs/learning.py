@@ -212,6 +212,11 @@ def _train(
     dump_diverged: str | Path | None,
 ) -> list[Run]:
     """Trains seeds into their folders; `folder` gets the curve of them all."""
+    config = configs[0]
+    steps = config.num_updates * config.steps_per_update
+    if steps > 1.1 * config.total_steps:
+        update = f"num_envs {config.num_envs} x rollout_steps {config.rollout_steps}"
+        echo(f"mqe: total_steps {config.total_steps:,} become {steps:,}, whole updates of {update}")
     with (
         guard(cast.env, dump_diverged) as env,
         open_training(cast._replace(env=env), configs, folders, resume) as training,
