@@ -160,9 +160,10 @@ class VectorEnv(EnvBatch):
             fail("final", final, f"some of {', '.join(FINAL)}")
         if num_envs * copies > _SMALL:
             state = jax.eval_shape(functools.partial(VectorEnv.reset, self), jax.random.PRNGKey(0))
-            check_memory(
-                "num_envs", num_envs * copies, copies * bytes_of(state) / jax.process_count()
-            )
+            share = num_envs * copies // jax.process_count()
+            needed = copies * bytes_of(state) / jax.process_count()
+            needed += self.env.physics.own_bytes(share)
+            check_memory("num_envs", num_envs * copies, needed)
         self.name = env.name
         self.max_episode_steps = env.max_steps
         self.num_agents = env.num_agents

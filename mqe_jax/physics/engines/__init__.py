@@ -2,9 +2,10 @@
 
 | name (`impl`) | engine | hardware |
 |---|---|---|
-| `warp` | MJX, Warp implementation | NVIDIA GPU (CPU for tests) |
+| `warp` | MuJoCo Warp, called once an environment step | NVIDIA GPU (CPU for tests) |
 | `c` | MuJoCo's own C engine on all cores, called through XLA's foreign function interface | CPU |
 | `jax` | MJX, JAX implementation | CPU, GPU, TPU |
+| `warp-mjx` | MuJoCo Warp as MJX calls it: the reference of `warp`, slower | as `warp` |
 """
 
 import pkgutil
@@ -19,9 +20,10 @@ from mqe_jax.physics.engines.engine import STATE_FIELDS, Engine
 __all__ = ["ENGINES", "STATE_FIELDS", "Engine", "make", "resolve"]
 
 ENGINES: dict[str, str] = {
-    "warp": "mqe_jax.physics.engines.mjx:WarpEngine",
+    "warp": "mqe_jax.physics.engines.warp:WarpEngine",
     "c": "mqe_jax.physics.engines.c:CEngine",
     "jax": "mqe_jax.physics.engines.mjx:JaxEngine",
+    "warp-mjx": "mqe_jax.physics.engines.mjx:WarpMjxEngine",
 }
 """Engines by name as MODULE:CLASS, imported on demand: a new one is one line. `auto` is the first
 that is preferred on this machine."""

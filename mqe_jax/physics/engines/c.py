@@ -63,9 +63,7 @@ class CEngine(Engine):
         )
 
     def blank(self) -> "mjx.Data":
-        device = jax.local_devices(backend="cpu")[0]
-        data = private.load_mjx().make_data(self.model, device, impl="cpp")
-        return private.without_pointers(data)
+        return private.light_data(self.model)
 
     def advance(
         self, data: "mjx.Data", fields: Mapping[str, jax.Array], forced: bool, num_substeps: int

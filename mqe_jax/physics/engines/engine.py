@@ -72,6 +72,10 @@ class Engine(abc.ABC):
         """Returns whether the engine can step `num_envs` environments at once."""
         return True
 
+    def own_bytes(self, num_envs: int) -> int:
+        """Returns the bytes of device memory that the engine needs beside the state."""
+        return 0
+
     @abc.abstractmethod
     def blank(self) -> mjx.Data:
         """Returns data of one environment with all arrays of the engine; `init` sets the state."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import copy
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.core.settings import fail
-from mqe_jax.physics.engines import private
+from mqe_jax.physics.engines import private, warp_model
 from mqe_jax.physics.engines.engine import Engine
 from mqe_jax.physics.robots.index import scatter
 from mqe_jax.physics.robots.motors import Motors
@@ -21,41 +19,7 @@ from mqe_jax.physics.robots.motors import Motors
 if TYPE_CHECKING:
     from mujoco import mjx
 
-_BIT = mujoco.mjtDisableBit
-_JACOBIAN = mujoco.mjtJacobian
-_FRICTION: int = int(_BIT.mjDSBL_FRICTIONLOSS)
-_PASSIVE: int = int(_BIT.mjDSBL_SPRING) | int(_BIT.mjDSBL_DAMPER)
-_MAX_DENSE = 50
-"""Degrees of freedom up to which Warp's line search needs no extra kernels for dense Jacobians."""
-_MAX_FULL = 80
-"""Degrees of freedom above which Warp's solver skips zeros by default.
-
-On an H200 this gains nothing with four robots (78, the most of the paper) and a third with eight
-(150): sizes/warp in results/measurements.json.
-"""
-_TERMS: dict[int, tuple[str, ...]] = {
-    _FRICTION: ("dof_frictionloss", "tendon_frictionloss"),
-    _PASSIVE: (
-        "jnt_stiffness",
-        "jnt_stiffnesspoly",
-        "tendon_stiffness",
-        "tendon_stiffnesspoly",
-        "dof_damping",
-        "dof_dampingpoly",
-        "tendon_damping",
-        "tendon_dampingpoly",
-        "actuator_damping",
-        "actuator_dampingpoly",
-        "body_gravcomp",
-        "geom_adhesion",
-        "pair_adhesion",
-    ),
-}
-"""The model fields of each term of the dynamics: if all are zero, so is the term.
-
-Without springs and dampers Warp and MuJoCo compute no passive force at all, so the fields of
-`_PASSIVE` include gravity compensation and adhesion.
-"""
+_SENSORS = mujoco.mjtDisableBit.mjDSBL_SENSOR
 
 
 class MjxEngine(Engine):
@@ -84,7 +48,7 @@ class MjxEngine(Engine):
         ctrl = data.ctrl
         model = self.mjx_model.replace(**fields) if fields else self.mjx_model
         model = _disable(model, self.unused_terms(fields))
-        loop = _disable(model, _BIT.mjDSBL_SENSOR) if self.last_apart else model
+        loop = _disable(model, _SENSORS) if self.last_apart else model
 
         def substep(
             model: mjx.Model, carry: tuple[mjx.Data, jax.Array]
@@ -165,14 +129,14 @@ class JaxEngine(MjxEngine):
         return data, jnp.zeros((), bool)
 
 
-class WarpEngine(MjxEngine):
-    """MJX-Warp on an NVIDIA GPU; environments share a contact buffer of fixed size.
+class WarpMjxEngine(MjxEngine):
+    """MJX-Warp as MJX calls it, with all arrays of model and data in each physics step.
 
-    It launches each kernel also where it adds zero, so terms that are zero for the whole model are
-    disabled.
+    It is the reference of `WarpEngine`, which is faster. Terms that are zero for the whole model
+    are disabled.
     """
 
-    impl = "warp"
+    impl = "warp-mjx"
     unroll = 3
     last_apart = True
 
@@ -180,29 +144,15 @@ class WarpEngine(MjxEngine):
         super().__init__(model, **options)
         self._mjx = private.load_mjx()
         private.keep_streams()
-        self._model = _with_jacobian(model)
+        self._model = warp_model.with_jacobian(model)
         put = self._mjx.put_model(self._model, jax.local_devices()[0], impl="warp")
         self.mjx_model = private.without_warnings(put)
-        needs = private.sparse_newton_needs(self.mjx_model)
-        if needs and self.sparse_solver:
-            fail("sparse_solver", True, f"None or False: it needs {needs}")
-        sparse = model.nv > _MAX_FULL if self.sparse_solver is None else self.sparse_solver
-        if sparse and not needs:
+        if warp_model.skips_zeros(self._model, self.sparse_solver):
             self.mjx_model = private.with_sparse_newton(self.mjx_model)
 
     @classmethod
-    def is_preferred(cls) -> bool:
-        kinds = [device.device_kind.lower() for device in jax.devices()]
-        nvidia = any("cuda" in kind or "nvidia" in kind for kind in kinds)
-        return jax.default_backend() == "gpu" and nvidia and private.warp_is_installed()
-
-    @classmethod
     def obstacle(cls) -> str | None:
-        if private.warp_is_installed():
-            return None
-        return (
-            "needs the package warp-lang: pip install 'mqe-jax[warp]', or choose impl 'c' or 'jax'"
-        )
+        return warp_model.obstacle()
 
     def holds(self, num_envs: int) -> bool:
         return num_envs <= self.num_envs
@@ -217,20 +167,7 @@ class WarpEngine(MjxEngine):
         )
 
     def unused_terms(self, fields: Collection[str]) -> int:
-        """Returns the disable flags of terms that are zero, also with any values of `fields`."""
-        model = self.model
-        flags = sum(
-            flag
-            for flag, names in _TERMS.items()
-            if not any(name in fields or np.any(getattr(model, name)) for name in names)
-        )
-        # Flexes and fluids add passive forces; without dampers, implicit integrators ignore the
-        # actuators' derivatives.
-        fluid = any((model.opt.density, model.opt.viscosity, *model.opt.wind))
-        implicit = model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER
-        if implicit or model.nflex or fluid:
-            flags &= ~_PASSIVE
-        return flags
+        return warp_model.unused_terms(self.model, fields)
 
     def advance(
         self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
@@ -244,18 +181,6 @@ class WarpEngine(MjxEngine):
 
     def physics_step(self, model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
         return self._mjx.step(model, data), jnp.zeros((), bool)
-
-
-def _with_jacobian(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns the model, or a copy with dense Jacobians.
-
-    These take fewer kernels in small models that leave the choice.
-    """
-    if model.opt.jacobian != _JACOBIAN.mjJAC_AUTO or model.nv > _MAX_DENSE:
-        return model
-    model = copy.copy(model)
-    model.opt.jacobian = _JACOBIAN.mjJAC_DENSE
-    return model
 
 
 def _disable(model: mjx.Model, disable: int) -> mjx.Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import importlib
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 if TYPE_CHECKING:
@@ -63,15 +65,20 @@ def load_mjx() -> ModuleType:
     return mjx
 
 
-def without_pointers(data: mjx.Data) -> mjx.Data:
-    """Zeroes MJX's memory addresses in data made with impl `cpp`.
+def light_data(model: mujoco.MjModel) -> mjx.Data:
+    """Returns MJX's data of one environment with public fields only, on JAX's first device.
 
-    They are invalid in another process.
+    They are of impl `cpp`, whose private fields are two memory addresses, here zero: those of
+    MJX's `make_data` are invalid in another process, and it needs JAX's CPU backend.
     """
-    zeros = {
-        name: jnp.zeros_like(getattr(data._impl, name)) for name in ("pointer_lo", "pointer_hi")
-    }
-    return data.replace(_impl=dataclasses.replace(data._impl, **zeros))
+    load_mjx()
+    from mujoco.mjx._src import io as mjx_io
+    from mujoco.mjx._src import types
+
+    fields = mjx_io._put_data_public_fields(mujoco.MjData(model))
+    zero = np.zeros((), np.uint32)
+    data = types.Data(**fields, _impl=types.DataCPP(pointer_lo=zero, pointer_hi=zero))
+    return mjx_io._strip_weak_type(jax.device_put(data, jax.local_devices()[0]))
 
 
 def warp_is_installed() -> bool:
@@ -108,20 +115,20 @@ def without_overflow(data: mjx.Data) -> mjx.Data:
 
 def overflow(data: mjx.Data) -> jax.Array:
     """Returns whether Warp dropped contacts or constraints since its flags were cleared () bool."""
-    return jnp.any((data._impl.overflow & ~_ITERATIONS) != 0)
+    return jnp.any(overflowed(data._impl.overflow))
 
 
-def sparse_newton_needs(model: mjx.Model) -> str | None:
-    """Returns what a model on Warp lacks for `with_sparse_newton`, or None.
+def sparse_newton_needs(model: mujoco.MjModel) -> str | None:
+    """Returns what a model lacks on Warp for `with_sparse_newton`, or None.
 
     The text ends a line that begins with "needs".
     """
     found = importlib.metadata.version("mujoco-mjx")
     if found != _NEWTON_OF:
         return f"mujoco-mjx {_NEWTON_OF}, not {found}"
-    if not model._impl.is_sparse:
+    if model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE:
         return f"sparse Jacobians, but those of {model.nv} degrees of freedom are dense"
-    if model.opt.integrator.name == "DISCRETE":  # couples robots by tendons and actuators too
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:  # couples robots by tendons too
         return "another integrator than discrete"
     return None
 
@@ -163,6 +170,79 @@ def _sparse_block_dim() -> type:
 
     solver._cholesky_factorize_solve = step
     return SparseBlockDim
+
+
+def warp_model(model: mujoco.MjModel, *, sparse: bool) -> Any:
+    """Returns MuJoCo Warp's model on Warp's device, as MJX makes it.
+
+    `sparse` says whether its Newton steps are those of `newton.py`.
+    """
+    made = _mujoco_warp().put_model(model)
+    made.opt.warn_overflow = 0
+    made.opt.tolerance.fill_(model.opt.tolerance)  # MuJoCo Warp raises it to 1e-6, MJX does not
+    if sparse:
+        made.block_dim = _sparse_block_dim()(**vars(made.block_dim))
+    return made
+
+
+def warp_data(model: mujoco.MjModel, count: int, contacts: int, constraints: int) -> Any:
+    """Returns MuJoCo Warp's data of `count` environments on Warp's device.
+
+    `contacts` is for all environments, `constraints` for each.
+    """
+    return _mujoco_warp().make_data(model, nworld=count, naconmax=contacts, njmax=constraints)
+
+
+def warp_bytes(model: mujoco.MjModel, count: int, contacts: int, constraints: int) -> int:
+    """Returns the bytes of `warp_data`, which are linear in `count` and `contacts`."""
+
+    def measure(count: int, contacts: int) -> int:
+        return _bytes_of_arrays(warp_data(model, count, contacts, constraints))
+
+    with importlib.import_module("warp").ScopedDevice("cpu"):
+        least = measure(1, 1)
+        of_environment = measure(2, 1) - least
+        of_contact = measure(1, 2) - least
+    return least + (count - 1) * of_environment + (contacts - 1) * of_contact
+
+
+def warp_step(model: Any, data: Any, disable: int) -> None:
+    """Launches a physics step of MuJoCo Warp with further disable flags."""
+    model = copy.copy(model)
+    model.opt = copy.copy(model.opt)
+    model.opt.disableflags |= disable
+    _mujoco_warp().step(model, data)
+
+
+def overflowed(flags: jax.Array) -> jax.Array:
+    """Returns where Warp dropped contacts or constraints, from its flags."""
+    return (flags & ~_ITERATIONS) != 0
+
+
+def forget_graphs(call: Any) -> None:
+    """Frees the graphs that a callable of Warp captured, and their copies of arguments."""
+    call.captures.clear()
+    for traced in call.call_descriptors.values():
+        for name in ("capture", *_STAGED):
+            setattr(traced, name, None)
+
+
+_STAGED = "input_staging_arrays", "output_staging_arrays", "static_staging_arrays"
+
+
+def _mujoco_warp() -> Any:
+    return importlib.import_module("mujoco.mjx.third_party.mujoco_warp")
+
+
+def _bytes_of_arrays(structure: Any) -> int:
+    """Returns the bytes of Warp's arrays in a structure."""
+    found = 0
+    for value in vars(structure).values():
+        if dataclasses.is_dataclass(value):
+            found += _bytes_of_arrays(value)
+        else:
+            found += getattr(value, "capacity", 0)
+    return found
 
 
 def contact(data: mjx.Data) -> mjx.Contact:

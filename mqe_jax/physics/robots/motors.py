@@ -167,6 +167,28 @@ class Motors:
         return xp.maximum(of_legs * self._full, needed)
 
     @functools.cached_property
+    def constants(self) -> np.ndarray:
+        """What `limit` and `clamp` know of each joint (J, 10), for kernels that do the same.
+
+        The columns: V, L, greatest speed, slopes of the torque line and of braking, complete
+        armature, armature beyond the limit, inertia, lowest V of the leg, whether the line is too
+        steep.
+        """
+        columns = (
+            self.speed,
+            self.torque,
+            self.fastest,
+            self._line,
+            self._brake,
+            self._full,
+            self._needed,
+            self._inertia,
+            np.repeat(self._leg_speed, len(self.response)),
+            self._steep,
+        )
+        return np.stack(columns, axis=-1).astype(np.float32)
+
+    @functools.cached_property
     def fastest(self) -> np.ndarray:
         """Greatest speeds after a physics step (..., J), rad/s."""
         return np.float32(CLAMP) * self.speed

@@ -1,0 +1,334 @@
+"""MuJoCo Warp: all physics steps of an environment step, with the motors, in one call.
+
+Model and data are structures of arrays that this module keeps on the device. JAX hands over the
+state and the model fields that environments override, and gets the next state.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import importlib
+import inspect
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+
+from mqe_jax.physics.engines import private, warp_model
+from mqe_jax.physics.engines.engine import Engine
+from mqe_jax.physics.robots.motors import Motors
+
+if TYPE_CHECKING:
+    from mujoco import mjx
+
+_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+_CHANGED = "qpos", "qvel", "qacc_warmstart", "time"
+_RESULTS = *_CHANGED, "sensordata", "overflow"
+
+
+class WarpEngine(Engine):
+    """MuJoCo Warp on an NVIDIA GPU; environments share a contact buffer of fixed size.
+
+    It launches each kernel also where it adds zero, so terms that are zero for the whole model are
+    disabled.
+    """
+
+    impl = "warp"
+    graph_mode: ClassVar[str] = "WARP_STAGED"
+    """How a GPU repeats the kernels of a call, a name of Warp's `JaxCallableGraphMode`."""
+
+    def __init__(self, model: mujoco.MjModel, **options: Any) -> None:
+        super().__init__(model, **options)
+        private.keep_streams()
+        own = warp_model.with_jacobian(model)
+        sparse = warp_model.skips_zeros(own, self.sparse_solver)
+        contacts = self.num_envs * self.contacts_per_env
+        limits = contacts, self.max_constraints_per_env
+        self._stepper = _Stepper(own, self.motors, sparse, limits, self.graph_mode)
+        weakref.finalize(self, self._stepper.retire).atexit = False
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        weakref.finalize(self, self._stepper.retire).atexit = False
+
+    @classmethod
+    def is_preferred(cls) -> bool:
+        return warp_model.is_preferred()
+
+    @classmethod
+    def obstacle(cls) -> str | None:
+        return warp_model.obstacle()
+
+    def holds(self, num_envs: int) -> bool:
+        return num_envs <= self.num_envs
+
+    def own_bytes(self, num_envs: int) -> int:
+        return self._stepper.bytes(num_envs)
+
+    def blank(self) -> mjx.Data:
+        return private.light_data(self.model)
+
+    def advance(
+        self, data: mjx.Data, fields: Mapping[str, jax.Array], forced: bool, num_substeps: int
+    ) -> tuple[mjx.Data, jax.Array]:
+        mocap = ("mocap_pos", "mocap_quat") if self.model.nmocap else ()
+        read = (*_CHANGED, "ctrl", *mocap, *(("xfrc_applied",) if forced else ()))
+        call = _Call(self._stepper, read, tuple(sorted(fields)), num_substeps)
+        arrays = [getattr(data, name) for name in read] + [fields[name] for name in call.fields]
+        found = _steps.bind(*(jnp.asarray(array)[None] for array in arrays), call=call)
+        *state, overflow = (array[0] for array in found)
+        data = data.replace(**dict(zip(_RESULTS[:-1], state, strict=True)))
+        return data, private.overflowed(overflow)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """What a call of Warp does."""
+
+    stepper: _Stepper
+    read: tuple[str, ...]  # fields of the data that it reads
+    fields: tuple[str, ...]  # fields of the model that environments override
+    num_substeps: int
+
+
+class _Stepper:
+    """Arrays and callables of an engine on Warp, until the engine is gone.
+
+    Warp and XLA keep callables for longer, and JAX programs; without arrays they are small. Calls
+    share the arrays, since each writes all that it reads.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        motors: Motors | None,
+        sparse: bool,
+        limits: tuple[int, int],
+        graph_mode: str,
+    ) -> None:
+        self.model = model
+        self.motors = motors
+        self._made = model, motors, sparse, limits, graph_mode
+        self._arrays: _Arrays | None = None
+        self._callables: dict[Any, Any] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Stepper, self._made  # a copy has its own arrays
+
+    def bytes(self, count: int) -> int:
+        """Returns the bytes of the data of `count` environments."""
+        return private.warp_bytes(self.model, count, *self._made[3])
+
+    def retire(self) -> None:
+        """Frees the arrays, and the graphs that use them.
+
+        It may interrupt the capture of a graph, which forbids to wait for the device.
+        """
+        if self._arrays is not None and not self._arrays.device.is_capturing:
+            _warp().synchronize_device(self._arrays.device)
+        for call in self._callables.values():
+            private.forget_graphs(call)
+        self._callables = {}
+        self._arrays = None
+
+    def callable(self, call: _Call, count: int) -> Any:
+        """Returns Warp's callable for `count` environments, and allocates its arrays.
+
+        Its arguments are the fields of the data, then those of the model.
+        """
+        key = call.read, call.fields, call.num_substeps, count
+        if key not in self._callables:
+            model, motors, sparse, limits, _ = self._made
+            if self._arrays is None:
+                self._arrays = _Arrays(model, motors, sparse)
+            self._arrays.allocate(count, limits)
+            self._callables[key] = self._register(call, count)
+        return self._callables[key]
+
+    def _register(self, call: _Call, count: int) -> Any:
+        wp = _warp()
+        assert self._arrays is not None
+        data = self._arrays.data[count]
+        returned = _RESULTS[len(_CHANGED) :]
+        likes = {name: getattr(data, name) for name in call.read}
+        likes |= {name: getattr(self._arrays.model, name) for name in call.fields}
+        likes |= {name: getattr(data, name) for name in returned}
+
+        def run(*arrays: Any) -> None:
+            self._step(call, count, dict(zip(likes, arrays, strict=True)))
+
+        # Warp reads names and types of the arguments from the function, and loads its module.
+        kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in likes.items()}
+        kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        run.__annotations__ = kinds
+        run.__module__ = "mqe_jax.physics.engines.warp_kernels"
+        vars(run)["__signature__"] = inspect.Signature([inspect.Parameter(x, kind) for x in kinds])
+        mode = self._made[4] if jax.default_backend() == "gpu" else "NONE"
+        return wp.jax_callable(
+            run,
+            num_outputs=len(_RESULTS),
+            graph_mode=wp.JaxCallableGraphMode[mode],
+            output_dims={name: likes[name].shape for name in returned},
+            in_out_argnames=_CHANGED,
+        )
+
+    def _step(self, call: _Call, count: int, given: dict[str, Any]) -> None:
+        """Launches the kernels of a call; a graph repeats them without it."""
+        arrays = self._arrays
+        if arrays is None:
+            raise RuntimeError("the environment of this compiled program no longer exists")
+        model = copy.copy(arrays.model)
+        data = copy.copy(arrays.data[count])
+        for name, array in given.items():
+            setattr(model if name in call.fields else data, name, array)
+        data.overflow.zero_()
+        drive = clamp = _nothing
+        if self.motors is not None:
+            drive, clamp = arrays.motor_kernels(model, data, count)
+        unused = warp_model.unused_terms(self.model, call.fields)
+        for left in reversed(range(call.num_substeps)):
+            drive()
+            private.warp_step(model, data, unused | (_SENSORS if left else 0))
+        clamp()
+
+
+class _Arrays:
+    """Warp's arrays of a model and its motors, and of data of some numbers of environments.
+
+    They are on JAX's first device.
+    """
+
+    def __init__(self, model: mujoco.MjModel, motors: Motors | None, sparse: bool) -> None:
+        wp = _warp()
+        self._model = model
+        self.device = wp.device_from_jax(jax.local_devices()[0])
+        self.data: dict[int, Any] = {}
+        self._armature: dict[int, Any] = {}
+        self._motors: list[Any] = []
+        with wp.ScopedDevice(self.device):
+            self.model = private.warp_model(model, sparse=sparse)
+            if motors is not None:
+                self._motors = [
+                    wp.array(motors.constants, dtype=float),
+                    wp.array(motors.joint_qpos, dtype=int),
+                    wp.array(motors.joint_qvel, dtype=int),
+                    float(motors.timestep),
+                    wp.mat33(motors.timestep * motors.response),
+                ]
+
+    def allocate(self, count: int, limits: tuple[int, int]) -> None:
+        """Allocates the data of `count` environments unless it exists."""
+        if count in self.data:
+            return
+        wp = _warp()
+        with wp.ScopedDevice(self.device):
+            self._armature[count] = wp.zeros((count, self._model.nv), dtype=float)
+            self.data[count] = private.warp_data(self._model, count, *limits)
+        wp.synchronize_device(self.device)  # JAX's stream does not wait for Warp's
+
+    def motor_kernels(
+        self, model: Any, data: Any, count: int
+    ) -> tuple[Callable[[], None], Callable[[], None]]:
+        """Returns what sets control and armature before a physics step, and clamps after the last.
+
+        `model` and `data` then have the motors' control and armature.
+        """
+        wp = _warp()
+        from mqe_jax.physics.engines import warp_kernels
+
+        given = [model.actuator_gainprm, model.actuator_biasprm, model.dof_armature, data.ctrl]
+        data.ctrl = self.data[count].ctrl
+        model.dof_armature = self._armature[count]
+        wp.launch(
+            warp_kernels.repeat,
+            dim=model.dof_armature.shape,
+            inputs=given[2:3],
+            outputs=[model.dof_armature],
+        )
+        joints = data.ctrl.shape[1]
+        state = [data.qpos, data.qvel]
+        drive = functools.partial(
+            wp.launch,
+            warp_kernels.drive,
+            dim=(count, joints // warp_kernels.JOINTS),
+            inputs=[*self._motors, *given],
+            outputs=[*state, data.ctrl, model.dof_armature],
+        )
+        clamp = functools.partial(
+            wp.launch,
+            warp_kernels.clamp,
+            dim=(count, joints),
+            inputs=self._motors[:-1],
+            outputs=state,
+        )
+        return drive, clamp
+
+
+def _nothing() -> None:
+    pass
+
+
+def _warp() -> Any:
+    return importlib.import_module("warp")
+
+
+_steps = Primitive("warp_steps")
+"""Physics steps of N environments: arrays (N, ...), as `_Call` names them, to `_RESULTS` (N, ...).
+
+A model field may have fewer rows, of which environment n reads row n modulo their number. A
+primitive knows the whole batch when JAX lowers it, which is when its arrays are allocated.
+"""
+_steps.multiple_results = True
+
+
+@_steps.def_abstract_eval
+def _(*arrays: Any, call: _Call) -> list[Any]:
+    first = arrays[0]
+    count = first.shape[0]
+    sensordata = first.update(shape=(count, call.stepper.model.nsensordata))
+    return [*arrays[: len(_CHANGED)], sensordata, first.update(shape=(count,), dtype=np.int32)]
+
+
+@_steps.def_impl
+@functools.partial(jax.jit, static_argnames="call")
+def _(*arrays: jax.Array, call: _Call) -> list[jax.Array]:
+    return _steps.bind(*arrays, call=call)
+
+
+def _batched(
+    arrays: Sequence[jax.Array], axes: Sequence[int | None], *, call: _Call
+) -> tuple[list[jax.Array], list[int]]:
+    """Makes one batch of S batches of N environments."""
+    size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
+    first = arrays[0]
+    count = first.shape[0] if axes[0] is None else np.delete(first.shape, axes[0])[0]
+    flat = []
+    for number, (x, axis) in enumerate(zip(arrays, axes, strict=True)):
+        if axis is not None:
+            x = jnp.moveaxis(x, axis, 0)
+            if x.shape[1] != count:
+                x = jnp.broadcast_to(x, (size, count, *x.shape[2:]))
+        elif number < len(call.read):
+            x = jnp.broadcast_to(x, (size, *x.shape))
+        else:
+            flat.append(x)
+            continue
+        flat.append(x.reshape(-1, *x.shape[2:]))
+    found = _steps.bind(*flat, call=call)
+    return [x.reshape(size, count, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+def _lowered(*arrays: jax.Array, call: _Call) -> list[jax.Array]:
+    return call.stepper.callable(call, len(arrays[0]))(*arrays)
+
+
+batching.primitive_batchers[_steps] = _batched
+mlir.register_lowering(_steps, mlir.lower_fun(_lowered, multiple_results=True))
