@@ -31,7 +31,7 @@ from mqe_jax.physics.engines import Engine, private
 from mqe_jax.physics.engines import host_call as host_calls
 from mqe_jax.physics.engines.c import CEngine, _Stepper
 from mqe_jax.physics.engines.host_call import host_call
-from mqe_jax.physics.engines.mjx import WarpEngine
+from mqe_jax.physics.engines.mjx import WarpMjxEngine
 from mqe_jax.physics.engines.mjx_step import MarginStep
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
@@ -41,7 +41,7 @@ from tests.inputs import refuses
 from tests.states import initial, made
 
 NEEDS_GPU = pytest.mark.gpu
-IMPLS = ["c", "jax", pytest.param("warp", marks=NEEDS_GPU)]
+IMPLS = ["c", "jax", *(pytest.param(name, marks=NEEDS_GPU) for name in ("warp", "warp-mjx"))]
 
 
 @pytest.fixture(scope="module")
@@ -427,26 +427,18 @@ def test_warp_skips_zeros_where_it_pays(
     found: bool | str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def put_model(model: mujoco.MjModel, device: Any, impl: str) -> Any:
-        option = SimpleNamespace(integrator=SimpleNamespace(name="EULER"))
-        sparse = model.opt.jacobian == mujoco.mjtJacobian.mjJAC_AUTO
-        return SimpleNamespace(nv=model.nv, opt=option, _impl=SimpleNamespace(is_sparse=sparse))
-
     # of another one compare the Newton step
     assert importlib.metadata.version("mujoco-mjx") == private._NEWTON_OF
     monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
-    monkeypatch.setattr(private, "load_mjx", lambda: SimpleNamespace(put_model=put_model))
     monkeypatch.setattr(private, "warp_is_installed", lambda: True)
-    for name in ("keep_streams", "without_warnings"):
-        monkeypatch.setattr(private, name, lambda model=None: model)
-    monkeypatch.setattr(private, "with_sparse_newton", lambda model: "sparse")
+    monkeypatch.setattr(private, "keep_streams", lambda: None)
     settings = {} if asked is None else {"sparse_solver": asked}
     build = functools.partial(make, "go1gate", impl="warp", num_agents=robots, **settings)
     if isinstance(found, str):
         refuses(f"sparse_solver: True is not allowed; it must be {found}", build)
     else:
         env: Any = build()
-        assert (env.physics.mjx_model == "sparse") == found
+        assert env.physics.skips_zeros == found
 
 
 @pytest.mark.gpu
@@ -592,7 +584,7 @@ def test_warp_computes_no_terms_that_are_zero(
       <actuator><motor joint="j"/></actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml.replace(f"<{part}", f"<{part} {attribute}", 1))
     before = content(model)
-    engine = WarpEngine(model)
+    engine = WarpMjxEngine(model)
     values = {name: jnp.asarray(getattr(model, name)) for name in fields}
     jax.eval_shape(lambda data: engine.step(data, data.ctrl, fields=values), engine.blank())
     assert set(warp.flags) == {unused, unused | BIT.mjDSBL_SENSOR}
@@ -732,7 +724,7 @@ def test_a_program_that_still_runs_at_the_end_of_the_interpreter_is_awaited() ->
 import time
 import jax, numpy as np
 from mqe_jax.physics.engines.host_call import host_call
-from mqe_jax.physics.engines.mjx import WarpEngine
+from mqe_jax.physics.engines.mjx import WarpMjxEngine
 class Owner: pass
 owner = Owner()
 def slow(x):

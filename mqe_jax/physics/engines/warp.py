@@ -49,10 +49,10 @@ class WarpEngine(Engine):
         super().__init__(model, **options)
         private.keep_streams()
         own = warp_model.with_jacobian(model)
-        sparse = warp_model.skips_zeros(own, self.sparse_solver)
-        contacts = self.num_envs * self.contacts_per_env
-        limits = contacts, self.max_constraints_per_env
-        self._stepper = _Stepper(own, self.motors, sparse, limits, self.graph_mode)
+        self.skips_zeros = warp_model.skips_zeros(own, self.sparse_solver)
+        """Whether the solver skips the zeros between robots that do not touch."""
+        limits = self.num_envs * self.contacts_per_env, self.max_constraints_per_env
+        self._stepper = _Stepper(own, self.motors, self.skips_zeros, limits, self.graph_mode)
         weakref.finalize(self, self._stepper.retire).atexit = False
 
     def __setstate__(self, state: dict[str, Any]) -> None:
