@@ -160,9 +160,9 @@ def environment(
             fail("impl", impl, f"left out for an environment, whose engine is {task.impl!r}")
         return task.changed(params)
     device = devices.platform()
-    if impl == "warp" and device != "gpu":
+    if impl in ("warp", "warp-mjx") and device != "gpu":
         raise InputError(
-            f"impl: 'warp' needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax"
+            f"impl: {impl!r} needs an NVIDIA GPU, but JAX runs on {device}; allowed: c, jax"
         )
     return make(task, impl=impl, num_envs=num_envs, **params)
 

@@ -172,7 +172,7 @@ def covering() -> list[tuple[str, str, str]]:
 def main(
     what: Positional[Literal["record", "agree"]],
     folder: Positional[pathlib.Path],
-    engine: Positional[Literal["jax", "warp", "c"]],
+    engine: Positional[Literal["jax", "warp", "warp-mjx", "c"]],
     tasks: Positional[tuple[str, ...]] = tuple(TASKS),
     num_envs: int = 8,
     seed: int = 0,

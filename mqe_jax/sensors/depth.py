@@ -37,7 +37,7 @@ class Depth(Sensor):
     The camera sees the geoms of the physics, not those that are only drawn.
     """
 
-    engines: ClassVar[tuple[str, ...]] = ("warp",)
+    engines: ClassVar[tuple[str, ...]] = ("warp", "warp-mjx")
 
     name: Literal["depth"] = "depth"
     """Name of the sensor."""

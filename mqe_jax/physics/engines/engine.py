@@ -8,6 +8,8 @@ named after `mjModel` fields.
 from __future__ import annotations
 
 import abc
+import atexit
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping
@@ -154,3 +156,14 @@ class Engine(abc.ABC):
         """
         with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
             return self.blank()
+
+
+@atexit.register
+def _finish() -> None:
+    """Waits for programs whose results exist.
+
+    Their threads cannot call Python while the interpreter ends.
+    """
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
+            array.block_until_ready()

@@ -9,8 +9,6 @@ XLA's stable C interface (`jax.ffi.include_dir()`, xla/ffi/api/c_api.h, version 
 version of it, JAX's callbacks do the same without being stored.
 """
 
-import atexit
-import contextlib
 import ctypes
 import functools
 import re
@@ -176,14 +174,3 @@ FITS = _fits()
 """Whether the structures fit JAX; an unsuitable handler would make JAX lose its CPU backend."""
 if FITS:
     jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
-
-
-@atexit.register
-def _finish() -> None:
-    """Waits for programs whose results exist.
-
-    Their threads cannot call Python while the interpreter ends.
-    """
-    for array in jax.live_arrays():
-        with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
-            array.block_until_ready()

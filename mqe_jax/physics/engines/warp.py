@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
 
 from mqe_jax.physics.engines import private, warp_model
@@ -118,7 +118,7 @@ class _Stepper:
         self.motors = motors
         self._made = model, motors, sparse, limits, graph_mode
         self._arrays: _Arrays | None = None
-        self._callables: dict[Any, Any] = {}
+        self._calls: dict[Any, tuple[Any, ClosedJaxpr]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _Stepper, self._made  # a copy has its own arrays
@@ -128,32 +128,42 @@ class _Stepper:
         return private.warp_bytes(self.model, count, *self._made[3])
 
     def retire(self) -> None:
-        """Frees the arrays, and the graphs that use them.
+        """Frees the arrays and the graphs that use them.
 
-        It may interrupt the capture of a graph, which forbids to wait for the device.
+        Programs that still run keep them until the next engine allocates its own. It may interrupt
+        the capture of a graph, during which nothing can wait for the device.
         """
+        if not all(array.is_ready() for array in jax.live_arrays() if not array.is_deleted()):
+            _running.append(self)
+            return
         if self._arrays is not None and not self._arrays.device.is_capturing:
             _warp().synchronize_device(self._arrays.device)
-        for call in self._callables.values():
-            private.forget_graphs(call)
-        self._callables = {}
+        for callable, _ in self._calls.values():
+            private.forget_graphs(callable)
+        self._calls = {}
         self._arrays = None
 
-    def callable(self, call: _Call, count: int) -> Any:
-        """Returns Warp's callable for `count` environments, and allocates its arrays.
+    def call(self, call: _Call, arrays: Sequence[jax.Array]) -> list[jax.Array]:
+        """Returns the results of a call, for a program that is being lowered; allocates its arrays.
 
-        Its arguments are the fields of the data, then those of the model.
+        `arrays` are the fields of the data, then those of the model.
         """
-        key = call.read, call.fields, call.num_substeps, count
-        if key not in self._callables:
+        key = call.read, call.fields, call.num_substeps, *(array.shape for array in arrays)
+        if key not in self._calls:
+            for _ in range(len(_running)):
+                _running.pop().retire()
+            count = len(arrays[0])
             model, motors, sparse, limits, _ = self._made
             if self._arrays is None:
                 self._arrays = _Arrays(model, motors, sparse)
             self._arrays.allocate(count, limits)
-            self._callables[key] = self._register(call, count)
-        return self._callables[key]
+            callable = self._register(call, count)
+            # Each trace would have its own graph and copies of the arrays.
+            self._calls[key] = callable, jax.make_jaxpr(callable)(*arrays)
+        return jaxpr_as_fun(self._calls[key][1])(*arrays)
 
     def _register(self, call: _Call, count: int) -> Any:
+        """Returns Warp's callable for `count` environments, which JAX can call."""
         wp = _warp()
         assert self._arrays is not None
         data = self._arrays.data[count]
@@ -162,8 +172,10 @@ class _Stepper:
         likes |= {name: getattr(self._arrays.model, name) for name in call.fields}
         likes |= {name: getattr(data, name) for name in returned}
 
+        names = tuple(likes)
+
         def run(*arrays: Any) -> None:
-            self._step(call, count, dict(zip(likes, arrays, strict=True)))
+            self._step(call, count, dict(zip(names, arrays, strict=True)))
 
         # Warp reads names and types of the arguments from the function, and loads its module.
         kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in likes.items()}
@@ -198,6 +210,10 @@ class _Stepper:
             drive()
             private.warp_step(model, data, unused | (_SENSORS if left else 0))
         clamp()
+
+
+_running: list[_Stepper] = []
+"""Steppers whose engines are gone but whose programs ran when they went."""
 
 
 class _Arrays:
@@ -327,7 +343,7 @@ def _batched(
 
 
 def _lowered(*arrays: jax.Array, call: _Call) -> list[jax.Array]:
-    return call.stepper.callable(call, len(arrays[0]))(*arrays)
+    return call.stepper.call(call, arrays)
 
 
 batching.primitive_batchers[_steps] = _batched
