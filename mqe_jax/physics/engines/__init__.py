@@ -20,7 +20,7 @@ from mqe_jax.physics.engines.engine import STATE_FIELDS, Engine
 __all__ = ["ENGINES", "STATE_FIELDS", "Engine", "make", "resolve"]
 
 ENGINES: dict[str, str] = {
-    "warp": "mqe_jax.physics.engines.warp:WarpEngine",
+    "warp": "mqe_jax.physics.engines.warp_engine:WarpEngine",
     "c": "mqe_jax.physics.engines.c:CEngine",
     "jax": "mqe_jax.physics.engines.mjx:JaxEngine",
     "warp-mjx": "mqe_jax.physics.engines.mjx:WarpMjxEngine",

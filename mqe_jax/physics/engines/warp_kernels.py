@@ -22,6 +22,10 @@ REACH = wp.constant(motors.REACH)
 ROUNDING = wp.constant(motors.ROUNDING)
 
 
+class Parameters(wp.types.vector(length=10, dtype=float)):
+    """Gain or bias of an actuator."""
+
+
 @wp.kernel(enable_backward=False)
 def repeat(rows: wp.array2d[float], result: wp.array2d[float]):
     """Gives each environment its row."""
@@ -73,8 +77,8 @@ def drive(
     speeds: wp.array[int],
     timestep: float,
     kick: wp.mat33,  # speeds that unit torques of a leg add in a physics step
-    gainprm: wp.array2d[wp.types.vector(length=10, dtype=float)],
-    biasprm: wp.array2d[wp.types.vector(length=10, dtype=float)],
+    gainprm: wp.array2d[Parameters],
+    biasprm: wp.array2d[Parameters],
     base: wp.array2d[float],
     asked: wp.array2d[float],
     qpos: wp.array2d[float],
@@ -116,9 +120,8 @@ def drive(
         speed = constants[joint, SPEED]
         full = constants[joint, FULL]
         reach = (pace[i] + added[i]) / speed
-        needed = float(0.0)
-        if reach > REACH:
-            needed = wp.min(constants[joint, NEEDED] * (reach - 1.0), full)
+        beyond = wp.min(constants[joint, NEEDED] * (reach - 1.0), full)
+        needed = wp.where(reach > REACH, beyond, 0.0)
         if constants[joint, STEEP] > 0.0:
             slope = constants[joint, LINE]
             line = slope * (speed + wp.where(given[i] < 0.0, pace[i], -pace[i]))

@@ -181,6 +181,7 @@ class _Stepper:
         kinds = {name: wp.array(dtype=x.dtype, ndim=x.ndim) for name, x in likes.items()}
         kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         run.__annotations__ = kinds
+        run.__qualname__ = "warp_steps"
         run.__module__ = "mqe_jax.physics.engines.warp_kernels"
         vars(run)["__signature__"] = inspect.Signature([inspect.Parameter(x, kind) for x in kinds])
         mode = self._made[4] if jax.default_backend() == "gpu" else "NONE"
