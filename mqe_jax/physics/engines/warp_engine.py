@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 _SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+_KERNELS = "mqe_jax.physics.engines.warp_kernels"  # imports Warp
 _CHANGED = "qpos", "qvel", "qacc_warmstart", "time"
 _RESULTS = *_CHANGED, "sensordata", "overflow"
 
@@ -182,7 +183,7 @@ class _Stepper:
         kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         run.__annotations__ = kinds
         run.__qualname__ = "warp_steps"
-        run.__module__ = "mqe_jax.physics.engines.warp_kernels"
+        run.__module__ = _KERNELS
         vars(run)["__signature__"] = inspect.Signature([inspect.Parameter(x, kind) for x in kinds])
         mode = self._made[4] if jax.default_backend() == "gpu" else "NONE"
         return wp.jax_callable(
@@ -230,6 +231,7 @@ class _Arrays:
         self.data: dict[int, Any] = {}
         self._armature: dict[int, Any] = {}
         self._motors: list[Any] = []
+        self._kernels: Any = importlib.import_module(_KERNELS)
         with wp.ScopedDevice(self.device):
             self.model = private.warp_model(model, sparse=sparse)
             if motors is not None:
@@ -259,13 +261,11 @@ class _Arrays:
         `model` and `data` then have the motors' control and armature.
         """
         wp = _warp()
-        from mqe_jax.physics.engines import warp_kernels
-
         given = [model.actuator_gainprm, model.actuator_biasprm, model.dof_armature, data.ctrl]
         data.ctrl = self.data[count].ctrl
         model.dof_armature = self._armature[count]
         wp.launch(
-            warp_kernels.repeat,
+            self._kernels.repeat,
             dim=model.dof_armature.shape,
             inputs=given[2:3],
             outputs=[model.dof_armature],
@@ -274,14 +274,14 @@ class _Arrays:
         state = [data.qpos, data.qvel]
         drive = functools.partial(
             wp.launch,
-            warp_kernels.drive,
-            dim=(count, joints // warp_kernels.JOINTS),
+            self._kernels.drive,
+            dim=(count, joints // self._kernels.JOINTS),
             inputs=[*self._motors, *given],
             outputs=[*state, data.ctrl, model.dof_armature],
         )
         clamp = functools.partial(
             wp.launch,
-            warp_kernels.clamp,
+            self._kernels.clamp,
             dim=(count, joints),
             inputs=self._motors[:-1],
             outputs=state,
