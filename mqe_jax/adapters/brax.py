@@ -4,8 +4,8 @@ Importing this module registers every task under its id, for `brax.envs.get_envi
 `brax.envs.create`.
 
 `ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length)` trains with
-automatic resets to new episodes. Brax's own wrapper also works, except on Warp, but restarts an
-environment from the same initial state.
+automatic resets to new episodes. Brax's own wrapper also works, except on `warp-mjx`, but
+restarts an environment from the same initial state.
 """
 
 import dataclasses

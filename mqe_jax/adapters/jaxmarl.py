@@ -127,7 +127,7 @@ class Env(MultiAgentEnv):
         """Advances by one environment step and resets an ended environment.
 
         It becomes `reset_state` if that is passed. The base class selects between whole states, but
-        on Warp all environments share contact buffers.
+        on `warp-mjx` all environments share contact buffers.
         """
         return self._step(key, state, self._checked(actions), reset_state)
 

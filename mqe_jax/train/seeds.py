@@ -1,6 +1,6 @@
 """States of several seeds in one pytree: where seeds become a `jax.vmap`.
 
-The seeds share Warp's contact buffers, which every step overwrites. Checkpoints omit them.
+On `warp-mjx` seeds share contact buffers, which every step overwrites. Checkpoints omit them.
 """
 
 from collections.abc import Callable, Sequence

@@ -58,6 +58,7 @@ class WarpEngine(Engine):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
+        self._stepper = copy.copy(self._stepper)
         weakref.finalize(self, self._stepper.retire).atexit = False
 
     @classmethod
@@ -134,10 +135,12 @@ class _Stepper:
         Programs that still run keep them until the next engine allocates its own. It may interrupt
         the capture of a graph, during which nothing can wait for the device.
         """
+        if self._arrays is None:
+            return
         if not all(array.is_ready() for array in jax.live_arrays() if not array.is_deleted()):
             _running.append(self)
             return
-        if self._arrays is not None and not self._arrays.device.is_capturing:
+        if not self._arrays.device.is_capturing:
             _warp().synchronize_device(self._arrays.device)
         for callable, _ in self._calls.values():
             private.forget_graphs(callable)
@@ -326,7 +329,7 @@ def _batched(
     """Makes one batch of S batches of N environments."""
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     first = arrays[0]
-    count = first.shape[0] if axes[0] is None else np.delete(first.shape, axes[0])[0]
+    count = first.shape[int(axes[0] == 0)]
     flat = []
     for number, (x, axis) in enumerate(zip(arrays, axes, strict=True)):
         if axis is not None:
@@ -338,7 +341,7 @@ def _batched(
         else:
             flat.append(x)
             continue
-        flat.append(x.reshape(-1, *x.shape[2:]))
+        flat.append(x.reshape(size * x.shape[1], *x.shape[2:]))
     found = _steps.bind(*flat, call=call)
     return [x.reshape(size, count, *x.shape[1:]) for x in found], [0] * len(found)
 
