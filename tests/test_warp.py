@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mqe_jax.core.memory import bytes_of
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.physics.engines import STATE_FIELDS, private
 from mqe_jax.physics.engines.warp_engine import WarpEngine
@@ -169,9 +170,8 @@ def test_few_arrays_pass_between_jax_and_warp() -> None:
     lines = steps_of(env.physics).lower(data).as_text().splitlines()
     (call,) = [line for line in lines if "custom_call @warp_steps" in line]
     assert call.rpartition("} : ")[2].count("tensor<") == 7 + 6
-    state = VectorEnv(env, 6).reset(jax.random.PRNGKey(0))
-    size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
-    assert size / 6 < 16_000
+    state = jax.eval_shape(VectorEnv(env, 6).reset, jax.random.PRNGKey(0))
+    assert bytes_of(state) / 6 < 16_000
 
 
 @pytest.mark.gpu
