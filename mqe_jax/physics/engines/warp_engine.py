@@ -311,10 +311,9 @@ _steps.multiple_results = True
 
 @_steps.def_abstract_eval
 def _(*arrays: Any, call: _Call) -> list[Any]:
-    first = arrays[0]
-    count = first.shape[0]
-    sensordata = first.update(shape=(count, call.stepper.model.nsensordata))
-    return [*arrays[: len(_CHANGED)], sensordata, first.update(shape=(count,), dtype=np.int32)]
+    *state, time = arrays[: len(_CHANGED)]
+    sensordata = state[0].update(shape=(time.shape[0], call.stepper.model.nsensordata))
+    return [*state, time, sensordata, time.update(dtype=np.int32)]
 
 
 @_steps.def_impl
