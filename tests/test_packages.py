@@ -35,7 +35,7 @@ def forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     It also forgets installed packages.
     """
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])  # as `mqe` has it
     shutil.copy(RACE, tmp_path)
 
     def clear() -> None:

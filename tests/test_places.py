@@ -139,7 +139,7 @@ for words in (["--help"], ["train", "--help"]):
         main(words)
 """
     said = run(code, tmp_path, env={**os.environ, "PYTHONOPTIMIZE": "2"}).stdout
-    assert "usage: mqe COMMAND" in said and "--ppo.gae-lambda" in said
+    assert "usage: mqe [--import FILE|MODULE] COMMAND" in said and "--ppo.gae-lambda" in said
 
 
 def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

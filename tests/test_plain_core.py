@@ -167,7 +167,7 @@ def test_randomised_parameters_reach_their_fields_of_the_model(box: Any, resets:
 def test_pushes_are_uniform_and_independent(box: Any, resets: Any) -> None:
     """A fifth of the robots in a step of 0.02 s, as the period is 0.1 s."""
     start = jax.tree.map(lambda x: x[0], resets.data).replace(qvel=jnp.zeros(box.compiled.model.nv))
-    push = jax.jit(jax.vmap(lambda key: box.randomizer.push(start, key, 0.02).qvel))
+    push = jax.jit(jax.vmap(lambda key: box.randomizer.push(start, jnp.array(0.4), key, 0.02).qvel))
     qvel = np.asarray(push(jax.random.split(KEY, 1 << 16)))
     columns = box.index.base_qvel[:, :2]
     assert not np.delete(qvel, columns.ravel(), axis=1).any()

@@ -247,10 +247,17 @@ def load_packages() -> None:
 
 
 def listed() -> dict[str, Shipped]:
-    """Returns what `mqe tasks` lists: of shipped tasks from here, of others from an environment."""
+    """Returns what `mqe tasks` lists: of shipped tasks from here, of others from an environment.
+
+    A line on standard error names a task whose environment cannot be made.
+    """
     found = dict(SHIPPED)
     for name in TASKS.keys() - SHIPPED.keys():
-        env = TASKS[name](num_envs=1, impl="c")
+        try:
+            env = TASKS[name](num_envs=1, impl="c")
+        except Exception as error:
+            echo(f"mqe: warning: the task {name} is not listed: {imports.reason(error)}")
+            continue
         teams = tuple(len(team) for team in env.teams)
         sizes = env.observation_size, env.privileged_observation_size
         found[name] = Shipped("", None, env.title, teams, *sizes, env.params.episode_length)

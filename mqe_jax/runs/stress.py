@@ -184,7 +184,7 @@ def stress(
     seed: Seed = 0,
     curves: bool = False,
 ) -> Stress:
-    """Evaluates a policy under each of `CONDITIONS`, as `mqe eval --stress`.
+    """Evaluates a policy under each of `CONDITIONS`, as `mqe eval RUN --stress`.
 
     Example:
         ```python
