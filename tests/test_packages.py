@@ -35,8 +35,9 @@ def forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     It also forgets installed packages.
     """
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])  # as `mqe` has it
     shutil.copy(RACE, tmp_path)
+    others = [place for place in sys.path if not Path(place, RACE.name).exists()]
+    monkeypatch.setattr(sys, "path", others)  # pytest adds the folders of its files
 
     def clear() -> None:
         for name in ("race", "broken", "own", "names", "names.race"):
