@@ -111,7 +111,8 @@ subprocess.run([*PROGRAM, "tasks"], check=True)
     assert not (tmp_path / "imported").exists()
 
 
-def test_a_platform_without_devices_is_rejected_in_a_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("platform", ["rocm", "cuda"])  # JAX fails in different ways
+def test_a_platform_without_devices_is_rejected_in_a_line(platform: str, tmp_path: Path) -> None:
     code = """
 import mqe_jax
 from mqe_jax.cli import main
@@ -124,10 +125,14 @@ for call in mqe_jax.make, mqe_jax.load_policy:
     except InputError as error:
         print("mqe:", error)
 """
-    done = run(code, tmp_path, env={**os.environ, "JAX_PLATFORMS": "rocm"})
+    done = run(
+        code, tmp_path, env={**os.environ, "JAX_PLATFORMS": platform, "CUDA_VISIBLE_DEVICES": ""}
+    )
     lines = (done.stderr + done.stdout).splitlines()
     assert len(lines) == 4
-    assert all(line.startswith("mqe: JAX_PLATFORMS: 'rocm' cannot be used") for line in lines)
+    assert all(
+        line.startswith(f"mqe: JAX_PLATFORMS: {platform!r} cannot be used") for line in lines
+    )
 
 
 def test_help_needs_no_docstrings(tmp_path: Path) -> None:
