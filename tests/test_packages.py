@@ -6,6 +6,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,8 @@ def forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     """
     monkeypatch.chdir(tmp_path)
     shutil.copy(RACE, tmp_path)
-    others = [place for place in sys.path if not Path(place, RACE.name).exists()]
-    monkeypatch.setattr(sys, "path", others)  # pytest adds the folders of its files
+    others = [place for place in sys.path if not PathFinder.find_spec("race", [place])]
+    monkeypatch.setattr(sys, "path", others)  # other tests add folders of examples
 
     def clear() -> None:
         for name in ("race", "broken", "own", "names", "names.race"):
@@ -138,6 +139,13 @@ def test_what_cannot_be_imported(
         Path(name).write_text(content)
     err = mqe("tasks --import", name, code=2).err
     assert said in err and err.count("\n") == 1
+
+
+def test_a_folder_is_no_module(forget: Any, tmp_path: Path, mqe: Any) -> None:
+    Path("names", "empty").mkdir(parents=True)
+    sys.path.append(str(tmp_path / "names"))
+    said = mqe("tasks --import empty", code=2).err
+    assert said == "mqe: import: empty: a folder without __init__.py; name a module in it\n"
 
 
 def install(name: str, module: str, folder: Path) -> None:

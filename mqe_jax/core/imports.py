@@ -29,8 +29,8 @@ def add(name: str) -> None:
     try:
         if file:
             _import_file(path)
-        else:
-            importlib.import_module(name)
+        elif not getattr(importlib.import_module(name), "__file__", True):
+            raise InputError("a folder without __init__.py; name a module in it")
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and error.name == name:
             hint = f"; did you mean {path.name}.py?" if Path(f"{path}.py").is_file() else ""
