@@ -57,15 +57,15 @@ def _trunk_init(
 
 
 def _hidden(params: Params, x: jax.Array, settings: ActorCritic) -> jax.Array:
-    """Applies the hidden layers: (..., n_in) -> (..., width)."""
+    """Applies the hidden layers, without the last normalisation: (B, n_in) -> (B, width)."""
     activation = _ACTIVATIONS[settings.activation]
     if not settings.openrl_layers:
         return nn.mlp(params["hidden"], x, activation, activate_last=True)
-    for i in range(len(settings.hidden_sizes)):
-        x = nn.layer_norm(params["norm"][str(i)], activation(nn.dense(params["hidden"][str(i)], x)))
-    return nn.layer_norm(
-        params["norm"][str(len(settings.hidden_sizes))], nn.dense(params["linear"], x)
-    )
+    x = activation(nn.dense(params["hidden"]["0"], x))
+    for i in range(1, len(settings.hidden_sizes)):
+        norm = params["norm"][str(i - 1)]
+        x = activation(nn.norm_dense(norm, params["hidden"][str(i)], x))
+    return nn.norm_dense(params["norm"][str(len(settings.hidden_sizes) - 1)], params["linear"], x)
 
 
 def _trunk(
@@ -80,18 +80,26 @@ def _trunk(
 
     The recurrent state `memory` is (..., H) or (). It restarts where `is_first` (L, ...) is true.
     """
-    x = _hidden(params, encoder.apply(params.get("encoder", {}), x), settings)
+    x = encoder.apply(params.get("encoder", {}), x)
+    lead = x.shape[:-1]
+    # XLA's code for a CPU takes twice as long with more axes than two.
+    x = _hidden(params, x.reshape(-1, x.shape[-1]), settings)
+    norms = [params["norm"][str(i)] for i in range(len(params.get("norm", ())))]
     if settings.recurrent:
+        if norms:
+            x = nn.layer_norm(norms[-2], x)
 
         def step(h: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             first_t, x_t = inputs
             h = nn.gru(params["gru"], jnp.where(first_t[..., None], 0.0, h), x_t)
             return h, h
 
-        memory, x = jax.lax.scan(step, memory, (is_first, x), unroll=min(x.shape[0], 8))
-        if settings.openrl_layers:
-            x = nn.layer_norm(params["norm"][str(len(settings.hidden_sizes) + 1)], x)
-    return nn.dense(params["head"], x), memory
+        x = x.reshape(*lead, x.shape[-1])
+        memory, x = jax.lax.scan(step, memory, (is_first, x), unroll=min(lead[0], 8))
+        x = x.reshape(-1, x.shape[-1])
+    head = params["head"]
+    x = nn.norm_dense(norms[-1], head, x) if norms else nn.dense(head, x)
+    return x.reshape(*lead, x.shape[-1]), memory
 
 
 def network(settings: ActorCritic, dims: EnvDims) -> Network:

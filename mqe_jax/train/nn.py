@@ -92,9 +92,23 @@ def layer_norm(params: Params, x: jax.Array) -> jax.Array:
 
     Shapes: (..., W) -> (..., W). Source: Ba et al., arXiv 1607.06450.
     """
+    return _standardize(x) * params["scale"] + params["shift"]
+
+
+def norm_dense(norm: Params, layer: Params, x: jax.Array) -> jax.Array:
+    """Applies a layer normalisation, then an affine layer: (..., n_in) -> (..., n_out).
+
+    Scale and shift join the affine layer, so that they and their gradients cost no pass over the
+    batch.
+    """
+    shift = jnp.matmul(norm["shift"], layer["weight"], precision=PRECISION)
+    weight = norm["scale"][:, None] * layer["weight"]
+    return dense({"weight": weight, "bias": layer["bias"] + shift}, _standardize(x))
+
+
+def _standardize(x: jax.Array) -> jax.Array:
     x = x - jnp.mean(x, axis=-1, keepdims=True)
-    x = x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-5)
-    return x * params["scale"] + params["shift"]
+    return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-5)
 
 
 def gru_init(key: jax.Array, n_in: int, n_hidden: int) -> Params:
