@@ -406,18 +406,18 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
 @pytest.mark.parametrize(
     ("robots", "asked", "version", "found"),
     [
-        (4, None, private._NEWTON_OF, False),
-        (5, None, private._NEWTON_OF, True),
-        (5, False, private._NEWTON_OF, False),
-        (3, True, private._NEWTON_OF, True),
+        (4, None, private._READ, False),
+        (5, None, private._READ, True),
+        (5, False, private._READ, False),
+        (3, True, private._READ, True),
         (
             2,
             True,
-            private._NEWTON_OF,
+            private._READ,
             "None or False: .* but those of 36 degrees of freedom are dense",
         ),
         (5, None, "3.99.0", False),
-        (5, True, "3.99.0", f"None or False: .* mujoco-mjx {private._NEWTON_OF}, not 3.99.0"),
+        (5, True, "3.99.0", f"None or False: .* mujoco-mjx {private._READ}, not 3.99.0"),
     ],
 )
 def test_warp_skips_zeros_where_it_pays(
@@ -428,7 +428,7 @@ def test_warp_skips_zeros_where_it_pays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # of another one compare the Newton step
-    assert importlib.metadata.version("mujoco-mjx") == private._NEWTON_OF
+    assert importlib.metadata.version("mujoco-mjx") == private._READ
     monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
     monkeypatch.setattr(private, "warp_is_installed", lambda: True)
     monkeypatch.setattr(private, "keep_streams", lambda: None)

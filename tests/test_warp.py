@@ -21,7 +21,8 @@ import pytest
 
 from mqe_jax.core.memory import bytes_of
 from mqe_jax.envs import VectorEnv, make
-from mqe_jax.physics.engines import STATE_FIELDS, private
+from mqe_jax.envs.registry import SHIPPED
+from mqe_jax.physics.engines import STATE_FIELDS, private, warp_model
 from mqe_jax.physics.engines.warp_engine import WarpEngine
 
 COUNT = 10
@@ -180,12 +181,36 @@ def test_terms_that_are_zero_and_early_sensors_are_skipped(
 ) -> None:
     env, data = small()
     seen = []
-    monkeypatch.setattr(private, "warp_step", lambda model, data, flags: seen.append(flags))
+    monkeypatch.setattr(private, "warp_step", lambda *given: seen.append(given[2]))
     engine = copy.deepcopy(env.physics)
     jax.block_until_ready(steps_of(engine)(data))
     bits = mujoco.mjtDisableBit
     unused = bits.mjDSBL_FRICTIONLOSS | bits.mjDSBL_SPRING | bits.mjDSBL_DAMPER
     assert seen == [unused | bits.mjDSBL_SENSOR] * 3 + [unused]
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_scenes_of_tasks_need_few_kernels(task: str) -> None:
+    model = make(task, impl="c").physics.model
+    assert warp_model.is_plain(model)
+    for body, end in enumerate(warp_model.subtree_ends(model)):
+        below = [body]
+        for other in range(body + 1, model.nbody):
+            below += [other] if model.body_parentid[other] in below else []
+        assert below == list(range(body, end))
+
+
+def test_other_models_have_their_own_step() -> None:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body(mass=1.0, inertia=[1.0, 1.0, 1.0]).add_joint()
+    assert not warp_model.is_plain(spec.compile())  # implicit damping
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    assert warp_model.is_plain(spec.compile())
+    spec.worldbody.bodies[0].joints[0].name = "joint"
+    spec.add_sensor(
+        type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname="joint"
+    )
+    assert not warp_model.is_plain(spec.compile())
 
 
 @pytest.mark.gpu

@@ -10,7 +10,7 @@ import importlib
 import importlib.metadata
 import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,10 +22,13 @@ import numpy as np
 if TYPE_CHECKING:
     from mujoco import mjx
 
+SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+PASSIVE = int(mujoco.mjtDisableBit.mjDSBL_SPRING) | int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
 _ITERATIONS = 1 << 9 | 1 << 10
 """Warp's flags for a solver at its iteration limit, which is expected, and no overflow."""
-_NEWTON_OF = "3.17.0"
-"""Version of mujoco-mjx whose Newton step `newton.py` replaces; compare both before raising it."""
+_READ = "3.17.0"
+"""Version of mujoco-mjx of which `newton.py` and `launch_scene_step` replace parts; compare these
+before raising it."""
 
 
 class _Late(ModuleType):
@@ -118,14 +121,18 @@ def overflow(data: mjx.Data) -> jax.Array:
     return jnp.any(overflowed(data._impl.overflow))
 
 
+def is_read() -> bool:
+    """Returns whether the installed mujoco-mjx is the one of which this package replaces parts."""
+    return importlib.metadata.version("mujoco-mjx") == _READ
+
+
 def sparse_newton_needs(model: mujoco.MjModel) -> str | None:
     """Returns what a model lacks on Warp for `with_sparse_newton`, or None.
 
     The text ends a line that begins with "needs".
     """
-    found = importlib.metadata.version("mujoco-mjx")
-    if found != _NEWTON_OF:
-        return f"mujoco-mjx {_NEWTON_OF}, not {found}"
+    if not is_read():
+        return f"mujoco-mjx {_READ}, not {importlib.metadata.version('mujoco-mjx')}"
     if model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE:
         return f"sparse Jacobians, but those of {model.nv} degrees of freedom are dense"
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:  # couples robots by tendons too
@@ -206,12 +213,79 @@ def warp_bytes(model: mujoco.MjModel, count: int, contacts: int, constraints: in
     return least + (count - 1) * of_environment + (contacts - 1) * of_contact
 
 
-def warp_step(model: Any, data: Any, disable: int) -> None:
-    """Launches a physics step of MuJoCo Warp with further disable flags."""
+def warp_step(model: Any, data: Any, disable: int, launch: Callable[[Any, Any], None]) -> None:
+    """Launches a physics step, `launch(model, data)`, with further disable flags."""
     model = copy.copy(model)
     model.opt = copy.copy(model.opt)
     model.opt.disableflags |= disable
-    _mujoco_warp().step(model, data)
+    launch(model, data)
+
+
+def launch_step(m: Any, d: Any) -> None:
+    """Launches a physics step of MuJoCo Warp."""
+    _mujoco_warp().step(m, d)
+
+
+def launch_scene_step(m: Any, d: Any, ends: Any, kernels: Any, forced: bool) -> None:
+    """Launches a physics step of a scene of `warp_model.is_plain` in fewer kernels.
+
+    Actuators are not read, but their forces `qfrc_actuator`. `forced` says whether `xfrc_applied`
+    is read. `ends` are those of `warp_model.subtree_ends`, on the device; `kernels` is the module
+    `warp_kernels`.
+    """
+    launch = importlib.import_module("warp").launch
+    smooth = warp_source("smooth")
+    forward = warp_source("forward")
+
+    def each(kernel: Any, columns: int, *inputs: Any, to: Sequence[Any]) -> None:
+        launch(kernel, dim=(d.nworld, columns), inputs=[*inputs], outputs=[*to])
+
+    smooth.kinematics(m, d)
+    masses = m.body_mass, m.body_subtreemass
+    each(kernels.center, m.nbody, ends, *masses, d.xipos, to=[d.subtree_com])
+    masses = m.body_mass, m.body_inertia
+    frames = d.xipos, d.ximat, d.subtree_com
+    each(smooth._cinert, m.nbody, m.body_rootid, *masses, *frames, to=[d.cinert])
+    joints = m.jnt_type, m.jnt_dofadr, m.jnt_bodyid
+    frames = d.xmat, d.xanchor, d.xaxis, d.subtree_com
+    each(smooth._cdof, m.njnt, m.body_rootid, *joints, *frames, to=[d.cdof])
+    each(kernels.composite, m.nbody, ends, d.cinert, to=[d.crb])
+    d.M.zero_()
+    rows = m.dof_bodyid, m.dof_parentid, m.dof_armature, m.M_rownnz, m.M_rowadr
+    each(smooth._M, m.nv, *rows, d.cdof, d.crb, to=[d.M])
+    warp_source("collision_driver").collision(m, d)
+    warp_source("constraint").make_constraint(m, d)
+    smooth.com_vel(m, d)
+    if ~m.opt.disableflags & PASSIVE:
+        warp_source("passive").passive(m, d)
+    smooth._rne_cacc_world(m, d)
+    smooth._rne_cacc_forward(m, d)
+    smooth._rne_cfrc(m, d)
+    known = d.cdof, d.cfrc_int, d.qfrc_passive, d.qfrc_actuator
+    each(kernels.forces, m.nv, ends, m.dof_bodyid, *known, to=[d.qfrc_smooth])
+    if forced:
+        warp_source("support").xfrc_accumulate(m, d, d.qfrc_smooth)
+    smooth.factor_solve_i(m, d, d.M, d.qLD, d.qLDiagInv, d.qacc_smooth, d.qfrc_smooth)
+    warp_source("solver").solve(m, d)
+    if ~m.opt.disableflags & SENSORS:
+        d.sensordata.zero_()
+        warp_source("sensor").sensor_acc(m, d, skip_rne_postconstraint=True)
+    joints = m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
+    changed = d.qpos, d.qvel, d.qacc_warmstart
+    each(kernels.advance, m.njnt, m.opt.timestep, *joints, d.qacc, to=changed)
+    limits = d.nworld, d.naconmax, d.njmax, d.njmax_nnz
+    counts = d.efc.J_rownnz, d.efc.J_rowadr, *limits, d.nacon, d.ncollision
+    launch(
+        forward._next_time_builder(int(m.opt.warn_overflow)),
+        dim=d.nworld,
+        inputs=[m.opt.timestep, m.is_sparse, d.nefc, d.time, *counts],
+        outputs=[d.time, d.overflow],
+    )
+
+
+def warp_source(name: str) -> ModuleType:
+    """Returns a module of MuJoCo Warp."""
+    return importlib.import_module(f"mujoco.mjx.third_party.mujoco_warp._src.{name}")
 
 
 def overflowed(flags: jax.Array) -> jax.Array:

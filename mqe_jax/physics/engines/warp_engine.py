@@ -29,7 +29,6 @@ from mqe_jax.physics.robots.motors import Motors
 if TYPE_CHECKING:
     from mujoco import mjx
 
-_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _KERNELS = "mqe_jax.physics.engines.warp_kernels"  # imports Warp
 _CHANGED = "qpos", "qvel", "qacc_warmstart", "time"
 _RESULTS = *_CHANGED, "sensordata", "overflow"
@@ -208,12 +207,15 @@ class _Stepper:
             setattr(model if name in call.fields else data, name, array)
         data.overflow.zero_()
         drive = clamp = _nothing
+        step = private.launch_step
         if self.motors is not None:
             drive, clamp = arrays.motor_kernels(model, data, count)
+            step = arrays.scene_step("xfrc_applied" in call.read) or step
         unused = warp_model.unused_terms(self.model, call.fields)
+        data.qfrc_passive.zero_()
         for left in reversed(range(call.num_substeps)):
             drive()
-            private.warp_step(model, data, unused | (_SENSORS if left else 0))
+            private.warp_step(model, data, unused | (private.SENSORS if left else 0), step)
         clamp()
 
 
@@ -245,6 +247,7 @@ class _Arrays:
                     float(motors.timestep),
                     wp.mat33(motors.timestep * motors.response),
                 ]
+            self._ends = wp.array(warp_model.subtree_ends(model), dtype=int)
 
     def allocate(self, count: int, limits: tuple[int, int]) -> None:
         """Allocates the data of `count` environments unless it exists."""
@@ -256,12 +259,19 @@ class _Arrays:
             self.data[count] = private.warp_data(self._model, count, *limits)
         wp.synchronize_device(self.device)  # JAX's stream does not wait for Warp's
 
+    def scene_step(self, forced: bool) -> Callable[[Any, Any], None] | None:
+        """Returns what launches a physics step in few kernels; None if the model needs more."""
+        if not warp_model.is_plain(self._model):
+            return None
+        own = {"ends": self._ends, "kernels": self._kernels, "forced": forced}
+        return functools.partial(private.launch_scene_step, **own)
+
     def motor_kernels(
         self, model: Any, data: Any, count: int
     ) -> tuple[Callable[[], None], Callable[[], None]]:
-        """Returns what sets control and armature before a physics step, and clamps after the last.
+        """Returns what sets the motors' part before a physics step, and clamps after the last.
 
-        `model` and `data` then have the motors' control and armature.
+        `model` and `data` then have the motors' control, torques and armature.
         """
         wp = _warp()
         given = [model.actuator_gainprm, model.actuator_biasprm, model.dof_armature, data.ctrl]
@@ -280,7 +290,7 @@ class _Arrays:
             self._kernels.drive,
             dim=(count, joints // self._kernels.JOINTS),
             inputs=[*self._motors, *given],
-            outputs=[*state, data.ctrl, model.dof_armature],
+            outputs=[*state, data.ctrl, data.qfrc_actuator, model.dof_armature],
         )
         clamp = functools.partial(
             wp.launch,

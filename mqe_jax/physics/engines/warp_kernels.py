@@ -1,7 +1,13 @@
-"""The motors as kernels of Warp, with the numbers of `Motors`."""
+"""Kernels of Warp: the motors, with the numbers of `Motors`, and parts of a physics step.
 
+MuJoCo Warp sums over the bodies below another in a kernel for each level of the tree. Here such a
+sum is a loop, since their numbers are consecutive.
+"""
+
+import mujoco
 import warp as wp  # pyright: ignore[reportMissingImports]
 
+from mqe_jax.physics.engines import private
 from mqe_jax.physics.robots import motors
 
 JOINTS = 3  # of a leg
@@ -20,10 +26,13 @@ SLOW = wp.constant(motors.SLOW)
 FAST = wp.constant(motors.FAST)
 REACH = wp.constant(motors.REACH)
 ROUNDING = wp.constant(motors.ROUNDING)
+FREE = wp.constant(int(mujoco.mjtJoint.mjJNT_FREE))
+BALL = wp.constant(int(mujoco.mjtJoint.mjJNT_BALL))
+quat_integrate = private.warp_source("math").quat_integrate
 
 
-class Parameters(wp.types.vector(length=10, dtype=float)):
-    """Gain or bias of an actuator."""
+class Ten(wp.types.vector(length=10, dtype=float)):
+    """Gain or bias of an actuator; inertia, first moment and mass of bodies."""
 
 
 @wp.kernel(enable_backward=False)
@@ -77,16 +86,17 @@ def drive(
     speeds: wp.array[int],
     timestep: float,
     kick: wp.mat33,  # speeds that unit torques of a leg add in a physics step
-    gainprm: wp.array2d[Parameters],
-    biasprm: wp.array2d[Parameters],
+    gainprm: wp.array2d[Ten],
+    biasprm: wp.array2d[Ten],
     base: wp.array2d[float],
     asked: wp.array2d[float],
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     ctrl: wp.array2d[float],
+    torques: wp.array2d[float],
     armature: wp.array2d[float],
 ):
-    """Sets a leg's control and armature in a physics step, `Motors.limit` after `Motors.clamp`."""
+    """Sets what a leg gets in a physics step, by `Motors.limit` after `Motors.clamp`."""
     env, leg = wp.tid()
     effort = wp.vec3()
     given = wp.vec3()
@@ -107,7 +117,10 @@ def drive(
         wanted = asked[env, joint]
         force = gain[0] * wanted + bias[0] + bias[1] * position + bias[2] * velocity
         found = sign * wp.min(wp.max(sign * force, -torque), most)
-        ctrl[env, joint] = wanted + (found - force) / wp.where(gain[0] == 0.0, 1.0, gain[0])
+        limited = wanted + (found - force) / wp.where(gain[0] == 0.0, 1.0, gain[0])
+        ctrl[env, joint] = limited
+        limited = gain[0] * limited + bias[0] + bias[1] * position + bias[2] * velocity
+        torques[env, speeds[joint]] = wp.clamp(limited, -torque, torque)
         effort[i] = wp.abs(found)
         given[i] = found * sign
 
@@ -130,3 +143,98 @@ def drive(
             needed = wp.max(share * (inertia + timestep * slope) - inertia, 0.0)
         dof = speeds[joint]
         armature[env, dof] = base[env % base.shape[0], dof] + wp.max(near * full, needed)
+
+
+@wp.kernel(enable_backward=False)
+def center(
+    ends: wp.array[int],
+    mass: wp.array2d[float],
+    subtree_mass: wp.array2d[float],
+    position: wp.array2d[wp.vec3],
+    result: wp.array2d[wp.vec3],
+):
+    """Computes the centre of mass of each body with those below it, whose numbers end at `ends`."""
+    env, body = wp.tid()
+    total = wp.vec3()
+    for part in range(body, ends[body]):
+        total += mass[env % mass.shape[0], part] * position[env, part]
+    whole = subtree_mass[env % subtree_mass.shape[0], body]
+    if whole != 0.0:
+        total = total / whole
+    result[env, body] = total
+
+
+@wp.kernel(enable_backward=False)
+def composite(ends: wp.array[int], inertia: wp.array2d[Ten], result: wp.array2d[Ten]):
+    """Sums the inertia of each body and those below it."""
+    env, body = wp.tid()
+    total = Ten()
+    for part in range(body, ends[body]):
+        total += inertia[env, part]
+    result[env, body] = total
+
+
+@wp.kernel(enable_backward=False)
+def forces(
+    ends: wp.array[int],
+    bodies: wp.array[int],
+    motion: wp.array2d[wp.spatial_vector],
+    force: wp.array2d[wp.spatial_vector],
+    passive: wp.array2d[float],
+    actuator: wp.array2d[float],
+    result: wp.array2d[float],
+):
+    """Sums the forces on each degree of freedom, without those of constraints."""
+    env, dof = wp.tid()
+    body = bodies[dof]
+    total = wp.spatial_vector()
+    for part in range(body, ends[body]):
+        total += force[env, part]
+    result[env, dof] = passive[env, dof] - wp.dot(motion[env, dof], total) + actuator[env, dof]
+
+
+@wp.func
+def _turn(env: int, place: int, speed: wp.vec3, timestep: float, qpos: wp.array2d[float]):
+    """Turns the quaternion at a place of the positions."""
+    before = wp.quat(
+        qpos[env, place], qpos[env, place + 1], qpos[env, place + 2], qpos[env, place + 3]
+    )
+    after = quat_integrate(before, speed, timestep)
+    for i in range(4):
+        qpos[env, place + i] = after[i]
+
+
+@wp.kernel(enable_backward=False)
+def advance(
+    timesteps: wp.array[float],
+    kinds: wp.array[int],
+    places: wp.array[int],
+    dofs: wp.array[int],
+    qacc: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    warmstart: wp.array2d[float],
+):
+    """Advances each joint's velocities, then its positions with these."""
+    env, joint = wp.tid()
+    timestep = timesteps[env % timesteps.shape[0]]
+    place = places[joint]
+    dof = dofs[joint]
+    kind = kinds[joint]
+    count = 1
+    moved = 1
+    if kind == FREE:
+        count = 6
+        moved = 3
+    if kind == BALL:
+        count = 3
+        moved = 0
+    for i in range(dof, dof + count):
+        qvel[env, i] = qvel[env, i] + qacc[env, i] * timestep
+        warmstart[env, i] = qacc[env, i]
+    for i in range(moved):
+        qpos[env, place + i] = qpos[env, place + i] + timestep * qvel[env, dof + i]
+    if count > 1:
+        first = dof + moved
+        speed = wp.vec3(qvel[env, first], qvel[env, first + 1], qvel[env, first + 2])
+        _turn(env, place + moved, speed, timestep, qpos)

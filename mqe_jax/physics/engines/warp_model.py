@@ -13,7 +13,6 @@ from mqe_jax.physics.engines import private
 _BIT = mujoco.mjtDisableBit
 _JACOBIAN = mujoco.mjtJacobian
 _FRICTION: int = int(_BIT.mjDSBL_FRICTIONLOSS)
-_PASSIVE: int = int(_BIT.mjDSBL_SPRING) | int(_BIT.mjDSBL_DAMPER)
 _MAX_DENSE = 50
 """Degrees of freedom up to which Warp's line search needs no extra kernels for dense Jacobians."""
 _MAX_FULL = 80
@@ -24,7 +23,7 @@ On an H200 this gains nothing with four robots (78, the most of the paper) and a
 """
 _TERMS: dict[int, tuple[str, ...]] = {
     _FRICTION: ("dof_frictionloss", "tendon_frictionloss"),
-    _PASSIVE: (
+    private.PASSIVE: (
         "jnt_stiffness",
         "jnt_stiffnesspoly",
         "tendon_stiffness",
@@ -43,7 +42,7 @@ _TERMS: dict[int, tuple[str, ...]] = {
 """The model fields of each term of the dynamics: if all are zero, so is the term.
 
 Without springs and dampers Warp and MuJoCo compute no passive force at all, so the fields of
-`_PASSIVE` include gravity compensation and adhesion.
+`PASSIVE` include gravity compensation and adhesion.
 """
 
 
@@ -59,8 +58,31 @@ def unused_terms(model: mujoco.MjModel, fields: Collection[str]) -> int:
     fluid = any((model.opt.density, model.opt.viscosity, *model.opt.wind))
     implicit = model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER
     if implicit or model.nflex or fluid:
-        flags &= ~_PASSIVE
+        flags &= ~private.PASSIVE
     return flags
+
+
+def is_plain(model: mujoco.MjModel) -> bool:
+    """Returns whether `private.launch_scene_step` computes a model's step, without its actuators.
+
+    It lacks tendons, flexes, activations, energy, other integrators than Euler's without implicit
+    damping, and sensors other than of contacts.
+    """
+    absent = model.ntendon, model.nflex, model.na, model.nplugin, model.opt.enableflags
+    explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    explicit &= bool(model.opt.disableflags & _BIT.mjDSBL_EULERDAMP)
+    contacts = np.all(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT)
+    known = private.is_read() and explicit and bool(contacts)
+    return known and not any(absent) and not np.any(model.jnt_actfrclimited)
+
+
+def subtree_ends(model: mujoco.MjModel) -> np.ndarray:
+    """Returns the number after the last of each body and those below it (nbody,)."""
+    ends = np.arange(1, model.nbody + 1)
+    for body in reversed(range(1, model.nbody)):
+        parent = model.body_parentid[body]
+        ends[parent] = max(ends[parent], ends[body])
+    return ends
 
 
 def with_jacobian(model: mujoco.MjModel) -> mujoco.MjModel:
