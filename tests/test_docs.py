@@ -201,6 +201,7 @@ SLOW = (
     "export/robot_team",
     "export/policy",
     "export/site",
+    "runs/real_time",
 )
 
 
@@ -222,7 +223,7 @@ def test_examples_of_docstrings_run(module: str, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(mqe_jax, name, functools.partial(getattr(mqe_jax, name), **few))
     if module == "export/site":  # without npm
         monkeypatch.setattr("mqe_jax.export.site.add_libraries", lambda *_: None)
-    if module == "export/robot_team":
+    if module in ("export/robot_team", "runs/real_time"):
         assert cli.main(["export", "go1gate", "--per-robot", "--onnx", "gate.onnx"]) == 0
     for example in re.findall(
         r"^ +```python\n(.*?)^ +```", SOURCES[module], re.DOTALL | re.MULTILINE

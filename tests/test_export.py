@@ -68,7 +68,7 @@ def new_policy(
 
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: Any) -> None:
     file = tmp_path / "box.onnx"
-    said = json.loads(mqe(f"export {zoo.file_of('go1pushbox')} --onnx {file} --json").out)
+    said = json.loads(mqe(f"export go1pushbox --onnx {file} --json").out)
     assert 0.0 < said["largest_error"] < 6e-5
     model = onnx.load(file)
     sizes = shapes(model)

@@ -28,6 +28,7 @@ CHECKING = {
     "runs.exploiting",
     "runs.learning",
     "runs.playing",
+    "runs.real_time",
     "runs.recording",
     "runs.stress",
     "runs.sweeping",

@@ -100,10 +100,11 @@ def test_child_processes_import_nothing_from_the_current_folder(tmp_path: Path) 
 import subprocess
 from pathlib import Path
 from mqe_jax.cli.launch import PROGRAM
-from mqe_jax.export.robot_team import _Process
+from mqe_jax.export.processes import AskedRobot, LiveRobot
 from mqe_jax.viz.render import _draws
 _draws("egl")
-_Process(Path("robot.onnx"), 0, 0).close()
+AskedRobot(Path("robot.onnx"), 0, 0).close()
+LiveRobot(Path("robot.onnx"), 0, 0, seconds=9.0).close()
 subprocess.run([*PROGRAM, "tasks"], check=True)
 """
     command = [sys.executable, "-P", "-c", code]

@@ -25,7 +25,7 @@ from mqe_jax.cli.options import (
 )
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import read_json
-from mqe_jax.core.limits import Environments, Episodes, Horizon
+from mqe_jax.core.limits import Environments, Episodes, Horizon, Latency
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail, settings_class
 
@@ -208,8 +208,9 @@ class Eval(PolicyOptions):
 
     json: Json = False
     long: Long = False
-    episodes: Episodes = 512
-    """Number of evaluation episodes, split evenly over environments."""
+    episodes: Episodes | None = None
+    """Number of evaluation episodes, split evenly over environments. Default: 512, in real time
+    20."""
     num_envs: Environments = 128
     """Number of parallel environments."""
     sides: Literal["both", "first"] = "first"
@@ -222,6 +223,13 @@ class Eval(PolicyOptions):
     actions are sampled."""
     opponent_export: RobotFile = None
     """The same for the robots of the opponents."""
+    real_time: bool = False
+    """With `--export`, also in real time: robots with their own clocks, whose answers may be late,
+    in a world at 1x that does not wait. An episode takes the time that it lasts."""
+    latency: Latency = 0.0
+    """With `--real-time`, time added to each command, s."""
+    log: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """With `--real-time`, folder for a log of each robot (see `mqe replay`)."""
     stress: bool = False
     """Evaluate under other friction, payload, motors, delay, errors of readings and pushes, each
     with `--episodes`. A run folder gets a picture, stress.png."""
@@ -232,12 +240,17 @@ class Eval(PolicyOptions):
         """Evaluates a policy; prints a table, or returns the object for `--json`."""
         from mqe_jax.runs.playing import evaluate
 
+        if self.real_time:
+            return self._real_time()
+        for name in ("latency", "log"):
+            if getattr(self, name):
+                fail(name, str(getattr(self, name)), "left out without --real-time")
         if self.stress:
             return self._stress()
         if self.curves:
             fail("curves", True, "left out without --stress")
         options = {
-            "episodes": self.episodes,
+            "episodes": self.episodes or 512,
             "num_envs": self.num_envs,
             "sides": self.sides,
             "seed": self.seed,
@@ -254,6 +267,33 @@ class Eval(PolicyOptions):
             print(result.details() if self.long else result)
         return result.to_dict()
 
+    def _real_time(self) -> dict[str, Any]:
+        from mqe_jax.runs.real_time import real_time
+
+        if self.export is None:
+            fail("real_time", True, "beside --export FILE")
+        given = {name: getattr(self, name) for name in ("policy", "dump_diverged", "stress")}
+        given |= {"impl": self.impl.replace("auto", "c").removeprefix("c")}
+        given |= {"sides": self.sides.removeprefix("first")}
+        for name, value in given.items():
+            if value:
+                fail(name, str(value), "left out with --real-time")
+        result = real_time(
+            self.target,
+            self.export,
+            self.opponent,
+            opponent_robot=self.opponent_export,
+            env=self.overrides(),
+            episodes=self.episodes or 20,
+            latency=self.latency,
+            deterministic=self.deterministic,
+            seed=self.seed,
+            log=self.log,
+        )
+        if not self.json:
+            print(result)
+        return result.to_dict()
+
     def _stress(self) -> dict[str, Any]:
         from mqe_jax.runs.stress import stress
         from mqe_jax.viz.curves import save_figure
@@ -263,7 +303,7 @@ class Eval(PolicyOptions):
                 fail(name, str(getattr(self, name)), "left out with --stress")
         found = stress(
             **self.playing,
-            episodes=self.episodes,
+            episodes=self.episodes or 512,
             num_envs=self.num_envs,
             sides=self.sides,
             seed=self.seed,
@@ -296,18 +336,24 @@ class Eval(PolicyOptions):
 
 @settings_class
 class Replay:
-    """Replay a recording of diverged physics, and render it with --output."""
+    """Replay a recording of diverged physics, and render it with --output.
+
+    Or show the log of a robot (.csv), and draw it.
+    """
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """Recording written by `--dump-diverged` (.npz)."""
+    """Recording written by `--dump-diverged` (.npz), or a robot's log (.csv) of
+    `mqe_jax.export.runner`."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    """Clip or image to write: .mp4, .webp, .gif or .png."""
+    """Clip or image to write: .mp4, .webp, .gif or .png; of a log .png, .svg or .pdf."""
     impl: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Engine: jax, warp or c. Default: the recorded one."""
     json: Json = False
 
     def run(self) -> dict[str, Any]:
         """Replays a recording; prints a table, or returns the object for `--json`."""
+        if self.file.suffix == ".csv":
+            return self._show_log()
         import numpy as np
 
         from mqe_jax.envs import replay as recordings
@@ -337,6 +383,21 @@ class Replay:
                 for name in ("qpos", "mocap_pos", "mocap_quat")
             )
             render.render_episode(env, recording.Episode(*pose, dt=env.dt), self.output)
+            echo(f"mqe: wrote {self.output}")
+        if not self.json:
+            print_table(result)
+        return result
+
+    def _show_log(self) -> dict[str, Any]:
+        from mqe_jax.export import robot_log
+        from mqe_jax.viz.curves import save_figure
+
+        if self.output is not None and self.output.suffix not in (".png", ".svg", ".pdf"):
+            fail("output", str(self.output), "a .png, .svg or .pdf of a robot's log")
+        log = robot_log.load_log(self.file)
+        result = robot_log.summarize(log)
+        if self.output is not None:
+            save_figure(robot_log.plot(log), self.output)
             echo(f"mqe: wrote {self.output}")
         if not self.json:
             print_table(result)

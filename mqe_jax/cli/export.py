@@ -18,7 +18,7 @@ from mqe_jax.core.settings import settings_class
 class Export:
     """Write a trained policy as one ONNX graph: of a team with its walk policy, or of one robot."""
 
-    run_dir: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK|RUN")]
+    run_dir: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|RUN")]
     """Task with a shipped policy, run folder, or policy file."""
     onnx: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write (.onnx)."""
@@ -53,7 +53,7 @@ class Export:
         from mqe_jax.export.policy import shapes
         from mqe_jax.export.robot_graph import verify_robot
 
-        with names.imports_of(policy, str(self.run_dir)):
+        with names.imports_of(policy, self.run_dir):
             env = names.environment(task, policy.config.env)
         if self.per_robot:
             model, error = verify_robot(policy if self.sampled else policy.acting(True), env)

@@ -37,6 +37,7 @@ Friction = Annotated[float, Ge(0), Le(100)]
 PositiveFriction = Annotated[float, Ge(1e-3), Le(100)]
 TimeLimit = Annotated[float, Ge(0.02), Le(1e6)]  # of an episode, s; not below one environment step
 Time = Annotated[float, Ge(0), Le(1e4)]  # s
+Latency = Annotated[float, Ge(0), Le(1)]  # of a message, s
 ClipLength = Annotated[float, Ge(0.02), Le(600)]  # s
 FrameRate = Annotated[float, Ge(0.1), Le(240)]  # Hz
 Speed = Annotated[float, Ge(0.01), Le(100)]  # of a clip, relative to real time

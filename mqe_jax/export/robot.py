@@ -11,6 +11,7 @@ numbers with which a graph samples. The program ends if an answer takes longer t
 """
 
 import contextlib
+import json
 import math
 import os
 import struct
@@ -44,6 +45,37 @@ class Robot:
         self._memory: dict[str, np.ndarray] = {}
         # metadata of the graph
         self.properties: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
+        about = json.loads(self.properties.get("velocity", "{}"))
+        self._velocity = {name: np.asarray(x, float) for name, x in about.items()}
+
+    @property
+    def size(self) -> int:
+        """Number of readings O."""
+        return math.prod(self._shapes["obs"])
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Largest vx, vy and yaw rate of its velocities (3,), m/s and rad/s.
+
+        ValueError unless its actions are these three.
+        """
+        return np.abs(self._commands["limits"]).max(axis=1)
+
+    def velocity(self, readings: ArrayLike, starts: bool = False) -> np.ndarray:
+        """Returns vx, vy and yaw rate (3,) in the trunk's frame, m/s and rad/s, of one episode.
+
+        `readings` (O,); `starts` says whether the episode starts. ValueError as `act` and `speed`.
+        """
+        (action,) = self.act(np.asarray(readings)[None], [float(starts)])
+        about = self._commands
+        change = np.where(action < 0, *about["slopes"]) * action
+        return np.clip(about["default"] + change, *about["limits"].T)
+
+    @property
+    def _commands(self) -> Mapping[str, np.ndarray]:
+        if not self._velocity:
+            raise ValueError("velocity: the graph has none; its actions must be vx, vy, yaw_rate")
+        return self._velocity
 
     def act(self, readings: ArrayLike, starts: ArrayLike) -> np.ndarray:
         """Returns the actions (N, D) for readings (N, O).
@@ -51,7 +83,7 @@ class Robot:
         `starts` (N,) is 1 where an episode starts, else 0. ValueError for anything else than finite
         numbers of these shapes.
         """
-        readings = _finite("readings", readings, math.prod(self._shapes["obs"]))
+        readings = _finite("readings", readings, self.size)
         starts = _finite("starts", starts)
         count = len(readings)
         if len(starts) != count:

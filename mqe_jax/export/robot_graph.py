@@ -26,6 +26,9 @@ from mqe_jax.export.task import Shapes, readings_function
 from mqe_jax.export.translate import translate
 from mqe_jax.train.policy import TrainedPolicy, template
 
+VELOCITY = ("vx", "vy", "yaw_rate")
+"""Commands that a robot's velocity has, in this order."""
+
 
 def robot_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of any robot of a policy's team.
@@ -41,8 +44,22 @@ def robot_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
     about = properties(policy, env) | {
         "needs": json.dumps(to_mapping(policy.needs)),
         "actions": "mean" if policy.deterministic else "sampled",
+        **_velocity(env),
     }
     return translate(act, sizes, f"{env.name.replace('-', '_')}_robot", about)
+
+
+def _velocity(env: QuadrupedEnv) -> dict[str, str]:
+    """Returns how actions become velocities, if these are what actions set (`Robot.velocity`)."""
+    commander = env.controller
+    if env.control != "command" or commander.commands != VELOCITY:
+        return {}
+    about = {
+        "default": commander.limits[:, 0] - commander.changes[:, 0],
+        "slopes": commander.slopes,
+        "limits": commander.limits,
+    }
+    return {"velocity": json.dumps({name: x.tolist() for name, x in about.items()})}
 
 
 def verify_robot(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelProto, float]:

@@ -5,12 +5,9 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +18,11 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_file, parse_json, parsing
 from mqe_jax.core.settings import build, checked, fail
 from mqe_jax.core.types import Memory, Observations
-from mqe_jax.export import robot
-from mqe_jax.export.robot import Robot, read_frame, write_frame
+from mqe_jax.export.processes import AskedRobot
+from mqe_jax.export.robot import Robot
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import Needs, unmet
 from mqe_jax.train.policy import check_obs
-
-_CLOSING = 10.0  # s, after which a process that does not end is killed
 
 
 class RobotTeam:
@@ -47,8 +42,8 @@ class RobotTeam:
         self.task = needs.task
         self.agents = needs.dims.agents  # number of robots A
         self.groups: tuple[str, ...] = (needs.group,)  # of observations that the robots see
-        self._seed = seed
-        self._processes: list[_Process] = []
+        self.seed = seed
+        self._processes: list[AskedRobot] = []
 
     def __repr__(self) -> str:
         return str(self.file)
@@ -86,8 +81,8 @@ class RobotTeam:
         starts = 1.0 - np.asarray(started).reshape(-1, 1)
         try:
             if not self._processes:
-                seeds = np.random.SeedSequence(self._seed).generate_state(rows.shape[1])
-                self._processes = [_Process(self.file, i, int(x)) for i, x in enumerate(seeds)]
+                seeds = np.random.SeedSequence(self.seed).generate_state(rows.shape[1])
+                self._processes = [AskedRobot(self.file, i, int(x)) for i, x in enumerate(seeds)]
             for i, process in enumerate(self._processes):
                 process.send(np.concatenate([starts, rows[:, i]], axis=1))
             shape = len(rows), self.needs.dims.action
@@ -96,56 +91,6 @@ class RobotTeam:
             self.failure = self.failure or str(error)
             raise
         return np.stack(actions, axis=1).reshape(*readings.shape[:-1], -1)
-
-
-class _Process:
-    """The process of one robot."""
-
-    def __init__(self, file: Path, number: int, seed: int) -> None:
-        self._name = f"export: the process of robot {number}"
-        self._errors: IO[bytes] = tempfile.TemporaryFile()
-        # -P: no module of the current folder
-        command = [sys.executable, "-P", robot.__file__, str(file), str(seed)]
-        # Ctrl-C must reach the parent only; this process sees its end.
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            start_new_session=True,
-        )
-
-    def send(self, frame: np.ndarray) -> None:
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # `receive` says why
-            write_frame(self._process.stdin, frame)
-
-    def receive(self, shape: tuple[int, int]) -> np.ndarray:
-        assert self._process.stdout is not None
-        frame = read_frame(self._process.stdout)
-        if frame is None:
-            code = self._process.wait(_CLOSING)
-            self._errors.seek(0)
-            last = self._errors.read().decode("utf-8", "replace").strip().rpartition("\n")[2]
-            raise ConnectionError(f"{self._name} ended with {code} ({last or 'without a message'})")
-        if frame.shape != shape:
-            raise ConnectionError(f"{self._name} answered {frame.shape} numbers, not {shape}")
-        if not np.isfinite(frame).all():
-            raise ConnectionError(f"{self._name} answered numbers that are not finite")
-        return frame
-
-    def close(self) -> None:
-        """Ends the process: it ends with its input."""
-        for stream in (self._process.stdin, self._process.stdout):
-            assert stream is not None
-            with contextlib.suppress(BrokenPipeError):
-                stream.close()
-        try:
-            self._process.wait(_CLOSING)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._errors.close()
 
 
 @contextlib.contextmanager

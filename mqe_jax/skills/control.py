@@ -73,7 +73,7 @@ class Commander:
 
         `change` is (..., action_size).
         """
-        down, up = np.where(self._slopes > 0, 1.0 / np.maximum(self._slopes, 1e-9), 0.0)
+        down, up = np.where(self.slopes > 0, 1.0 / np.maximum(self.slopes, 1e-9), 0.0)
         return jnp.clip(jnp.where(change < 0, down, up) * change, -1.0, 1.0)
 
     def change(self, action: jax.Array) -> jax.Array:
@@ -81,7 +81,7 @@ class Commander:
 
         They are differences from the default commands.
         """
-        down, up = self._slopes
+        down, up = self.slopes
         low, high = self.changes.T
         return jnp.clip(jnp.where(action < 0, down, up) * action, low, high)
 
@@ -122,7 +122,7 @@ class Commander:
         return self.skill.changes(self.commands, self.ranges, self.default_commands)
 
     @property
-    def _slopes(self) -> np.ndarray:
+    def slopes(self) -> np.ndarray:
         """Change of each command per unit of a negative and of a positive action (2, n)."""
         gain = self.skill.column("gain", self.commands)
         limit = self.skill.column("limit", self.commands)
