@@ -84,7 +84,7 @@ def real_time(
     seed: Seed = 0,
     log: str | Path | None = None,
 ) -> RealTime:
-    """Evaluates exported robots in real time, as `mqe eval TARGET --export FILE --real-time`.
+    """Evaluates exported robots in real time, as `mqe eval TASK --export FILE --real-time`.
 
     The world runs on the C engine, not faster than time passes. Each robot is a process
     (`mqe_jax.export.runner`).
