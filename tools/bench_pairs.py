@@ -5,8 +5,9 @@
 starts one process per checkout and case, waits for compilation, and times them in turn. Drifts of
 the machine's speed then affect all equally. It prints medians and ratios of the pairs. A case is
 TASK:ENGINE:ENVIRONMENTS. Each timing is that of `mqe bench`: the median of a few calls of 50
-environment steps, whole step and bare physics. `PATH,senses=onboard` is a checkout with a task
-parameter.
+environment steps, whole step and bare physics. TASK:ENGINE:SETTINGS, as go1gate:c:demo, times
+updates of a training instead. `PATH,senses=onboard` is a checkout with a
+task parameter.
 """
 
 import argparse
@@ -32,38 +33,70 @@ def work(case: str, *, steps: int, repeats: int, cpu_time: bool, params: dict[st
     os.dup2(2, 1)  # whatever libraries print
 
     import jax
-    import jax.numpy as jnp
 
     import mqe_jax
-    from mqe_jax.runs.throughput import programs
 
     clock = time.process_time if cpu_time else time.perf_counter
-    task, impl, count = case.split(":")
-    env = mqe_jax.make(task, impl=impl, num_envs=int(count), **params)
-    vector: Any = mqe_jax.VectorEnv(env, int(count), final=())
-    if getattr(env.params, "senses", ()):
-        vector = vector.with_groups(["onboard"])
-    scan, bare_scan = programs(env, vector, steps, lambda state: ())
-    whole = jax.jit(lambda carry: scan(carry)[0])
-    bare = jax.jit(bare_scan)
+    task, impl, how = case.split(":")
+    if how.isdecimal():
+        runs = of_environments(task, impl, int(how), steps, params)
+    else:
+        runs = of_updates(task, impl, how, params)
 
-    def rate(run: Any, start: Any) -> float:
+    def rate(run: Any, start: Any, count: int) -> float:
         seconds = []
         for _ in range(repeats):
             began = clock()
             start = jax.block_until_ready(run(start))
             seconds.append(clock() - began)
-        return int(count) * steps / median(seconds)
+        return round(count / median(seconds), 1)
 
-    carry = (jax.jit(vector.reset)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1))
-    data = jax.tree.map(jnp.copy, carry[0].data)
-    jax.block_until_ready((whole(carry), bare(data)))
+    for run, begin, _ in runs.values():
+        jax.block_until_ready(run(begin))
     device = jax.devices()[0].device_kind
     print(json.dumps({"ready": mqe_jax.__file__}), file=output, flush=True)
     for _ in sys.stdin:
-        figures = {RATES[0]: round(rate(whole, carry), 1), RATES[1]: round(rate(bare, data), 1)}
+        figures: dict[str, Any] = {name: rate(*each) for name, each in runs.items()}
         about = {"device": device, "jax": jax.__version__}
         print(json.dumps(figures | about), file=output, flush=True)
+
+
+def of_environments(
+    task: str, impl: str, count: int, steps: int, params: dict[str, Any]
+) -> dict[str, tuple[Any, Any, int]]:
+    """Returns a compiled function, its argument and its environment steps, for each of `RATES`."""
+    import jax
+    import jax.numpy as jnp
+
+    import mqe_jax
+    from mqe_jax.runs.throughput import programs
+
+    env = mqe_jax.make(task, impl=impl, num_envs=count, **params)
+    vector: Any = mqe_jax.VectorEnv(env, count, final=())
+    if getattr(env.params, "senses", ()):
+        vector = vector.with_groups(["onboard"])
+    scan, bare = programs(env, vector, steps, lambda state: ())
+    carry = (jax.jit(vector.reset)(jax.random.PRNGKey(0)), jax.random.PRNGKey(1))
+    data = jax.tree.map(jnp.copy, carry[0].data)
+    whole = jax.jit(lambda carry: scan(carry)[0])
+    runs = (whole, carry, count * steps), (jax.jit(bare), data, count * steps)
+    return dict(zip(RATES, runs, strict=True))
+
+
+def of_updates(
+    task: str, impl: str, settings: str, params: dict[str, Any]
+) -> dict[str, tuple[Any, Any, int]]:
+    """Returns the same of an update of a training, which has no bare rate."""
+    import jax
+
+    from mqe_jax.runs.learning import prepare
+    from mqe_jax.train.start import initial_key, own_learner
+
+    (config,), cast = prepare(task, settings, params or None, impl=impl, seeds=[0])
+    learner, _ = own_learner(cast, config)
+    state = jax.jit(learner.init)(initial_key(config))
+    update = jax.jit(learner.update)
+    return {RATES[0]: (lambda state: update(state)[0], state, config.steps_per_update)}
 
 
 def start(place: str, case: str, **options: Any) -> subprocess.Popen[str]:
@@ -106,7 +139,7 @@ def main() -> int:
         metavar="NAME=PATH[,PARAMETER=VALUE...]",
         help="ratios are to the first one",
     )
-    parser.add_argument("--cases", nargs="+", metavar="TASK:ENGINE:ENVS")
+    parser.add_argument("--cases", nargs="+", metavar="TASK:ENGINE:ENVS|SETTINGS")
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--repeats", type=int, default=3)
@@ -134,17 +167,19 @@ def main() -> int:
         worker.kill()
     if arguments.csv is not None:
         with arguments.csv.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            names = list(dict.fromkeys(name for row in rows for name in row))
+            writer = csv.DictWriter(file, names, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
     for case in arguments.cases:
         result: dict[str, Any] = {"case": case}
-        for rate in RATES:
+        measured = [row for row in rows if row["case"] == case]
+        for rate in filter(measured[0].__contains__, RATES):
             result[rate] = {}
             result[f"{rate}/ratio"] = {}
             first: list[float] = []
             for name in trees:
-                values = [r[rate] for r in rows if (r["case"], r["tree"]) == (case, name)]
+                values = [row[rate] for row in measured if row["tree"] == name]
                 first = first or values
                 ratios = [own / other for own, other in zip(values, first, strict=True)]
                 result[rate][name] = median(values)
