@@ -30,7 +30,7 @@ SHORTER = {
 VERSIONS = {
     "mqe_jax/core/version.py": r'^__version__ = "(.+)"$',
     "CITATION.cff": r"^version: (.+)$",
-    "CHANGELOG.md": r"^## \[(\d[^]]*)\]",
+    "CHANGELOG.md": r"^## \[(\d[^]]*)\] - \d",  # not what is unreleased
 }
 """Where the version of pyproject.toml is repeated, first."""
 
