@@ -1,6 +1,6 @@
 """A custom task in five steps: a robot catches a mouse that flees from it around a pillar.
 
-docs/new_task.md explains the steps; `python examples/new_task.py` evaluates the scripted policy.
+docs/task_parts.md explains the parts; `python examples/new_task.py` evaluates the scripted policy.
 """
 
 from __future__ import annotations
