@@ -69,6 +69,13 @@ def test_a_run_asks_for_the_import_of_its_task(forget: Any, mqe: Any, monkeypatc
     assert mqe(f"--import race.py --import ./race.py eval runs/race {few}").out  # both once
 
 
+def test_a_class_that_python_imported_needs_its_file(forget: Any) -> None:
+    imports.add("race.py")
+    imports.IMPORTED.clear()
+    assert imports.needed(TASKS["race"]) == ["race.py"]
+    assert imports.needed(TASKS["go1gate"]) == []
+
+
 def test_a_run_asks_for_what_else_its_import_registered(forget: Any, mqe: Any) -> None:
     policy = mqe_jax.load_policy("go1gate")
     config = override(policy.config, {"env.robot": "own"})

@@ -67,6 +67,14 @@ def _import_file(path: Path) -> None:
         raise
 
 
+def needed(kind: type) -> list[str]:
+    """Returns what `mqe` imports to know a class: what this process did, or the class's file."""
+    file = getattr(sys.modules[kind.__module__], "__file__", None)
+    if IMPORTED or file is None or Path(file).is_relative_to(Path(__file__).parents[1]):
+        return [*IMPORTED]
+    return [os.path.relpath(file)]
+
+
 def reason(error: BaseException) -> str:
     """Returns why an import failed: the error, and the first line of a user's file."""
     text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"

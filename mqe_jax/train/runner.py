@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core import interrupts
+from mqe_jax.core import imports
 from mqe_jax.core.devices import Processes, translate_errors
 from mqe_jax.core.errors import NonFiniteError
-from mqe_jax.core.imports import IMPORTED
 from mqe_jax.core.settings import fail, to_mapping
 from mqe_jax.core.types import Cast, PyTree, VectorEnv, generator, raw_keys
 from mqe_jax.train.checkpoint import checkpoint_step, latest, nonfinite, save_checkpoint
@@ -246,7 +246,8 @@ class Training:
 
     def policies(self) -> list[TrainedPolicy]:
         """Returns the newest policy of every seed."""
-        about: dict[str, Any] = {"imports": [*IMPORTED]} if IMPORTED else {}
+        names = imports.needed(type(getattr(self._env, "env", self._env)))
+        about: dict[str, Any] = {"imports": names} if names else {}
         return [
             policy_of(state, self._env, config, env_steps=self.env_steps, **about)
             for state, config in zip(self._own(), self._configs, strict=True)
