@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core import interrupts
-from mqe_jax.core import imports
+from mqe_jax.core import imports, interrupts
 from mqe_jax.core.devices import Processes, translate_errors
 from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.core.settings import fail, to_mapping
