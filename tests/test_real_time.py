@@ -17,7 +17,7 @@ import pytest
 from mqe_jax import names
 from mqe_jax.core.settings import build
 from mqe_jax.envs import make
-from mqe_jax.export import robot_log, runner
+from mqe_jax.export import robot, robot_log, runner
 from mqe_jax.export.processes import LiveRobot
 from mqe_jax.export.runner import Limits, run
 from mqe_jax.train.config import TrainConfig
@@ -121,19 +121,34 @@ def test_a_robot_needs_python_only(tmp_path: Path) -> None:
 
 # -- worlds in real time
 
-SHORT = {"episode_length": 1.0, "collision_force": 1e6}
+RANGES: dict[str, Any] = {"command_ranges": {"vx": (-0.5, 1.2)}}
+SHORT = {"episode_length": 1.0, "collision_force": 1e6, **RANGES}
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The graph of a robot with random weights."""
     graph = pytest.importorskip("mqe_jax.export.robot_graph")
-    env = make("go1gate", impl="c", num_envs=1)
-    settings = {"task": env.name, "network": {"recurrent": True, "gru_size": 8}}
+    env = make("go1gate", impl="c", num_envs=1, **RANGES)
+    settings = {"task": env.name, "network": {"recurrent": True, "gru_size": 8}, "env": RANGES}
     policy = untrained(env, build(TrainConfig, settings)).acting(True)
     written = tmp_path_factory.mktemp("robot") / "robot.onnx"
     written.write_bytes(graph.robot_onnx(policy, env).SerializeToString())
     return written
+
+
+def test_a_robot_asks_for_the_velocity_of_its_action(file: Path) -> None:
+    readings = np.random.default_rng(0).normal(size=(20, 16))
+    alone = robot.Robot(str(file))
+    own = robot.Robot(str(file))
+    controller = make("go1gate", impl="c", num_envs=1, **RANGES).controller
+    for step, row in enumerate(readings):
+        action = alone.act(row[None], [step == 0])
+        velocity = own.velocity(row, starts=step == 0)
+        np.testing.assert_allclose(velocity, controller.change(action)[0], atol=1e-5)
+        back = controller.change(controller.action_of(velocity))
+        np.testing.assert_allclose(back, velocity, atol=1e-5)
+    np.testing.assert_allclose(own.speed, [1.2, 0.5, 0.5])
 
 
 @pytest.fixture(scope="module")
@@ -146,13 +161,14 @@ def world(file: Path) -> Any:
 
 def test_robots_act_in_real_time_beside_step_by_step(file: Path, tmp_path: Path, mqe: Any) -> None:
     words = f"eval go1gate --export {file} --real-time --episodes 2 --latency 0.1 --json"
-    sets = [f"--set={name}={value}" for name, value in SHORT.items()]
+    sets = ["--set=episode_length=1.0", "--set=collision_force=1e6"]
+    sets.append("--set=command_ranges={vx: [-0.5, 1.2]}")
     found = json.loads(mqe(words, *sets, "--log", tmp_path / "logs").out)
     assert found["episodes"] == 2 and found["latency"] == 0.1
     assert 0.0 <= found["rate"] <= 1.0 and 0.0 <= found["synchronous"] <= 1.0
     assert 0.1 < found["speed"] < 1.001 and found["delay"] >= 0.12 - 1e-6
-    for robot in range(2):
-        log = robot_log.load_log(tmp_path / "logs" / f"robot{robot}.csv")
+    for number in range(2):
+        log = robot_log.load_log(tmp_path / "logs" / f"robot{number}.csv")
         assert log["moving"].max() == 1.0 and np.abs(log["vx"]).max() > 0.0
 
 

@@ -290,6 +290,11 @@ class Eval(PolicyOptions):
             seed=self.seed,
             log=self.log,
         )
+        if result.speed < 0.95:
+            echo(
+                f"mqe: warning: the world ran at {result.speed:.2f} x real time: its robots had "
+                "more time to answer than in reality"
+            )
         if not self.json:
             print(result)
         return result.to_dict()

@@ -58,7 +58,7 @@ class Limits(NamedTuple):
     """Largest magnitudes of what is sent: forward, sideways, turning."""
 
     speed: Velocity = (1.0, 0.5, 0.5)  # m/s, m/s, rad/s
-    acceleration: Velocity = (20.0, 20.0, 40.0)  # m/s^2, m/s^2, rad/s^2
+    acceleration: Velocity = (50.0, 50.0, 100.0)  # m/s^2, m/s^2, rad/s^2
 
 
 def run(
