@@ -74,7 +74,7 @@ class Robot:
     @property
     def _commands(self) -> Mapping[str, np.ndarray]:
         if not self._velocity:
-            raise ValueError("velocity: the graph has none; its actions must be vx, vy, yaw_rate")
+            raise ValueError("velocity: the graph has none; export actions vx, vy, yaw_rate again")
         return self._velocity
 
     def act(self, readings: ArrayLike, starts: ArrayLike) -> np.ndarray:
