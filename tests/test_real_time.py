@@ -141,7 +141,7 @@ def test_a_robot_asks_for_the_velocity_of_its_action(file: Path) -> None:
     readings = np.random.default_rng(0).normal(size=(20, 16))
     alone = robot.Robot(str(file))
     own = robot.Robot(str(file))
-    controller = make("go1gate", impl="c", num_envs=1, **RANGES).controller
+    controller: Any = make("go1gate", impl="c", num_envs=1, **RANGES).controller
     for step, row in enumerate(readings):
         action = alone.act(row[None], [step == 0])
         velocity = own.velocity(row, starts=step == 0)
