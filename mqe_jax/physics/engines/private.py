@@ -226,12 +226,14 @@ def launch_step(m: Any, d: Any) -> None:
     _mujoco_warp().step(m, d)
 
 
-def launch_scene_step(m: Any, d: Any, ends: Any, kernels: Any, forced: bool) -> None:
+def launch_scene_step(
+    m: Any, d: Any, ends: Any, kernels: Any, forced: bool, solver: Any = None
+) -> None:
     """Launches a physics step of a scene of `warp_model.is_plain` in fewer kernels.
 
     Actuators are not read, but their forces `qfrc_actuator`. `forced` says whether `xfrc_applied`
     is read. `ends` are those of `warp_model.subtree_ends`, on the device; `kernels` is the module
-    `warp_kernels`.
+    `warp_kernels`. `solver` is a `warp_solver.Solver`, or None for MuJoCo Warp's.
     """
     launch = importlib.import_module("warp").launch
     smooth = warp_source("smooth")
@@ -265,8 +267,11 @@ def launch_scene_step(m: Any, d: Any, ends: Any, kernels: Any, forced: bool) -> 
     each(kernels.forces, m.nv, ends, m.dof_bodyid, *known, to=[d.qfrc_smooth])
     if forced:
         warp_source("support").xfrc_accumulate(m, d, d.qfrc_smooth)
-    smooth.factor_solve_i(m, d, d.M, d.qLD, d.qLDiagInv, d.qacc_smooth, d.qfrc_smooth)
-    warp_source("solver").solve(m, d)
+    if solver is None:
+        smooth.factor_solve_i(m, d, d.M, d.qLD, d.qLDiagInv, d.qacc_smooth, d.qfrc_smooth)
+        warp_source("solver").solve(m, d)
+    else:
+        solver.launch(m, d)
     if ~m.opt.disableflags & SENSORS:
         d.sensordata.zero_()
         warp_source("sensor").sensor_acc(m, d, skip_rne_postconstraint=True)

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import math
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
 _KERNELS = "mqe_jax.physics.engines.warp_kernels"  # imports Warp
+_SOLVER = "mqe_jax.physics.engines.warp_solver"
 _CHANGED = "qpos", "qvel", "qacc_warmstart", "time"
 _RESULTS = *_CHANGED, "sensordata", "overflow"
 
@@ -125,8 +127,13 @@ class _Stepper:
         return _Stepper, self._made  # a copy has its own arrays
 
     def bytes(self, count: int) -> int:
-        """Returns the bytes of the data of `count` environments."""
-        return private.warp_bytes(self.model, count, *self._made[3])
+        """Returns the bytes of the data and the solver of `count` environments."""
+        limits = self._made[3]
+        found = private.warp_bytes(self.model, count, *limits)
+        if warp_model.is_small(self.model):
+            shapes = importlib.import_module(_SOLVER).scratch(self.model.nv, limits[1])
+            found += 4 * count * sum(map(math.prod, shapes))
+        return found
 
     def retire(self) -> None:
         """Frees the arrays and the graphs that use them.
@@ -210,7 +217,7 @@ class _Stepper:
         step = private.launch_step
         if self.motors is not None:
             drive, clamp = arrays.motor_kernels(model, data, count)
-            step = arrays.scene_step("xfrc_applied" in call.read) or step
+            step = arrays.scene_step(count, "xfrc_applied" in call.read) or step
         unused = warp_model.unused_terms(self.model, call.fields)
         data.qfrc_passive.zero_()
         for left in reversed(range(call.num_substeps)):
@@ -235,6 +242,7 @@ class _Arrays:
         self.device = wp.device_from_jax(jax.local_devices()[0])
         self.data: dict[int, Any] = {}
         self._armature: dict[int, Any] = {}
+        self._solvers: dict[int, Any] = {}
         self._motors: list[Any] = []
         self._kernels: Any = importlib.import_module(_KERNELS)
         with wp.ScopedDevice(self.device):
@@ -257,14 +265,17 @@ class _Arrays:
         with wp.ScopedDevice(self.device):
             self._armature[count] = wp.zeros((count, self._model.nv), dtype=float)
             self.data[count] = private.warp_data(self._model, count, *limits)
+            if warp_model.is_small(self._model):
+                solver = importlib.import_module(_SOLVER).Solver
+                self._solvers[count] = solver(count, self._model.nv, limits[1])
         wp.synchronize_device(self.device)  # JAX's stream does not wait for Warp's
 
-    def scene_step(self, forced: bool) -> Callable[[Any, Any], None] | None:
+    def scene_step(self, count: int, forced: bool) -> Callable[[Any, Any], None] | None:
         """Returns what launches a physics step in few kernels; None if the model needs more."""
         if not warp_model.is_plain(self._model):
             return None
-        own = {"ends": self._ends, "kernels": self._kernels, "forced": forced}
-        return functools.partial(private.launch_scene_step, **own)
+        own = {"ends": self._ends, "kernels": self._kernels, "solver": self._solvers.get(count)}
+        return functools.partial(private.launch_scene_step, forced=forced, **own)
 
     def motor_kernels(
         self, model: Any, data: Any, count: int

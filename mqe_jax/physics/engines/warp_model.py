@@ -76,6 +76,14 @@ def is_plain(model: mujoco.MjModel) -> bool:
     return known and not any(absent) and not np.any(model.jnt_actfrclimited)
 
 
+def is_small(model: mujoco.MjModel) -> bool:
+    """Returns whether `warp_solver` computes the accelerations of a model."""
+    newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    pyramids = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    dense = model.opt.jacobian == _JACOBIAN.mjJAC_DENSE and model.nv <= _MAX_DENSE
+    return is_plain(model) and newton and pyramids and dense and not model.opt.noslip_iterations
+
+
 def subtree_ends(model: mujoco.MjModel) -> np.ndarray:
     """Returns the number after the last of each body and those below it (nbody,)."""
     ends = np.arange(1, model.nbody + 1)
