@@ -167,7 +167,8 @@ def make_learner(
             labels = moving(transitions.teacher_action) / config.action_scale
             batch = batch._replace(teacher_action=chunks(labels, network.chunk_length))
         carry = state.params, restart(state.optimizer, now.actor_begins), state.learning_rate
-        carry, loss_metrics = algorithm.update(carry, batch, now, epoch_key)
+        with jax.named_scope("learner"):
+            carry, loss_metrics = algorithm.update(carry, batch, now, epoch_key)
         params, optimizer_state, learning_rate = carry
         loss_metrics["learning_rate"] = learning_rate * now.learning_rate_factor
         obs_normalizer = state.obs_normalizer

@@ -91,16 +91,17 @@ def rollout(
         memory = reset_memory(state.memory, state.is_first)
         active = active_of(before)
         seen = observations(before).group(group)
-        obs, privileged = normalize_obs(
-            normalizer, seen, before.privileged_obs, active, normalize, features
-        )
-        action, log_prob, actor_memory = network.act(
-            network.policy_params(params), memory.actor, obs, key, active
-        )
-        not_first = jnp.zeros((1, *state.is_first.shape), bool)
-        _, critic_memory = network.value(
-            params, memory.critic, not_first, obs[None], privileged[None], active[None]
-        )
+        with jax.named_scope("policy"):
+            obs, privileged = normalize_obs(
+                normalizer, seen, before.privileged_obs, active, normalize, features
+            )
+            action, log_prob, actor_memory = network.act(
+                network.policy_params(params), memory.actor, obs, key, active
+            )
+            not_first = jnp.zeros((1, *state.is_first.shape), bool)
+            _, critic_memory = network.value(
+                params, memory.critic, not_first, obs[None], privileged[None], active[None]
+            )
         label = ()
         teacher_memory = ()
         if teacher is not None:
