@@ -20,6 +20,7 @@ from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.readings import Reading, Readings
 from mqe_jax.physics.robots.go1 import GO1
+from mqe_jax.selfplay import demonstrations
 from mqe_jax.selfplay.demonstrations import Demonstrated
 from mqe_jax.selfplay.opponents import Versus
 from mqe_jax.sensors.detections import Detections
@@ -98,10 +99,12 @@ class Recorder:
         return found
 
 
-@pytest.fixture
-def recorder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorder]:
-    yield Recorder(monkeypatch)
-    jax.clear_caches()  # of functions that were traced while recording
+@pytest.fixture(scope="module")
+def recorder() -> Iterator[Recorder]:
+    # of a precision of its own, so that JAX shares no trace with tests that do not record
+    with pytest.MonkeyPatch.context() as patch, jax.default_matmul_precision("highest"):
+        patch.setattr(demonstrations, "NUM_ENVS", 2)
+        yield Recorder(patch)
 
 
 def two_steps(batch: Any, agents: int, *leading: int) -> Callable[[jax.Array], Any]:
