@@ -123,8 +123,8 @@ def brax(its: Any, *task: Any, **settings: Any) -> float:
 def jaxmarl(its: Any, *task: Any, **settings: Any) -> float:
     env = its.Env(*task, **settings)
     key = jax.random.PRNGKey(0)
-    _, state = env.reset(key)
-    rewards = env.step_env(key, state, dict.fromkeys(env.agents, jnp.zeros(12)))[2]
+    _, state = jax.jit(env.reset)(key)
+    rewards = jax.jit(env.step_env)(key, state, dict.fromkeys(env.agents, jnp.zeros(12)))[2]
     return float(rewards["robot_0"])
 
 

@@ -281,14 +281,17 @@ def herding(robots: list[list[float]], sheep: list[list[float]]) -> dict[str, ja
     }
 
 
+plan = jax.jit(plan_sheep_hard)
+
+
 def test_the_robots_of_a_large_team_drive_sheep_whatever_their_order() -> None:
     random = np.random.default_rng(0)
     robots = random.uniform([0, -2.5], [7, 2.5], (5, 2))
     sheep = random.uniform([2, -2.5], [9, 2.5], (11, 2))
     order = np.array([3, 0, 4, 1, 2])
-    actions = plan_sheep_hard(herding(robots.tolist(), sheep.tolist()))
+    actions = plan(herding(robots.tolist(), sheep.tolist()))
     np.testing.assert_allclose(
-        plan_sheep_hard(herding(robots[order].tolist(), sheep.tolist())), actions[order], atol=1e-5
+        plan(herding(robots[order].tolist(), sheep.tolist())), actions[order], atol=1e-5
     )
     assert np.all(np.abs(actions) <= 1) and np.any(actions != 0)
 
@@ -298,9 +301,9 @@ def test_robots_brake_before_they_touch_what_they_drive() -> None:
     wall.
     """
     robots = [[2.0, 0.0], [2.7, 0.0], [5.0, 1.5], [8.1, 2.2]]
-    forward = plan_sheep_hard(herding(robots, [[5.4, 1.5], [8.2, 1.6], [7.0, -1.5]]))[:, 0]
+    forward = plan(herding(robots, [[5.4, 1.5], [8.2, 1.6], [7.0, -1.5]]))[:, 0]
     assert forward[0] <= 0 and forward[2] < 0 and forward[3] < 0
-    assert plan_sheep_hard(herding([[1.0, 0.0]], [[6.0, 0.0]]))[0, 0] > 0.4
+    assert plan(herding([[1.0, 0.0]], [[6.0, 0.0]]))[0, 0] > 0.4
 
 
 # -- episodes in which some robots and sheep take no part
@@ -371,7 +374,14 @@ def begun(task: str) -> Any:
         sheep = np.asarray(jax.vmap(env.herd.there)(states.data)).sum(axis=1)
         count = np.where(sheep == SMALL[task]["num_sheep"], count, 0)
     row = int(np.flatnonzero(count == SMALL[task]["num_agents"])[0])
-    return jax.tree.map(lambda x: x[row] if np.shape(x)[:1] == (40,) else x, states)
+    return at(row, states)
+
+
+def at(row: int, states: Any) -> Any:
+    """One of 40 states; NumPy indexes, for which JAX would compile a program per shape."""
+    return jax.tree.map(
+        lambda x: jnp.asarray(np.asarray(x)[row]) if np.shape(x)[:1] == (40,) else x, states
+    )
 
 
 def forged(env: Any, state: Any) -> Any:

@@ -46,7 +46,7 @@ def test_each_environment_keeps_the_values_of_its_condition_after_a_reset() -> N
     assert np.any(seen[0].payload[:, 7] != seen[-1].payload[:, 7])  # another episode
     clean = make("go1plane", impl="c", num_envs=16, **short)
     plain = dataclasses.replace(state, readings=())
-    known = np.asarray(jax.vmap(clean.with_observations)(plain).obs).reshape(2, 8, -1)
+    known = np.asarray(jax.jit(jax.vmap(clean.with_observations))(plain).obs).reshape(2, 8, -1)
     error = np.abs(np.asarray(state.obs).reshape(2, 8, -1) - known).max(axis=(0, 2))
     wrong = dict(zip(CONDITIONS, error > 1e-6, strict=True))
     assert {name for name, is_wrong in wrong.items() if is_wrong} == {
