@@ -3,6 +3,7 @@ endings, the defender's play.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -30,9 +31,19 @@ MATCHES = [name for name, task in TASKS.items() if issubclass(task, Match)]
 PI = np.pi
 
 
+@functools.cache
+def programs(env: Any) -> tuple[Any, Any]:
+    """Compiled: the result of a state, and the task's own state after a step."""
+
+    def verdict(state: State) -> Any:
+        return env.result(state, env.read(state.data), jnp.array(False))
+
+    return jax.jit(verdict), jax.jit(env.step_task)
+
+
 def result(env: Any, state: Any) -> tuple[float, float]:
     """Wins of both teams, as if the episode ended now."""
-    out = env.result(state, env.read(state.data), jnp.array(False))
+    out = programs(env)[0](state)
     assert out.result.sum(axis=1).tolist() == [1, 1]
     assert out.win.tolist() == out.loss[::-1].tolist() == out.success.tolist()
     return float(out.win[0]), float(out.win[1])
@@ -301,7 +312,6 @@ def test_robots_start_as_listed(task: str) -> None:
 # -- football
 
 
-NO = jnp.array(False)
 FOOTBALL = ("go1football-defender", "go1football-1vs1", "go1football-2vs2")
 
 
@@ -442,10 +452,10 @@ GOALS = {
 )
 def test_goals_at_both_ends(duel: Any, ball: tuple[float, float], goals: tuple[int, int]) -> None:
     state = with_ball(duel, initial(duel), ball)
-    robots = duel.read(state.data)
+    robots = moment(duel, state).robots
     np.testing.assert_array_equal(duel.leading(state, robots), np.array(goals, bool))
     assert bool(duel.ending(state, robots)) == any(goals)
-    outcome = duel.result(state, robots, NO)
+    outcome = programs(duel)[0](state)
     assert (
         outcome.win.tolist()
         == outcome.success.tolist()
@@ -563,10 +573,10 @@ def test_passes_and_goals_of_both(task: str, touching: tuple[int, ...]) -> None:
         ball = (12.1, 0.0) if robot == "goal" else (7.0, 0.0)
         after = with_ball(env, standing(env, state, places), ball, (speed, 0.0, 0.0))
         state = dataclasses.replace(
-            after, task=env.step_task(moment(env, state), moment(env, after))
+            after, task=programs(env)[1](moment(env, state), moment(env, after))
         )
     first, second, both = TOUCHES[touching]
-    outcome = env.result(state, env.read(state.data), NO)
+    outcome = programs(env)[0](state)
     assert float(outcome.further["both_touched"][0]) == both
     assert outcome.further["passes"].tolist() == (
         [first, second] if task == FOOTBALL[2] else [first]
