@@ -12,6 +12,7 @@ import shlex
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax import cli, names
+from mqe_jax.acting import evaluate
 from mqe_jax.acting.evaluate import Evaluator
 from mqe_jax.cli.arguments import COMMANDS, parse, take_imports
 from mqe_jax.core.settings import override
@@ -30,6 +32,8 @@ from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.registry import NAMED_SCRIPTED
 from mqe_jax.names import load_policy
 from mqe_jax.policies.scripted import scripted_policy
+from mqe_jax.runs import cast, playing
+from mqe_jax.train import monitor
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import NETWORKS
 from mqe_jax.walk.training import AGILE
@@ -127,14 +131,43 @@ def test_charts_show_the_published_data(
     )
 
 
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Trainings of two updates and episodes of 20 steps, of examples as a user writes them, in an
-    empty folder.
+MADE: dict[Any, Any] = {}
 
-    After the check of their settings they all have the same ones, so that pages share compiled
-    programs.
+
+def kept(make: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that returns what it made of the same arguments before, so that pages share
+    compiled programs.
     """
+
+    def call(*arguments: Any, **named: Any) -> Any:
+        every = *arguments, *sorted(named.items())
+        seen = [id(x) if hasattr(x, "reset") else repr(x) for x in every]
+        key = make, TASKS.get(str(arguments[0])), *seen
+        if key not in MADE:
+            MADE[key] = make(*arguments, **named), arguments  # the latter keep their ids
+        return MADE[key][0]
+
+    return call
+
+
+@pytest.fixture
+def small(shared_programs: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Trainings of two updates, evaluations of 8 episodes and episodes of 20 steps, of examples as
+    a user writes them, in an empty folder.
+
+    After the check of their settings trainings all have the same ones, and environments that are
+    made by name are made once, so that pages share compiled programs.
+    """
+    measure = mqe_jax.evaluate
+    monkeypatch.setattr(
+        mqe_jax, "evaluate", lambda *given, **named: measure(*given, **named | {"episodes": 8})
+    )
+    monkeypatch.setattr(names, "make", kept(names.make))
+    monkeypatch.setattr(VectorEnv, "with_groups", kept(VectorEnv.with_groups))
+    for module in (names, cast, playing):
+        monkeypatch.setattr(module, "VectorEnv", kept(VectorEnv))
+    for module in (evaluate, monitor):
+        monkeypatch.setattr(module, "Evaluator", kept(Evaluator))
     few: dict[str, Any] = {"num_envs": 8, "rollout_steps": 16, "total_steps": 256, "ppo.epochs": 1}
     few |= {"network": {"recurrent": False, "hidden_sizes": (8,)}}
     real = names.settings
