@@ -136,9 +136,9 @@ def newton(
             if j <= i:
                 total = m[env, j, i]
                 for row in range(rows):
-                    if slope[env, row] > 0.0:
-                        pair = jacobian[env, row, i] * jacobian[env, row, j]
-                        total += slope[env, row] * pair
+                    weight = slope[env, row] * jacobian[env, row, j]
+                    if weight != 0.0:
+                        total += weight * jacobian[env, row, i]
                 h[env, j, i] = total
         _wait()
         _factor(env, thread, size, h, inverse)
