@@ -50,9 +50,13 @@ def nudged(state: Any) -> Any:
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", SCENES)
 def test_steps_are_those_of_mjx(name: str) -> None:
-    """One step from each of 100 states, and 20 steps in a row."""
+    """One step from each of 100 states, and 20 steps in a row.
+
+    Four iterations of the solver, the default, do not always converge, which magnifies rounding.
+    """
     task, control, settings = SCENES[name]
-    envs = [make(task, impl=x, control=control, num_envs=COUNT, **settings) for x in IMPLS]
+    settings = {"control": control, "num_envs": COUNT, "solver_iterations": 20, **settings}
+    envs = [make(task, impl=x, **settings) for x in IMPLS]
     keys = jax.random.split(jax.random.PRNGKey(0), COUNT)
     mine, theirs = (jax.jit(jax.vmap(env.reset))(keys) for env in envs)
     step, reference = (jax.jit(jax.vmap(env.step)) for env in envs)
@@ -218,7 +222,8 @@ def test_other_models_have_their_own_step() -> None:
 def test_few_kernels_compute_the_same(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Robots that lie on their backs, and robots that stand."""
     count = 6
-    env = make(task, impl="warp", control="position", num_envs=count)
+    settings = {"control": "position", "num_envs": count, "solver_iterations": 20}
+    env = make(task, impl="warp", **settings)
     data = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), count)).data
     place = env.index.base_qpos[:, 2:]
     data = data.replace(qpos=data.qpos.at[:4, place].set(jnp.array([0.06, 0.0, 1.0, 0.0, 0.0])))
@@ -230,7 +235,7 @@ def test_few_kernels_compute_the_same(task: str, monkeypatch: pytest.MonkeyPatch
     few = after(True)
     many = after(False)
     assert np.abs(many.sensordata).max() > 20.0
-    for field, tolerance in (("qpos", 1e-5), ("qvel", 1e-3), ("sensordata", 0.1)):
+    for field, tolerance in (("qpos", 1e-6), ("qvel", 1e-4), ("sensordata", 0.01)):
         found = getattr(few, field)
         np.testing.assert_allclose(found, getattr(many, field), rtol=1e-3, atol=tolerance)
 

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp  # pyright: ignore[reportMissingImports]
 
 THREADS = 64
-SLOPE = 1e-5
+SLOPE = 1e-6
 """Share of its first slope at which the search along a step ends."""
 
 
