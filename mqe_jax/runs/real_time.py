@@ -133,7 +133,7 @@ def real_time(
     ):
         shown = bar.add_task(f"{world.env.name} in real time", total=episodes)
         course = world.play(robots, keys, report=lambda: bar.advance(shown))
-    delays = np.array(course.delays) * world.env.dt
+    delays = np.array(course.delays or [0]) * world.env.dt  # in an episode that ends at once
     late = delays > LATE * world.env.dt + latency + 1e-6
     return RealTime(
         task=world.env.name,
