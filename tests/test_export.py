@@ -83,7 +83,7 @@ def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: A
     properties = {entry.key: entry.value for entry in model.metadata_props}
     assert (properties["task"], properties["control"]) == ("go1pushbox", "command")
     assert properties["period_s"] == "0.02" and properties["opset"] == "17"
-    assert file.stat().st_size < 3.9e6  # weights that float16 represents are stored as such
+    assert file.stat().st_size < 4.0e6  # weights that float16 represents are stored as such
 
 
 def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() -> None:
