@@ -48,7 +48,7 @@ class SeesawParams(TaskParams):
     episode_length: TimeLimit = 10.0
     min_height: Coordinate = 0.08
     end_on_collision: bool = True
-    gait: str = "pace"
+    gait: str | None = "pace"
     track_width: Length = 3.0
     """Track width, m."""
     plank: Seesaw = Seesaw()
