@@ -33,6 +33,7 @@ MEASURES = {
     "evaluate": "mqe_jax.runs.playing:evaluate",
     "tournament": "mqe_jax.runs.playing:tournament",
     "exploitability": "mqe_jax.runs.exploiting:exploitability",
+    "stress": "mqe_jax.runs.stress:stress",
 }
 """Functions by the name in `measure`. Those with an argument `folder` get the measurement's
 folder."""
@@ -47,7 +48,7 @@ class Measurement:
     """
 
     measure: str
-    """What is called: evaluate, tournament or exploitability, as in `mqe_jax`."""
+    """What is called: evaluate, tournament, exploitability or stress, as in `mqe_jax`."""
     tasks: Annotated[tuple[str, ...], MinLen(1)]
     """Ids of the tasks."""
     arguments: Mapping[str, Any] = FrozenMapping()
@@ -79,6 +80,7 @@ def load(path: Path, part: str | None = None) -> Measurement:
 class Item(NamedTuple):
     """One measurement of a part."""
 
+    measure: str
     task: str
     variant: str
     arguments: dict[str, Any]
@@ -125,7 +127,7 @@ def plan(part: Measurement, folder: Path, impl: str = "auto") -> list[Item]:
                     f"an argument of {part.measure}: {', '.join(known)}",
                 )
             comes_from = provenance(measure=part.measure, arguments=arguments)
-            items.append(Item(task, variant, arguments, place / RESULT, comes_from))
+            items.append(Item(part.measure, task, variant, arguments, place / RESULT, comes_from))
     return items
 
 
@@ -196,22 +198,20 @@ def _for_robot(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
 def _rates(item: Item) -> list[dict[str, Any]]:
     """Returns the rates of an evaluation with their intervals, a row each; none without a
     result.
+
+    Of several evaluations, as those of `stress`, the variants are their names.
     """
-    result = item.result() or {}
+    found = item.result() or {}
+    every = found if item.measure == "stress" else {item.variant: found}
+    rows = []
     with parsing(item.file, "a result of lab.measure"):
-        about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions")}
-        return [
-            {
-                "task": item.task,
-                "variant": item.variant,
-                **about,
-                "rate": name,
-                "value": result[name],
-                "low": low,
-                "high": high,
-            }
-            for name, (low, high) in result.get("intervals", {}).items()
-        ]
+        for variant, result in every.items():
+            about = {name: result.get(name) or "" for name in ("opponent", "sides", "actions")}
+            about = {"task": item.task, "variant": variant, **about}
+            for name, (low, high) in result.get("intervals", {}).items():
+                values = {"rate": name, "value": result[name], "low": low, "high": high}
+                rows.append(about | values)
+    return rows
 
 
 def main() -> None:

@@ -320,7 +320,7 @@ class Eval(PolicyOptions):
         if folder.is_dir():
             save_figure(found.plot(), folder / "stress.png")
             echo(f"mqe: {folder / 'stress.png'} has the picture")
-        return {name: result.to_dict() for name, result in found.results.items()}
+        return found.to_dict()
 
     @contextlib.contextmanager
     def _robots(self) -> Iterator[dict[str, Any]]:

@@ -146,6 +146,10 @@ class Stress:
         alone = [name for name in rates if name not in ("usual", "everything")]
         return min(alone, key=lambda name: rates[name].value)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, of each condition those of `Result.to_dict`."""
+        return {name: result.to_dict() for name, result in self.results.items()}
+
     def __repr__(self) -> str:
         width = max(map(len, self.results))
         rows = [f"{name:{width}}  {rate.percent}" for name, rate in self.rates.items()]
