@@ -134,6 +134,8 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
         own = {name: value for name, value in own.items() if value != usual[name]}
         if needs.senses:
             own["senses"] = needs.senses
+        if "@" in own.get("robot", ""):  # of a file, which the training's settings name
+            own["robot"] = policy.config.env.get("robot", own["robot"])
         if needs.skill_weights:
             own["skill_weights"] = policy.config.env.get("skill_weights")
         params = own | {name: value for name, value in params.items() if value is not None}

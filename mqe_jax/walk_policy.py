@@ -33,7 +33,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.physics.robots.quadruped import NUM_JOINTS
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Command, Skill, register
 from mqe_jax.skills.weights import ASSETS, Networks, Params, layers  # noqa: F401
 

@@ -18,7 +18,7 @@ from mqe_jax.physics.robots import motors as motor
 from mqe_jax.physics.robots.build import build_robot
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.motors import Motors
-from mqe_jax.physics.robots.robot import JOINT_NAMES
+from mqe_jax.physics.robots.quadruped import JOINT_NAMES
 from mqe_jax.physics.scene import Scene, compile_scene
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track
 from tests.states import initial

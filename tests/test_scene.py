@@ -20,9 +20,9 @@ from mqe_jax.physics import robots
 from mqe_jax.physics.engines import c
 from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.go1 import GO1
-from mqe_jax.physics.robots.index import foot_positions, knee_positions
 from mqe_jax.physics.robots.motors import leg_response
-from mqe_jax.physics.robots.robot import LEGS, CollisionShape, Link, Robot, box, capsule, sphere
+from mqe_jax.physics.robots.quadruped import LEGS, CollisionShape
+from mqe_jax.physics.robots.robot import Link, Robot, box, capsule, sphere
 from mqe_jax.physics.scene import CompiledScene, Scene, compile_scene
 from mqe_jax.terrain import Plane, Track
 from tests.inputs import refuses
@@ -116,9 +116,9 @@ def test_closed_form_feet_are_where_mujoco_puts_them(name: str) -> None:
     mujoco.mj_kinematics(scene.model, data)
     geoms = [scene.model.geom(f"robot0/{leg}_foot").id for leg in LEGS]
     feet = data.geom_xpos[geoms] - [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(foot_positions(robot, jnp.asarray(joints)), feet, atol=1e-5)
+    np.testing.assert_allclose(robot.foot_positions(jnp.asarray(joints)), feet, atol=1e-5)
     knees = data.xpos[scene.index.bodies[0, 3::3]] - [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(knee_positions(robot, jnp.asarray(joints)), knees, atol=1e-5)
+    np.testing.assert_allclose(robot.knee_positions(jnp.asarray(joints)), knees, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.state import FINAL
 from mqe_jax.names import load_policy
 from mqe_jax.physics.robots.go1 import GO1
-from mqe_jax.physics.robots.robot import MIRROR
+from mqe_jax.physics.robots.quadruped import MIRROR
 from mqe_jax.sensors import Sensor, register
 from mqe_jax.sensors.depth import Depth
 from mqe_jax.sensors.detections import Detections

@@ -23,7 +23,7 @@ from mqe_jax.core.types import NetworkMemory
 from mqe_jax.physics import actuators
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.physics.robots.robot import JOINT_NAMES, MIRROR
+from mqe_jax.physics.robots.quadruped import JOINT_NAMES, MIRROR
 from mqe_jax.skills import agile
 from mqe_jax.train.learner import TrainState
 from mqe_jax.train.networks import EnvDims

@@ -11,6 +11,7 @@ import importlib
 import pickle
 import weakref
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ from mqe_jax.envs.registry import SHIPPED
 from mqe_jax.physics.engines import STATE_FIELDS, private, warp_model
 from mqe_jax.physics.engines.warp_engine import WarpEngine
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 COUNT = 10
 IMPLS = "warp", "warp-mjx"
 RANDOM = {
@@ -37,6 +39,7 @@ RANDOM = {
 SCENES: dict[str, tuple[str, str, Mapping[str, Any]]] = {
     "randomized": ("go1gate", "position", {"randomization": RANDOM, "joint_mechanics": True}),
     "torques": ("go1tug", "torque", {"robot": "go2"}),
+    "two legs": ("go1plane", "position", {"robot": str(EXAMPLES / "robots" / "biped.xml")}),
     "sparse solver": ("go1football-2vs2", "position", {"sparse_solver": True}),
 }
 
@@ -75,7 +78,7 @@ def test_steps_are_those_of_mjx(name: str) -> None:
                     np.asarray(getattr(x.data, field)) for x in (found, after, sensitive)
                 )
                 apart = np.abs(found_x - after_x).max()
-                assert apart <= max(tolerance, 2 * np.abs(sensitive_x - after_x).max())
+                assert apart <= max(tolerance, 3 * np.abs(sensitive_x - after_x).max())
             np.testing.assert_array_equal(found.metrics["overflow"], after.metrics["overflow"])
         if number < 20:
             alone = step(alone, action)

@@ -28,7 +28,12 @@ Long = Annotated[
     bool, tyro.conf.arg(help="Print everything; without it only what most readers need.")
 ]
 Seed = Annotated[settings.Seed, tyro.conf.arg(help="Random seed.")]
-Robot = Annotated[str, tyro.conf.arg(metavar="NAME", help="Robot: go1 or go2.")]
+Robot = Annotated[
+    str,
+    tyro.conf.arg(
+        metavar="NAME|FILE", help="Robot: go1, go2, an MJCF or YAML file, or menagerie:NAME."
+    ),
+]
 PolicyName = Annotated[str | None, tyro.conf.arg(metavar="NAME|RUN|FILE")]
 RobotFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 DumpDiverged = Annotated[
@@ -49,8 +54,9 @@ class TaskOptions:
     control: Annotated[str | None, tyro.conf.arg(metavar="MODE")] = None
     """Action mode: command (velocities for the walk policy), position (joint targets), torque.
     Default: command, or the run's mode."""
-    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Robot of the task: go1 or go2. Default: go1, or the run's robot."""
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Robot of the task: go1, go2, an MJCF or YAML file, or menagerie:NAME. Default: go1, or the
+    run's robot."""
     senses: Annotated[str | None, tyro.conf.arg(metavar="NAME|LIST")] = None
     """Sensors: onboard, full (none), or a list such as '[proprioception, lidar]'. Short for --set
     senses=VALUE; a training then reads them. Default: full, or those of the run."""

@@ -80,6 +80,6 @@ class SkillConvert:
             )
         check_output(self.output)
         params = convert(self.adaptation, self.body)
-        about = {"robot": robots.get(self.robot).name}
+        about = {"robot": robots.get(self.robot).identity}
         walk_policy.save_params(params, self.output, about, half=self.float16)
         echo(f"mqe: wrote {self.output}")

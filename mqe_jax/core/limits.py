@@ -79,6 +79,14 @@ DEPTH = 32  # nesting of settings
 YAML_BYTES = 2**17
 FILE_BYTES = 2**28  # of other files; of an archive, all members and all tensors
 CHECKPOINT_BYTES = 2**34
+MJCF_BYTES = 2**20  # of a file of an MJCF
+MJCF_FILES = 16  # that make an MJCF
+MJCF_ELEMENTS = 5000  # of an MJCF
+MJCF_DEPTH = 64  # of its elements within each other
+MESH_BYTES = 2**25  # of a mesh
+MESHES_BYTES = 2**27  # of all meshes of a robot
+ROBOT_BODIES = 256
+ROBOT_JOINTS = 64
 WEIGHT = 1e4  # magnitude of a policy's or a skill's weight; trained ones are below 10
 
 # -- memory, checked before it is allocated

@@ -78,7 +78,7 @@ def make(
         InputError: for an unknown task, engine, mode or parameter, or a value that is not allowed.
     """
     cls = TASKS[task_id(task)]
-    return cls(override(cls.Params(), overrides), impl=impl, control=control, num_envs=num_envs)
+    return cls(cls.Params().changed(overrides), impl=impl, control=control, num_envs=num_envs)
 
 
 __all__ = [

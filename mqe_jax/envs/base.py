@@ -26,7 +26,7 @@ from mqe_jax.core.files import digest
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, check_signatures, results, weights_of
-from mqe_jax.core.settings import Parameters, check, checked, differences, fail, override
+from mqe_jax.core.settings import Parameters, check, checked, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.assembly import make_controller, make_scene
 from mqe_jax.envs.observation import ObservationLayout, finite
@@ -139,6 +139,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         reads["skill_weights"] = self.controller.skill_params is not None
         files = {name: getattr(self.params, name) for name, read in reads.items() if read}
         self.digests = {name: digest(file) for name, file in files.items() if file}
+        if self.robot.digest:
+            self.digests["robot"] = self.robot.digest
         self.check_senses()
         self.sizes = Sizes(self)
         self.randomizer = Randomizer(
@@ -237,7 +239,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         """
         others = {name: value for name, value in params.items() if name != "control"}
         control = params.get("control", self.control)
-        wanted = override(self.params, others)
+        wanted = self.params.changed(others)
         arguments: dict[str, Any] = {}
         if wanted != self.params:
             arguments["params"] = wanted

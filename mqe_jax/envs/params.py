@@ -1,7 +1,7 @@
 """Parameters common to all tasks."""
 
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from mqe_jax.core.limits import (
     Velocity,
     bounds,
 )
-from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, settings_class
+from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, override, settings_class
 from mqe_jax.envs.randomization import NamedRandomization, Randomization
 from mqe_jax.physics import robots
 from mqe_jax.sensors.suite import Senses
@@ -50,7 +50,8 @@ class TaskParams:
     """Curriculum: agents first learn in small teams. At `State.assistance` 1 only the fewest robots
     or sheep are drawn; the highest number grows linearly to all at assistance 0."""
     robot: str = "go1"
-    """Name of the robot, such as go1 or go2 (`mqe_jax.physics.robots`)."""
+    """Robot: go1, go2, or another registered name; an MJCF, or a YAML that names one; or
+    menagerie:NAME."""
     episode_length: TimeLimit = 10.0
     """Time limit, s, rounded to environment steps (0.02 s)."""
     spawn_height: Length = 0.42
@@ -130,6 +131,10 @@ class TaskParams:
     """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at
     assistance 1."""
 
+    follows: ClassVar[Mapping[str, str]] = {"spawn_height": "height", "min_height": "height"}
+    """Parameters whose defaults follow the robot's body, with a field of `Proportions`. Heights
+    are above `ground`."""
+
     def __post_init__(self) -> None:
         commander = self.commander
         commander.skill.check_commands(commander.commands)
@@ -148,6 +153,41 @@ class TaskParams:
         """Height of the surface on which robots start, m."""
         return 0.0
 
+    @classmethod
+    def suited(cls, robot: str) -> Self:
+        """Returns the defaults for a robot, of which those in `follows` follow its body.
+
+        InputError as of `mqe_jax.physics.robots.get`.
+        """
+        usual = cls()
+        proportions = robots.get(robot).proportions
+        changes: dict[str, Any] = {"robot": robot}
+        for name, size in cls.follows.items():
+            base = usual.ground if size == "height" else 0.0
+            value = getattr(usual, name)
+            if value > base:
+                factor = getattr(proportions, size)
+                changes[name] = value if factor == 1 else base + (value - base) * factor
+        return override(usual, changes)
+
+    def changed(self, changes: Mapping[str, Any]) -> Self:
+        """Returns the parameters with changes by name.
+
+        With another robot, values in `follows` that are the defaults become those of that robot,
+        unless they are among the changes.
+        """
+        robot = changes.get("robot", self.robot)
+        if robot == self.robot or not isinstance(robot, str):
+            return override(self, changes)
+        before = self.suited(self.robot)
+        after = self.suited(robot)
+        follow = {
+            name: getattr(after, name)
+            for name in self.follows
+            if getattr(self, name) == getattr(before, name)
+        }
+        return override(self, {**follow, **changes})
+
     @property
     def commander(self) -> Commander:
         """What actions mean with control `command`."""
@@ -164,7 +204,7 @@ class TaskParams:
 
     def actions(self, control: str) -> dict[str, Any]:
         """Returns what an agent's actions mean in a control mode, by names of parameters."""
-        meaning: dict[str, Any] = {"robot": self.robot, "control": control}
+        meaning: dict[str, Any] = {"robot": robots.get(self.robot).identity, "control": control}
         if control == "command":
             gait = self.gait or next(iter(self.commander.skill.gaits), None)
             ranges = self.action_ranges()

@@ -54,6 +54,7 @@ class PrivilegedObservation:
         own_qvel = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)
         self._qpos = np.setdiff1d(np.arange(model.nq), own_qpos)
         self._qvel = np.setdiff1d(np.arange(model.nv), own_qvel)
+        touching = 1 + index.foot_force.shape[1]
         clock = "of each robot's skill; walk policy: sine and cosine"
         forces = "on each robot's trunk and feet, N"
         blocks: list[Block] = []
@@ -69,7 +70,7 @@ class PrivilegedObservation:
             Block("motor_strength", count, "factor on each robot's torques"),
             Block("action_lag", 1, "environment steps"),
             Block("gait_phase", clock_size * count, clock),
-            Block("contact_force", 5 * count if contact_forces else 0, forces),
+            Block("contact_force", touching * count if contact_forces else 0, forces),
         ]
         self.layout = ObservationLayout(tuple(block for block in blocks if block.width))
 

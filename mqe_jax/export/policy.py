@@ -155,7 +155,7 @@ def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
         "opset": str(OPSET),
         "task": env.name,
         "control": env.control,
-        "robot": env.robot.name,
+        "robot": env.robot.identity,
         "period_s": f"{env.dt:g}",
         "group": policy.needs.group,
         "observation": json.dumps(layout),

@@ -51,7 +51,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
         "task": env.name,
         "title": env.heading,
         "aim": env.aim,
-        "robot": env.robot.name,
+        "robot": env.robot.identity,
         "mujoco": mujoco.__version__,
         "dt": env.dt,
         "substeps": env.physics.num_substeps,

@@ -23,7 +23,7 @@ from mqe_jax import names
 from mqe_jax.acting.seats import Policy
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import write_atomically
-from mqe_jax.core.settings import fail, override
+from mqe_jax.core.settings import fail
 from mqe_jax.envs import SCRIPTED, TASKS, QuadrupedEnv
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.export.check import verify
@@ -190,7 +190,7 @@ def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
     Policies and keys choose one of them.
     """
     settings = {name: value for name, value in params.items() if name != "control"}
-    plain = override(TASKS[task].Params(), settings)
+    plain = TASKS[task].Params().changed(settings)
     known = [command.name for command in AgileSkill.commands]
     shipped = plain.skill in ("walk", "agile") and not plain.skill_weights
     if not shipped or not {*plain.commands} <= {*known}:

@@ -182,7 +182,7 @@ class SensedScene:
         """
         own = _planar(robots.position_w, robots.quaternion)
         every = jnp.concatenate([own, *self._entities(data, anchors)])
-        hips = float(np.hypot(*self.compiled.robot.leg_root))
+        hips = self.compiled.robot.radius
         circles = dict.fromkeys(range(self.num_robots), hips)
         circles |= {row: shape.radius for row, shape in self._circles.items()}
         radii = np.array([*circles.values()], np.float32)[:, None]

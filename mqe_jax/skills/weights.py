@@ -22,6 +22,7 @@ import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import check_locks, linear_layers, read_tensors, write_atomically
+from mqe_jax.physics.robots.quadruped import JOINTS, NUM_JOINTS
 from mqe_jax.physics.robots.robot import Robot
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
@@ -36,6 +37,15 @@ def layers(
         x = x if name == "0" else jax.nn.elu(x)
         x = jnp.matmul(x, params[name]["weight"].T, precision=precision) + params[name]["bias"]
     return x
+
+
+def check_legs(skill: str, robot: Robot) -> None:
+    """Raises an InputError unless a robot has the legs for which skills are trained."""
+    if (robot.num_joints, robot.limb) != (NUM_JOINTS, len(JOINTS)):
+        raise InputError(
+            f"skill: {skill!r} needs four legs of three joints; {robot.name} has "
+            f"{robot.num_joints} joints otherwise; use control 'position' or 'torque'"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,9 +103,10 @@ class Networks:
         Raises:
             InputError: if the file is missing, damaged, or holds other names or shapes.
         """
+        check_legs(self.skill, robot)
         shipped = ASSETS / f"{self.skill}_{robot.walk.weights}.safetensors"
         file = shipped if path is None else pathlib.Path(path)
-        train = f"train it with 'mqe skill train {self.skill} --robot {robot.name}'"
+        train = f"train it with 'mqe skill train {self.skill} --robot {robot.call}'"
         if not file.is_file() and path is None:
             raise InputError(
                 f"{self.title}: no weights are shipped for {robot.name} (assets/{file.name}); "

@@ -37,7 +37,7 @@ class Needs:
     version: PositiveInt | None = None
     """Version of the task."""
     robot: str | None = None
-    """Name of the robot."""
+    """Name of the robot, and the digest of its files if it was read from any."""
     control: str | None = None
     """Action mode."""
     skill: str | tuple[str, ...] | None = None

@@ -14,13 +14,15 @@ import numpy as np
 
 from mqe_jax import walk_policy
 from mqe_jax.core import keys
+from mqe_jax.core.settings import override
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.reward import weigh
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.physics.robots.index import Proprioception, RobotState, foot_positions
-from mqe_jax.physics.robots.robot import NUM_JOINTS, Robot
+from mqe_jax.physics.robots.index import Proprioception, RobotState
+from mqe_jax.physics.robots.quadruped import NUM_JOINTS
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.rotation import quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import Plane, Track
@@ -71,14 +73,14 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         self.name = skill  # pyright: ignore[reportAttributeAccessIssue]
         self.skill = self.trainee.skill
         lagged = dataclasses.replace(RANDOMIZATION, action_lag=self.task.action_lag)
-        params = WalkParams(
-            robot=robot.name,
-            skill=skill,
-            episode_length=self.task.episode_length,
-            solver_iterations=self.task.solver_iterations,
-            randomization=lagged if self.task.randomize else Randomization(),
-            walk=self.task,
-        )
+        changes = {
+            "skill": skill,
+            "episode_length": self.task.episode_length,
+            "solver_iterations": self.task.solver_iterations,
+            "randomization": lagged if self.task.randomize else Randomization(),
+            "walk": self.task,
+        }
+        params = override(WalkParams.suited(robot.call), changes)
         super().__init__(params, impl=impl, control="position", num_envs=num_envs)
         self.skill.check_period(self.compiled.scene.timestep, self.physics.num_substeps)
 
@@ -293,7 +295,7 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         height = robot_state.position_w[0, 2:]
         feet = rotate(
             jnp.broadcast_to(quaternion, (4, 4)),
-            foot_positions(self.robot, robot_state.joint_position[0]),
+            self.robot.foot_positions(robot_state.joint_position[0]),
         )
         phases = self.trainee.foot_phases(walk.gait, walk.spec.commands)
         optional = {}

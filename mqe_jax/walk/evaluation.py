@@ -17,7 +17,7 @@ from mqe_jax.core.limits import Environments, Seed
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import checked
 from mqe_jax.physics import robots
-from mqe_jax.physics.robots.index import Proprioception, foot_positions
+from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.rotation import rotate
 from mqe_jax.skills.weights import Params
@@ -209,7 +209,7 @@ def _run(
         state = env.with_observations(env.advance(state, memory.action[None]))
         after = env.read(state.data)
         turn = jnp.broadcast_to(after.quaternion[0], (4, 4))
-        feet = rotate(turn, foot_positions(env.robot, after.joint_position[0]))
+        feet = rotate(turn, env.robot.foot_positions(after.joint_position[0]))
         height = feet[:, 2] + after.position_w[0, 2]
         velocity, yaw_rate = heading_velocity(after)
         errors = jnp.append(velocity[:2], yaw_rate) - commands[:3]
@@ -288,7 +288,7 @@ def evaluate_skill(
     Args:
         skill: name of the skill: walk or agile.
         weights: file of the weights. Default: the shipped ones.
-        robot: name of the robot.
+        robot: name or file of the robot.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         episodes: episodes of each scenario, run in parallel.
         seed: random seed.
@@ -315,7 +315,7 @@ def evaluate_skill(
     keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
     return {
         "skill": skill,
-        "robot": body.name,
+        "robot": body.identity,
         "impl": env.impl,
         "episodes": episodes,
         **{key: flat[key] for key in keys if key in flat},

@@ -30,7 +30,8 @@ from mqe_jax.core.limits import Horizon, NonNegative
 from mqe_jax.core.settings import FileName, fail, settings_class
 from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.physics import robots
-from mqe_jax.physics.robots.robot import MIRROR, NUM_JOINTS, Mirror
+from mqe_jax.physics.robots.quadruped import MIRROR, NUM_JOINTS
+from mqe_jax.physics.robots.robot import Mirror
 from mqe_jax.skills import agile
 from mqe_jax.skills.weights import Networks
 from mqe_jax.train import nn

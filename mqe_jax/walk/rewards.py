@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from mqe_jax.core.settings import settings_class
-from mqe_jax.physics.robots.index import RobotState, foot_positions, knee_positions
+from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.rotation import (
     euler_to_quaternion,
@@ -96,8 +96,7 @@ def reward_terms(
     velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
     rate = robot_state.angular_velocity_b[0]
 
-    locate_feet = functools.partial(foot_positions, robot)
-    feet, feet_velocity = jax.jvp(locate_feet, (joint_position,), (joint_velocity,))
+    feet, feet_velocity = jax.jvp(robot.foot_positions, (joint_position,), (joint_velocity,))
     feet_velocity = feet_velocity + velocity_b + jnp.cross(rate, feet)
     turn = jnp.broadcast_to(quaternion, (4, 4))
     feet_w = rotate(turn, feet)
@@ -130,7 +129,7 @@ def reward_terms(
     margin = 0.05 * (robot.joint_upper - robot.joint_lower)
     beyond = jnp.maximum(joint_position - robot.joint_upper + margin, 0)
     beyond += jnp.maximum(robot.joint_lower + margin - joint_position, 0)
-    knees = rotate(turn, knee_positions(robot, joint_position))[:, 2] + height
+    knees = rotate(turn, robot.knee_positions(joint_position))[:, 2] + height
     kneeling = jnp.maximum(robot.walk.min_knee_height - knees, 0.0) > 0
     foot_speed = jnp.sum(jnp.square(feet_velocity), axis=-1)
     foot_speed_xy = jnp.sum(jnp.square(feet_velocity[:, :2]), axis=-1)

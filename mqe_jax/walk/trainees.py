@@ -12,6 +12,7 @@ from mqe_jax.core.errors import known_name
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Skill, agile
+from mqe_jax.skills.weights import check_legs
 from mqe_jax.walk_policy import WalkMemory, WalkPolicy
 
 VELOCITY = ("vx", "vy", "yaw_rate")
@@ -132,6 +133,9 @@ TRAINEES: dict[str, type[Trainee]] = {"walk": Walk, "agile": Agile}
 def make(name: str, robot: Robot) -> Trainee:
     """Returns a skill of a robot to train.
 
-    InputError for a name that is not in `TRAINEES`.
+    InputError for a name that is not in `TRAINEES`, and for a robot without four legs of three
+    joints.
     """
-    return TRAINEES[known_name("skill: cannot be trained:", name, TRAINEES)](robot)
+    trainee = TRAINEES[known_name("skill: cannot be trained:", name, TRAINEES)]
+    check_legs(name, robot)
+    return trainee(robot)

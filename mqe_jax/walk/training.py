@@ -105,7 +105,7 @@ def train_skill(
         run_dir: run folder; every checkpoint writes SKILL.safetensors (float16) into it.
         config: settings. Default: those of `SETTINGS`.
         task: parameters of the walking task. Default: those of `SETTINGS`.
-        robot: name of the robot.
+        robot: name or file of the robot.
         weights: weights to start from; may be those of another robot. Default: from scratch.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.
         resume: whether to continue from the newest checkpoint in the folder, with environments
@@ -137,7 +137,7 @@ def train_skill(
             return
         updates = int(row["updates"])
         if updates % config.checkpoint.every == 0 or updates == config.num_updates:
-            about = {"robot": body.name, "env_steps": int(row["env_steps"])}
+            about = {"robot": body.identity, "env_steps": int(row["env_steps"])}
             file = run_dir / f"{skill}.safetensors"
             network.form.networks.save(state.params["policy"], file, about, half=True)
 

@@ -248,12 +248,15 @@ class _Arrays:
         with wp.ScopedDevice(self.device):
             self.model = private.warp_model(model, sparse=sparse)
             if motors is not None:
+                self._limb = len(motors.response)
                 self._motors = [
                     wp.array(motors.constants, dtype=float),
                     wp.array(motors.joint_qpos, dtype=int),
                     wp.array(motors.joint_qvel, dtype=int),
                     float(motors.timestep),
-                    wp.mat33(motors.timestep * motors.response),
+                    wp.types.matrix(motors.response.shape, float)(
+                        motors.timestep * motors.response
+                    ),
                 ]
             self._ends = wp.array(warp_model.subtree_ends(model), dtype=int)
 
@@ -298,8 +301,8 @@ class _Arrays:
         state = [data.qpos, data.qvel]
         drive = functools.partial(
             wp.launch,
-            self._kernels.drive,
-            dim=(count, joints // self._kernels.JOINTS),
+            self._kernels.driver(self._limb),
+            dim=(count, joints // self._limb),
             inputs=[*self._motors, *given],
             outputs=[*state, data.ctrl, data.qfrc_actuator, model.dof_armature],
         )

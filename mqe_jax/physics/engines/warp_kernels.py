@@ -4,13 +4,14 @@ MuJoCo Warp sums over the bodies below another in a kernel for each level of the
 sum is a loop, since their numbers are consecutive.
 """
 
+import functools
+
 import mujoco
 import warp as wp  # pyright: ignore[reportMissingImports]
 
 from mqe_jax.physics.engines import private
 from mqe_jax.physics.robots import motors
 
-JOINTS = 3  # of a leg
 # Columns of `Motors.constants`.
 SPEED = wp.constant(0)
 TORQUE = wp.constant(1)
@@ -79,70 +80,81 @@ def clamp(
     _clamp(joint, env, constants, angles, speeds, timestep, qpos, qvel)
 
 
-@wp.kernel(enable_backward=False)
-def drive(
-    constants: wp.array2d[float],
-    angles: wp.array[int],
-    speeds: wp.array[int],
-    timestep: float,
-    kick: wp.mat33,  # speeds that unit torques of a leg add in a physics step
-    gainprm: wp.array2d[Ten],
-    biasprm: wp.array2d[Ten],
-    base: wp.array2d[float],
-    asked: wp.array2d[float],
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    ctrl: wp.array2d[float],
-    torques: wp.array2d[float],
-    armature: wp.array2d[float],
-):
-    """Sets what a leg gets in a physics step, by `Motors.limit` after `Motors.clamp`."""
-    env, leg = wp.tid()
-    effort = wp.vec3()
-    given = wp.vec3()
-    pace = wp.vec3()
-    for i in range(JOINTS):
-        joint = leg * JOINTS + i
-        _clamp(joint, env, constants, angles, speeds, timestep, qpos, qvel)
-        position = qpos[env, angles[joint]]
-        velocity = qvel[env, speeds[joint]]
-        gain = gainprm[env % gainprm.shape[0], joint]
-        bias = biasprm[env % biasprm.shape[0], joint]
-        torque = constants[joint, TORQUE]
-        pace[i] = wp.abs(velocity)
-        below = constants[joint, SPEED] - pace[i]
-        steepest = wp.min(constants[joint, LINE] * below, constants[joint, BRAKE] * below)
-        most = wp.max(wp.min(steepest, torque), -torque)
-        sign = wp.where(velocity < 0.0, -1.0, 1.0)
-        wanted = asked[env, joint]
-        force = gain[0] * wanted + bias[0] + bias[1] * position + bias[2] * velocity
-        found = sign * wp.min(wp.max(sign * force, -torque), most)
-        limited = wanted + (found - force) / wp.where(gain[0] == 0.0, 1.0, gain[0])
-        ctrl[env, joint] = limited
-        limited = gain[0] * limited + bias[0] + bias[1] * position + bias[2] * velocity
-        torques[env, speeds[joint]] = wp.clamp(limited, -torque, torque)
-        effort[i] = wp.abs(found)
-        given[i] = found * sign
+@functools.cache
+def driver(joints: int):
+    """Returns the kernel `drive` for limbs of a number of joints.
 
-    added = effort @ kick
-    fastest = wp.max(wp.max(pace[0], pace[1]), pace[2])
-    near = (fastest / constants[leg * JOINTS, LEG_SPEED] - SLOW) / (FAST - SLOW)
-    near = wp.clamp(near, 0.0, 1.0)
-    for i in range(JOINTS):
-        joint = leg * JOINTS + i
-        speed = constants[joint, SPEED]
-        full = constants[joint, FULL]
-        reach = (pace[i] + added[i]) / speed
-        beyond = wp.min(constants[joint, NEEDED] * (reach - 1.0), full)
-        needed = wp.where(reach > REACH, beyond, 0.0)
-        if constants[joint, STEEP] > 0.0:
-            slope = constants[joint, LINE]
-            line = slope * (speed + wp.where(given[i] < 0.0, pace[i], -pace[i]))
-            share = wp.min(effort[i] / wp.max(line, ROUNDING), 1.0)
-            inertia = constants[joint, INERTIA]
-            needed = wp.max(share * (inertia + timestep * slope) - inertia, 0.0)
-        dof = speeds[joint]
-        armature[env, dof] = base[env % base.shape[0], dof] + wp.max(near * full, needed)
+    Its `kick` are the speeds that unit torques of a limb add in a physics step.
+    """
+    Row = wp.types.vector(length=joints, dtype=float)
+    Square = wp.types.matrix(shape=(joints, joints), dtype=float)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def drive(
+        constants: wp.array2d[float],
+        angles: wp.array[int],
+        speeds: wp.array[int],
+        timestep: float,
+        kick: Square,  # pyright: ignore[reportInvalidTypeForm]
+        gainprm: wp.array2d[Ten],
+        biasprm: wp.array2d[Ten],
+        base: wp.array2d[float],
+        asked: wp.array2d[float],
+        qpos: wp.array2d[float],
+        qvel: wp.array2d[float],
+        ctrl: wp.array2d[float],
+        torques: wp.array2d[float],
+        armature: wp.array2d[float],
+    ):
+        """Sets what a limb gets in a physics step, by `Motors.limit` after `Motors.clamp`."""
+        env, limb = wp.tid()
+        effort = Row()
+        given = Row()
+        pace = Row()
+        for i in range(joints):
+            joint = limb * joints + i
+            _clamp(joint, env, constants, angles, speeds, timestep, qpos, qvel)
+            position = qpos[env, angles[joint]]
+            velocity = qvel[env, speeds[joint]]
+            gain = gainprm[env % gainprm.shape[0], joint]
+            bias = biasprm[env % biasprm.shape[0], joint]
+            torque = constants[joint, TORQUE]
+            pace[i] = wp.abs(velocity)
+            below = constants[joint, SPEED] - pace[i]
+            steepest = wp.min(constants[joint, LINE] * below, constants[joint, BRAKE] * below)
+            most = wp.max(wp.min(steepest, torque), -torque)
+            sign = wp.where(velocity < 0.0, -1.0, 1.0)
+            wanted = asked[env, joint]
+            force = gain[0] * wanted + bias[0] + bias[1] * position + bias[2] * velocity
+            found = sign * wp.min(wp.max(sign * force, -torque), most)
+            limited = wanted + (found - force) / wp.where(gain[0] == 0.0, 1.0, gain[0])
+            ctrl[env, joint] = limited
+            limited = gain[0] * limited + bias[0] + bias[1] * position + bias[2] * velocity
+            torques[env, speeds[joint]] = wp.clamp(limited, -torque, torque)
+            effort[i] = wp.abs(found)
+            given[i] = found * sign
+
+        added = effort @ kick
+        fastest = wp.max(pace)
+        near = (fastest / constants[limb * joints, LEG_SPEED] - SLOW) / (FAST - SLOW)
+        near = wp.clamp(near, 0.0, 1.0)
+        for i in range(joints):
+            joint = limb * joints + i
+            speed = constants[joint, SPEED]
+            full = constants[joint, FULL]
+            reach = (pace[i] + added[i]) / speed
+            beyond = wp.min(constants[joint, NEEDED] * (reach - 1.0), full)
+            needed = wp.where(reach > REACH, beyond, 0.0)
+            if constants[joint, STEEP] > 0.0:
+                slope = constants[joint, LINE]
+                line = slope * (speed + wp.where(given[i] < 0.0, pace[i], -pace[i]))
+                share = wp.min(effort[i] / wp.max(line, ROUNDING), 1.0)
+                inertia = constants[joint, INERTIA]
+                needed = wp.max(share * (inertia + timestep * slope) - inertia, 0.0)
+            dof = speeds[joint]
+            armature[env, dof] = base[env % base.shape[0], dof] + wp.max(near * full, needed)
+
+    return drive
 
 
 @wp.kernel(enable_backward=False)

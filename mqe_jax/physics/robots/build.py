@@ -7,7 +7,7 @@ import numpy as np
 
 from mqe_jax.physics.appearance import HIDDEN_GROUP, ROBOT_COLORS, VISUAL_GROUP, bodies
 from mqe_jax.physics.collision import robot_bits
-from mqe_jax.physics.robots.robot import JOINT_NAMES, JOINTS, LEGS, Link, Primitive, Robot
+from mqe_jax.physics.robots.robot import Hinge, Link, Primitive, Robot, parts_of
 
 _GEOM_TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -34,25 +34,22 @@ def _add_inertial(body: Any, link: Link) -> None:
     body.fullinertia = link.inertia
 
 
-def _add_geom(body: Any, primitive: Primitive, left: int, **properties: Any) -> None:
-    """Adds a primitive to the body of a link, with y negated if `left` is -1."""
-    x, y, z = primitive.position
-    place: dict[str, Any] = {"pos": (x, left * y, z)}
+def _add_geom(spec: Any, body: Any, primitive: Primitive, **properties: Any) -> None:
+    """Adds a primitive or a mesh to a body."""
+    place: dict[str, Any] = {"pos": primitive.position, "quat": primitive.quaternion}
     if primitive.end is not None:
-        end_x, end_y, end_z = primitive.end
-        place = {"fromto": (x, left * y, z, end_x, left * end_y, end_z)}
+        place = {"fromto": (*primitive.position, *primitive.end)}
+    if primitive.mesh is not None:
+        mesh = spec.add_mesh(
+            name=f"mesh{len(spec.meshes)}",
+            uservert=primitive.mesh.vertices.ravel(),
+            userface=primitive.mesh.faces.ravel(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **place, **properties)
+        return
     size = (*np.atleast_1d(primitive.size), 0.0, 0.0)[:3]
     body.add_geom(type=_GEOM_TYPES[primitive.kind], size=size, mass=0.0, **place, **properties)
-
-
-def _back(robot: Robot) -> float:
-    """Returns the height of the highest visual shape of the trunk above the trunk's origin, m."""
-
-    def top(shape: Primitive) -> float:
-        end = shape.end or shape.position
-        return max(shape.position[2], end[2]) + np.atleast_1d(shape.size)[-1]
-
-    return max(top(shape.primitive) for shape in robot.visuals if shape.link == "trunk")
 
 
 def build_robot(
@@ -74,19 +71,26 @@ def build_robot(
     m) instead of joint targets (rad). If `numbered`, the index + 1 is on its back.
     """
     agent_color = ROBOT_COLORS[(number if color is None else color) % len(ROBOT_COLORS)]
-    shapes = robot.shapes(contacts)
+    parts = parts_of(contacts)
     contype, conaffinity = robot_bits(number)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-
-    def add_shapes(body: Any, link: str, leg: str, left: int) -> None:
-        for shape in shapes:
-            if shape.link == link:
+    made = {"": spec.worldbody}
+    for part in robot.tree:
+        body = made[part.parent].add_body(name=part.name, pos=part.position, quat=part.quaternion)
+        made[part.name] = body
+        _add_inertial(body, part.link)
+        if not part.parent:
+            body.add_freejoint(name="base")
+        for hinge in part.hinges:
+            _add_hinge(body, robot, hinge, joint_mechanics)
+        for shape in part.shapes:
+            if not parts or shape.part in parts:
                 _add_geom(
+                    spec,
                     body,
                     shape.primitive,
-                    left,
-                    name=f"{leg}{shape.name}",
+                    name=shape.name,
                     contype=contype,
                     conaffinity=conaffinity,
                     group=HIDDEN_GROUP,
@@ -98,58 +102,21 @@ def build_robot(
                     margin=MARGIN,
                     rgba=(0.9, 0.3, 0.3, 0.4),
                 )
-        for visual_shape in robot.visuals if visual else ():
-            if visual_shape.link == link:
-                for side in (left, -left) if visual_shape.both else (left,):
-                    _add_geom(
-                        body,
-                        visual_shape.primitive,
-                        side,
-                        contype=0,
-                        conaffinity=0,
-                        rgba=visual_shape.mix_color(agent_color),
-                        group=VISUAL_GROUP,
-                    )
-
-    trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, robot.stand_height))
-    trunk.add_freejoint(name="base")
-    _add_inertial(trunk, robot.trunk)
-    add_shapes(trunk, "trunk", "", 1)
-    if visual and numbered:
-        bodies.back_number(trunk, number + 1, _back(robot))
-    for leg in LEGS:
-        front = 1 if leg[0] == "F" else -1
-        left = 1 if leg[1] == "L" else -1
-        root = (front * robot.leg_root[0], left * robot.leg_root[1], 0.0)
-        hip = trunk.add_body(name=f"{leg}_hip", pos=root)
-        _add_inertial(hip, robot.hip.reflect(front, left))
-        thigh = hip.add_body(name=f"{leg}_thigh", pos=(0.0, left * robot.hip_length, 0.0))
-        _add_inertial(thigh, robot.thigh.reflect(1, left))
-        calf = thigh.add_body(name=f"{leg}_calf", pos=(0.0, 0.0, -robot.thigh_length))
-        _add_inertial(calf, robot.calf.reflect(1, left))
-        axes = ((1, 0, 0), (0, 1, 0), (0, 1, 0))
-        for body, joint, axis in zip((hip, thigh, calf), JOINTS, axes, strict=True):
-            index = JOINT_NAMES.index(f"{leg}_{joint}")
-            hinge = body.add_joint(
-                name=f"{leg}_{joint}",
-                type=mujoco.mjtJoint.mjJNT_HINGE,
-                axis=axis,
-                limited=True,
-                range=(robot.joint_lower[index], robot.joint_upper[index]),
-                margin=robot.joint_margin,
-                solref_limit=SOLREF,
+        for look in part.looks if visual else ():
+            _add_geom(
+                spec,
+                body,
+                look.primitive,
+                contype=0,
+                conaffinity=0,
+                rgba=look.mix_color(agent_color),
+                group=VISUAL_GROUP,
             )
-            if joint_mechanics:
-                hinge.armature = robot.rotor_inertia[index]
-                hinge.damping[0] = robot.joint_damping[index]  # of the speed, not its powers
-                hinge.frictionloss = robot.friction_loss[index]
-            add_shapes(body, joint, f"{leg}_", left)
-    gain = robot.kp
-    bias = (0.0, -robot.kp, -robot.kd)
-    if torque_control:
-        gain = 1.0
-        bias = (0.0, 0.0, 0.0)
-    for name, limit in zip(JOINT_NAMES, robot.torque_limit, strict=True):
+        if visual and numbered and not part.parent:
+            back = max(look.primitive.top for look in part.looks)
+            bodies.back_number(body, number + 1, back)
+    for i, name in enumerate(robot.joint_names):
+        limit = robot.torque_limit[i]
         actuator = spec.add_actuator(
             name=name,
             target=name,
@@ -159,6 +126,24 @@ def build_robot(
             forcelimited=True,
             forcerange=(-limit, limit),
         )
-        actuator.gainprm[0] = gain
-        actuator.biasprm[:3] = bias
+        actuator.gainprm[0] = 1.0 if torque_control else robot.kp
+        actuator.biasprm[:3] = (0.0, 0.0, 0.0) if torque_control else (0.0, -robot.kp, -robot.kd)
     return spec
+
+
+def _add_hinge(body: Any, robot: Robot, hinge: Hinge, mechanics: bool) -> None:
+    index = robot.joint_names.index(hinge.name)
+    added = body.add_joint(
+        name=hinge.name,
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=hinge.axis,
+        pos=hinge.position,
+        limited=True,
+        range=(robot.joint_lower[index], robot.joint_upper[index]),
+        margin=robot.joint_margin,
+        solref_limit=SOLREF,
+    )
+    if mechanics:
+        added.armature = robot.rotor_inertia[index]
+        added.damping[0] = robot.joint_damping[index]  # of the speed, not its powers
+        added.frictionloss = robot.friction_loss[index]

@@ -12,11 +12,9 @@ zero at 30.
 
 import numpy as np
 
+from mqe_jax.physics.robots.quadruped import CollisionShape, Quadruped, VisualShape
 from mqe_jax.physics.robots.robot import (
-    CollisionShape,
     Link,
-    Robot,
-    VisualShape,
     WalkSettings,
     box,
     capsule,
@@ -88,7 +86,7 @@ _VISUALS = (
     VisualShape("calf", sphere(0.021, (0, 0, -0.213)), _BLACK),
 )
 
-GO1 = Robot(
+GO1 = Quadruped(
     name="go1",
     title="Unitree Go1",
     trunk=Link(4.8, (0.0116, 0.0044, 0.0001), (0.01613, 0.03651, 0.04469, 0.00059, 7.3e-6, 2.1e-5)),

@@ -10,11 +10,9 @@ and damping: kp 30 (Go1: 20) and kd 0.75 (Go1: 0.5). Torques reach the motors' l
 
 import numpy as np
 
+from mqe_jax.physics.robots.quadruped import CollisionShape, Quadruped, VisualShape
 from mqe_jax.physics.robots.robot import (
-    CollisionShape,
     Link,
-    Robot,
-    VisualShape,
     WalkSettings,
     box,
     capsule,
@@ -86,7 +84,7 @@ _VISUALS = (
     VisualShape("calf", sphere(0.023, _FOOT), _BLACK),
 )
 
-GO2 = Robot(
+GO2 = Quadruped(
     name="go2",
     title="Unitree Go2",
     trunk=Link.from_principal(

@@ -1,4 +1,4 @@
-"""Index tables of a scene's robots, their state after a step, and kinematics of the legs."""
+"""Index tables of a scene's robots, and their state after a step."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.physics.robots.robot import NUM_LEGS, Robot
+from mqe_jax.physics.robots.robot import FOOT, TRUNK, Robot, parts_of
 from mqe_jax.physics.rotation import quaternion_to_euler, rotate_inverse
 
 
@@ -19,17 +19,17 @@ class RobotIndex:
 
     base_qpos: np.ndarray  # addresses of (position 3, quaternion wxyz 4) in qpos (R, 7)
     base_qvel: np.ndarray  # addresses of (linear 3 world, angular 3 body) in qvel (R, 6)
-    joint_qpos: np.ndarray  # joint angles in qpos (R, 12)
-    joint_qvel: np.ndarray  # joint velocities in qvel (R, 12)
-    actuator: np.ndarray  # rows of ctrl (R, 12)
+    joint_qpos: np.ndarray  # joint angles in qpos (R, J)
+    joint_qvel: np.ndarray  # joint velocities in qvel (R, J)
+    actuator: np.ndarray  # rows of ctrl (R, J)
     trunk_body: np.ndarray  # trunk body ids (R,)
-    bodies: np.ndarray  # all body ids of each robot (R, 13)
+    bodies: np.ndarray  # all body ids of each robot (R, B)
     geoms: np.ndarray  # collision geom ids of each robot (R, G)
     trunk_force: np.ndarray
     """Addresses in sensordata of the strongest contact force on each of the trunk's T collision
     geoms (R, T, 3), contact frame, N."""
     foot_force: np.ndarray
-    """Addresses of each foot's strongest contact force (R, 4, 3), contact frame, N; (0, 4, 3)
+    """Addresses of each foot's strongest contact force (R, F, 3), contact frame, N; (0, F, 3)
     unless the scene has foot sensors."""
 
     @property
@@ -59,15 +59,11 @@ def trunk_bodies(model: mujoco.MjModel) -> list[int]:
     """Returns the body ids of the robots' trunks in a scene's model, in the order of the robots."""
     found: list[int] = []
     while True:
-        name = f"{prefix(len(found))}trunk"
+        name = prefix(len(found)) + TRUNK
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         if body < 0:
             return found
         found.append(body)
-
-
-def _geom_names(robot: Robot, part: str) -> list[str]:
-    return [name for shape in robot.shapes() if shape.part == part for name in shape.geom_names]
 
 
 def add_sensors(spec: mujoco.MjSpec, robots: Sequence[Robot], *, feet: bool = False) -> None:
@@ -76,10 +72,7 @@ def add_sensors(spec: mujoco.MjSpec, robots: Sequence[Robot], *, feet: bool = Fa
     All engines support them.
     """
     for number, robot in enumerate(robots):
-        names = _geom_names(robot, "trunk")
-        if feet:
-            names += _geom_names(robot, "foot")
-        for name in names:
+        for name in robot.geom_names(TRUNK) + (robot.geom_names(FOOT) if feet else ()):
             spec.add_sensor(
                 name=f"{prefix(number)}{name}_force",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -99,7 +92,7 @@ def index_robots(
 ) -> RobotIndex:
     """Builds the index tables of a compiled model's robots by looking up names."""
     numbers = range(num_robots)
-    geom_names = [name for shape in robot.shapes(contacts) for name in shape.geom_names]
+    soles = robot.geom_names(FOOT)
     bases = [model.joint(prefix(i) + "base") for i in numbers]
 
     def table(lookup: Callable[[str], Any], names: Sequence[str]) -> np.ndarray:
@@ -114,13 +107,11 @@ def index_robots(
         joint_qpos=table(lambda name: model.joint(name).qposadr[0], robot.joint_names),
         joint_qvel=table(lambda name: model.joint(name).dofadr[0], robot.joint_names),
         actuator=table(lambda name: model.actuator(name).id, robot.joint_names),
-        trunk_body=table(lambda name: model.body(name).id, ["trunk"])[:, 0],
-        bodies=table(lambda name: model.body(name).id, ["trunk", *robot.joint_names]),
-        geoms=table(lambda name: model.geom(name).id, geom_names),
-        trunk_force=force(_geom_names(robot, "trunk")),
-        foot_force=(
-            force(_geom_names(robot, "foot")) if feet else np.zeros((0, NUM_LEGS, 3), np.int32)
-        ),
+        trunk_body=table(lambda name: model.body(name).id, [TRUNK])[:, 0],
+        bodies=table(lambda name: model.body(name).id, robot.body_names),
+        geoms=table(lambda name: model.geom(name).id, robot.geom_names(*parts_of(contacts))),
+        trunk_force=force(robot.geom_names(TRUNK)),
+        foot_force=force(soles) if feet else np.zeros((0, len(soles), 3), np.int32),
     )
 
 
@@ -128,8 +119,8 @@ class Proprioception(NamedTuple):
     """What a skill senses of one robot."""
 
     gravity_b: jax.Array  # unit gravity vector in the trunk frame (3,)
-    joint_position: jax.Array  # joint angles (12,), rad
-    joint_velocity: jax.Array  # joint velocities (12,), rad/s
+    joint_position: jax.Array  # joint angles (J,), rad
+    joint_velocity: jax.Array  # joint velocities (J,), rad/s
 
 
 @jax.tree_util.register_dataclass
@@ -141,8 +132,8 @@ class RobotState:
     quaternion: jax.Array  # trunk orientation, wxyz (R, 4)
     linear_velocity_w: jax.Array  # of the trunk origin in the environment frame (R, 3), m/s
     angular_velocity_b: jax.Array  # angular velocity of the trunk in its own frame (R, 3), rad/s
-    joint_position: jax.Array  # joint angles (R, 12), rad
-    joint_velocity: jax.Array  # joint velocities (R, 12), rad/s
+    joint_position: jax.Array  # joint angles (R, J), rad
+    joint_velocity: jax.Array  # joint velocities (R, J), rad/s
     trunk_force: jax.Array  # strongest contact force on the trunk (R,), N
     active: jax.Array  # robots that take part (R,) bool; the others count nowhere
 
@@ -199,38 +190,3 @@ def read_robots(
         trunk_force=jnp.max(trunk_forces, axis=-1),
         active=takes_part,
     )
-
-
-def foot_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
-    """Computes the feet's centres (..., 4, 3), m, in the trunk frame.
-
-    The joint angles are (..., 12), rad.
-    """
-    return _leg_points(robot, joint_position, robot.foot_position)
-
-
-def knee_positions(robot: Robot, joint_position: jax.Array) -> jax.Array:
-    """Computes the knees (calf joints) (..., 4, 3), m, in the trunk frame.
-
-    The joint angles are (..., 12), rad.
-    """
-    return _leg_points(robot, joint_position, (0.0, 0.0))
-
-
-def _leg_points(robot: Robot, joint_position: jax.Array, point: tuple[float, float]) -> jax.Array:
-    """Computes a point (x, z) of each calf frame, m, in the trunk frame (..., 4, 3), m."""
-    angles = joint_position.reshape(*joint_position.shape[:-1], NUM_LEGS, 3)
-    hip, thigh, calf = jnp.moveaxis(angles, -1, 0)
-    front = jnp.array([1.0, 1.0, -1.0, -1.0])
-    left = jnp.array([1.0, -1.0, 1.0, -1.0])
-    ahead, up = point
-    x = -robot.thigh_length * jnp.sin(thigh) + up * jnp.sin(thigh + calf)
-    z = -robot.thigh_length * jnp.cos(thigh) + up * jnp.cos(thigh + calf)
-    if ahead:
-        x += ahead * jnp.cos(thigh + calf)
-        z -= ahead * jnp.sin(thigh + calf)
-    y = left * robot.hip_length
-    x_trunk = front * robot.leg_root[0] + x
-    y_trunk = left * robot.leg_root[1] + y * jnp.cos(hip) - z * jnp.sin(hip)
-    z_trunk = y * jnp.sin(hip) + z * jnp.cos(hip)
-    return jnp.stack([x_trunk, y_trunk, z_trunk], axis=-1)

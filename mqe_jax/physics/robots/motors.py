@@ -34,35 +34,38 @@ REACH = 1.25
 GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
 STEEP = 2.0
 """Timestep x slope of the torque line / inertia above which explicit integration is unstable."""
+UNLIMITED = 1e6  # rad/s, the speed limit of motors without one
 CLAMP = 1.09  # greatest share of the speed limit after a physics step
 ROUNDING = 1e-5  # relative margin that covers the rounding of single precision
 
 
 @functools.cache
 def leg_response(robot: Robot) -> np.ndarray:
-    """Returns the accelerations of a leg's joints per torque (3, 3), 1/(kg m^2).
+    """Returns the accelerations of the first limb's joints per torque (L, L), 1/(kg m^2).
 
-    They are magnitudes, in the default pose.
+    They are magnitudes, in the default pose. L is `Robot.limb`.
     """
     model = build_robot(robot, 0, visual=False).compile()
     data = mujoco.MjData(model)
     matrix = np.zeros((model.nv, model.nv))
-    data.qpos[7:] = robot.default_joints
+    joints = [model.joint(name) for name in robot.joint_names]
+    data.qpos[[joint.qposadr[0] for joint in joints]] = robot.default_joints
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, matrix)
-    return np.abs(np.linalg.inv(matrix)[6:9, 6:9])
+    limb = [joint.dofadr[0] for joint in joints[: robot.limb]]
+    return np.abs(np.linalg.inv(matrix)[np.ix_(limb, limb)])
 
 
 @dataclasses.dataclass(frozen=True)
 class Motors:
-    """The motors of R robots of one type in a compiled scene, J = 12 R joints."""
+    """The motors of R robots of one type in a compiled scene, all J joints."""
 
     joint_qpos: np.ndarray  # joint angles in qpos (J,)
     joint_qvel: np.ndarray  # joint velocities in qvel (J,)
     speed: np.ndarray  # speed limits V (J,), rad/s
     torque: np.ndarray  # torque limits of the controller L (J,), N m
     stall: np.ndarray  # stall torques S (J,), N m
-    response: np.ndarray  # accelerations of a leg's joints per torque (3, 3), 1/(kg m^2)
+    response: np.ndarray  # accelerations of a limb's joints per torque (L, L), 1/(kg m^2)
     timestep: float  # physics step, s
 
     @classmethod
@@ -79,7 +82,7 @@ class Motors:
         return cls(
             joint_qpos=index.joint_qpos.ravel(),
             joint_qvel=index.joint_qvel.ravel(),
-            speed=per_joint(robot.joint_speed_limit),
+            speed=per_joint(np.minimum(robot.joint_speed_limit, UNLIMITED)),
             torque=per_joint(robot.torque_limit),
             stall=per_joint(robot.stall_torque),
             response=leg_response(robot).astype(np.float32),
@@ -151,7 +154,7 @@ class Motors:
         `pace` and `effort` are magnitudes of speeds and torques, `against` says which are opposed.
         """
         size = len(self.response)
-        fastest = xp.maximum(xp.maximum(pace[..., 0::size], pace[..., 1::size]), pace[..., 2::size])
+        fastest = functools.reduce(xp.maximum, [pace[..., i::size] for i in range(size)])
         near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
         reach = (pace + self._kick(xp, effort)) / self.speed
         if xp is np and near.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
@@ -235,7 +238,7 @@ class Motors:
 
     @functools.cached_property
     def _leg_speed(self) -> np.ndarray:
-        """Lowest speed limit of each leg (..., J / 3), rad/s."""
+        """Lowest speed limit of each leg (..., J / L), rad/s."""
         return self.speed.reshape(*self.speed.shape[:-1], -1, len(self.response)).min(axis=-1)
 
     @functools.cached_property

@@ -1,36 +1,32 @@
-"""The `Robot` type: an immutable description of a quadruped with twelve joints.
+"""The `Robot` type: an immutable description of a robot with a free base and J joints.
 
-All values are in SI units (metre, kilogram, second, radian, newton). Link frames have x forward, y
-left and z up at zero joint angles. Legs are ordered FL, FR, RL, RR and joints hip, thigh, calf
-everywhere in this package. One leg is described, the front left; the others are its mirror images.
+All values are in SI units (metre, kilogram, second, radian, newton). The trunk's frame has x
+forward, y left and z up. `mqe_jax.physics.robots.quadruped` describes one by the links of a leg,
+`mqe_jax.physics.robots.mjcf` reads one from an MJCF; both fill the same body tree.
 """
 
 import dataclasses
 import functools
-from collections import Counter
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.physics.appearance import Color, mix
 
-LEGS = ("FL", "FR", "RL", "RR")
-JOINTS = ("hip", "thigh", "calf")
-NUM_LEGS = len(LEGS)
-NUM_JOINTS = NUM_LEGS * len(JOINTS)
-JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
-LINKS = ("trunk", *JOINTS)
-# Body parts of collision shapes.
-PARTS = ("trunk", "hip", "thigh", "calf", "foot")
-
-# Sets of collision shapes: the whole body, or only trunk and feet.
-CONTACTS: dict[str, tuple[str, ...]] = {"full": PARTS, "minimal": ("trunk", "foot")}
+TRUNK = "trunk"
+"""Name of the first body, and part of its collision shapes."""
+FOOT = "foot"
+"""Part of the feet's collision shapes."""
+CONTACTS = ("full", "minimal")
+"""Sets of collision shapes: the whole body, or only trunk and feet."""
 
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 
 
 class Mirror(NamedTuple):
@@ -44,13 +40,6 @@ class Mirror(NamedTuple):
     def reflect(self, values: jax.Array) -> jax.Array:
         """Returns reflected values (..., n)."""
         return values[..., self.source] * self.sign
-
-
-MIRROR = Mirror(
-    source=np.arange(NUM_JOINTS).reshape(NUM_LEGS, -1)[[1, 0, 3, 2]].ravel(),
-    sign=np.tile(np.array([-1.0, 1.0, 1.0], np.float32), NUM_LEGS),
-)
-"""The reflection of a quadruped's joints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,17 +100,47 @@ def _six(tensor: np.ndarray) -> tuple[float, float, float, float, float, float]:
     return xx, yy, zz, xy, xz, yz
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mesh:
+    """The surface of a mesh in its own frame."""
+
+    vertices: np.ndarray
+    """Vertices (V, 3), m."""
+    faces: np.ndarray
+    """Indices of the vertices of its triangles (F, 3)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """A primitive in a link frame; on the right legs y is negated."""
+    """A primitive in a link frame, or a mesh, which is only drawn."""
 
-    kind: Literal["sphere", "capsule", "cylinder", "box", "ellipsoid"]
+    kind: Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
     size: float | Vector
     """Radius of a sphere, capsule or cylinder; half-lengths (3,) of a box or ellipsoid, m."""
     position: Vector = (0.0, 0.0, 0.0)
     """Centre, or first end of a capsule's or cylinder's axis, m."""
     end: Vector | None = None
     """Second end of the axis, m; None for the other kinds."""
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """Orientation, wxyz, of the kinds without an axis."""
+    mesh: Mesh | None = None
+    """Surface of a mesh."""
+
+    def reflect(self) -> "Primitive":
+        """Returns a primitive without orientation with y negated."""
+        end = None if self.end is None else (self.end[0], -1 * self.end[1], self.end[2])
+        x, y, z = self.position
+        return dataclasses.replace(self, position=(x, -1 * y, z), end=end)
+
+    @property
+    def top(self) -> float:
+        """Height of its highest point above the link's origin, m; exact if it is upright."""
+        if self.mesh is not None:
+            rows = np.zeros(9)
+            mujoco.mju_quat2Mat(rows, np.array(self.quaternion))
+            return float((self.mesh.vertices @ rows[6:]).max()) + self.position[2]
+        end = self.end or self.position
+        return max(self.position[2], end[2]) + float(np.atleast_1d(self.size)[-1])
 
 
 sphere = functools.partial(Primitive, "sphere")
@@ -131,61 +150,68 @@ box = functools.partial(Primitive, "box")
 ellipsoid = functools.partial(Primitive, "ellipsoid")
 
 
-@dataclasses.dataclass(frozen=True)
-class CollisionShape:
-    """A collision shape: one geom on the trunk, or one on each leg."""
+class Hinge(NamedTuple):
+    """A hinge of a body, in the body's frame."""
 
+    name: str
+    axis: Vector
+    position: Vector = (0.0, 0.0, 0.0)
+    """A point of the axis, m."""
+
+
+class Proportions(NamedTuple):
+    """Sizes of a robot's body, as factors on those of the Go1."""
+
+    height: float = 1.0
+    """Of the standing trunk."""
+    width: float = 1.0
+    """Of all of the body."""
+    length: float = 1.0
+    """Likewise."""
+    mass: float = 1.0
+
+
+class Shape(NamedTuple):
+    """A collision shape of a body."""
+
+    name: str
+    """Unique in the robot."""
     part: str
-    """Part that the shape belongs to: one of `PARTS`."""
+    """`TRUNK`, `FOOT`, or any other text."""
     primitive: Primitive
-    """Its geometry, in the frame of `link`."""
-    name: str = ""
-    """Unique in the robot; the part's name if empty. A leg's shapes are called `FL_<name>` and so
-    on."""
-
-    def __post_init__(self) -> None:
-        if self.part not in PARTS:
-            raise InputError(
-                f"CollisionShape.part: unknown part {self.part!r}; allowed: {', '.join(PARTS)}"
-            )
-        if not self.name:
-            object.__setattr__(self, "name", self.part)
-
-    @property
-    def link(self) -> str:
-        """Link of the shape: the calf of a foot."""
-        return "calf" if self.part == "foot" else self.part
-
-    @property
-    def geom_names(self) -> tuple[str, ...]:
-        """Names of its geoms in the model of one robot, without the robot's prefix."""
-        return (self.name,) if self.part == "trunk" else tuple(f"{leg}_{self.name}" for leg in LEGS)
 
 
-@dataclasses.dataclass(frozen=True)
-class VisualShape:
-    """A massless, non-colliding shape for rendering."""
+class Look(NamedTuple):
+    """A massless, non-colliding shape of a body for rendering."""
 
-    link: str
-    """Link that the shape is fixed to: trunk, hip, thigh or calf."""
     primitive: Primitive
-    """Its geometry, in the frame of `link`."""
-    color: Color = (0.0, 0.0, 0.0, 1.0)
+    color: Color
     """Base colour."""
     tint: float = 0.0
     """Fraction of the agent's colour mixed into the base colour, in [0, 1]."""
-    both: bool = False
-    """Whether its mirror image is on the right side of the trunk too."""
-
-    def __post_init__(self) -> None:
-        if self.link not in LINKS:
-            raise InputError(
-                f"VisualShape.link: unknown link {self.link!r}; allowed: {', '.join(LINKS)}"
-            )
 
     def mix_color(self, agent_color: Color) -> Color:
         """Returns the base colour mixed with the agent's colour."""
         return mix(self.color, agent_color, self.tint)
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """A rigid body of a robot, in the frame of its parent at zero joint angles."""
+
+    name: str
+    """Unique in the robot; that of the first is `TRUNK`."""
+    parent: str
+    """Name of a body before it; empty for the first."""
+    position: Vector
+    """Origin, m."""
+    link: Link
+    hinges: tuple[Hinge, ...] = ()
+    """Its joints, which turn it in this order; the trunk has none."""
+    shapes: tuple[Shape, ...] = ()
+    looks: tuple[Look, ...] = ()
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """Orientation, wxyz."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,9 +233,9 @@ class WalkSettings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Robot:
-    """A quadruped; make a variant with `dataclasses.replace`.
+    """A robot; make a variant with `dataclasses.replace`.
 
-    Arrays (12,) are in the order of `joint_names`.
+    Arrays (J,) are in the order of `joint_names`.
 
     Example:
         ```python
@@ -219,46 +245,30 @@ class Robot:
         ```
     """
 
+    _: dataclasses.KW_ONLY
     name: str
     """Short name, as in the registry."""
     title: str
     """Full name."""
-    trunk: Link
-    hip: Link
-    """The front left hip; y is mirrored for the right legs, x for the rear ones."""
-    thigh: Link
-    """The front left thigh; y is mirrored for the right legs."""
-    calf: Link
-    """The front left calf with its foot; y is mirrored for the right legs."""
-    leg_root: tuple[float, float]
-    """Hip joint of the front left leg in the trunk frame (x, y), m."""
-    hip_length: float
-    """Distance from hip joint to thigh joint, outward, m."""
-    thigh_length: float
-    """Distance from thigh joint to calf joint, downward, m."""
-    foot_position: tuple[float, float]
-    """Centre of the foot in the calf frame (x, z), m."""
-    foot_radius: float
-    """Radius of the foot, m."""
     default_joints: np.ndarray
-    """Default joint angles: the targets of zero joint actions (12,), rad."""
+    """Default joint angles: the targets of zero joint actions (J,), rad."""
     joint_lower: np.ndarray
-    """Lower joint limits (12,), rad."""
+    """Lower joint limits (J,), rad."""
     joint_upper: np.ndarray
-    """Upper joint limits (12,), rad."""
+    """Upper joint limits (J,), rad."""
     joint_speed_limit: np.ndarray
-    """Speed limits of the motors (12,), rad/s (`mqe_jax.physics.robots.motors`)."""
+    """Speed limits of the motors (J,), rad/s (`mqe_jax.physics.robots.motors`)."""
     torque_limit: np.ndarray
-    """Torque limits of the controller (12,), N m."""
+    """Torque limits of the controller (J,), N m."""
     stall_torque: np.ndarray
-    """Torques of the motors at rest (12,), N m; they fall linearly to zero at the speed limit."""
+    """Torques of the motors at rest (J,), N m; they fall linearly to zero at the speed limit."""
     rotor_inertia: np.ndarray
-    """Inertia of the rotors at the joints (12,), kg m^2; simulated where `joint_mechanics` is
+    """Inertia of the rotors at the joints (J,), kg m^2; simulated where `joint_mechanics` is
     set."""
     joint_damping: np.ndarray
-    """Viscous friction of the joints (12,), N m s/rad; likewise."""
+    """Viscous friction of the joints (J,), N m s/rad; likewise."""
     friction_loss: np.ndarray
-    """Dry friction of the joints (12,), N m; likewise."""
+    """Dry friction of the joints (J,), N m; likewise."""
     joint_margin: float
     """Distance before a joint limit at which its constraint begins, rad: a joint at its motor's
     speed limit passes the limit by up to 0.25 rad within a physics step. A stiffer constraint needs
@@ -268,13 +278,19 @@ class Robot:
     kd: float
     """Derivative gain, N m s/rad."""
     action_scale: np.ndarray
-    """Scale of joint actions (12,), rad: joint target = default + scale x action."""
+    """Scale of joint actions (J,), rad: joint target = default + scale x action."""
+    foot_radius: float
+    """Radius of the foot, m."""
     stand_height: float
     """Height of the trunk origin at the default angles, m; the walk policy's target at a zero
     height command."""
-    collision: tuple[CollisionShape, ...]
-    visuals: tuple[VisualShape, ...]
     walk: WalkSettings
+    digest: str = ""
+    """SHA-256 of the files that the robot was read from; empty without any."""
+    source: str = ""
+    """File that the robot was read from; empty without one."""
+    notes: tuple[str, ...] = ()
+    """What its files leave open, and what is used instead, a line each."""
 
     def __post_init__(self) -> None:
         for name in (field.name for field in dataclasses.fields(self) if field.type is np.ndarray):
@@ -291,18 +307,51 @@ class Robot:
             raise InputError(
                 f"Robot.default_joints: {self.default_joints} must lie between the joint limits"
             )
-        counts = Counter(shape.name for shape in self.collision)
-        repeated = [name for name, count in counts.items() if count > 1]
-        if repeated:
-            raise InputError(f"Robot.collision: duplicate names {', '.join(repeated)}")
-        parts = [shape.part for shape in self.collision]
-        if parts.count("foot") != 1 or "trunk" not in parts:
-            raise InputError("Robot.collision: needs one foot shape and at least one trunk shape")
+
+    # Defined by each kind:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints, in the order of all arrays."""
-        return JOINT_NAMES
+        raise NotImplementedError
+
+    @property
+    def tree(self) -> tuple[Body, ...]:
+        """Its bodies, each after its parent; the first is the trunk."""
+        raise NotImplementedError
+
+    @property
+    def mirror(self) -> Mirror:
+        """The reflection of left and right."""
+        raise NotImplementedError
+
+    @property
+    def limb(self) -> int:
+        """Number of joints of each limb, if all limbs are alike and follow each other.
+
+        Otherwise J.
+        """
+        raise NotImplementedError
+
+    @property
+    def radius(self) -> float:
+        """Radius about the trunk's origin of the circle that stands for the robot to sensors, m."""
+        raise NotImplementedError
+
+    def foot_positions(self, joint_position: jax.Array) -> jax.Array:
+        """Computes the feet's centres (..., F, 3), m, in the trunk frame, of angles (..., J)."""
+        raise NotImplementedError
+
+    def knee_positions(self, joint_position: jax.Array) -> jax.Array:
+        """Computes the origins (..., F, 3) of the bodies that the last joint of a leg moves."""
+        raise NotImplementedError
+
+    @property
+    def proportions(self) -> Proportions:
+        """Sizes that tasks and the training of skills follow; those shipped are as the Go1."""
+        return Proportions()
+
+    # Common to all:
 
     @property
     def num_joints(self) -> int:
@@ -310,19 +359,38 @@ class Robot:
         return len(self.joint_names)
 
     @property
-    def mirror(self) -> Mirror:
-        """The reflection of left and right."""
-        return MIRROR
+    def call(self) -> str:
+        """What the parameter `robot` accepts for it: its file, or its name."""
+        return self.source or self.name
+
+    @property
+    def identity(self) -> str:
+        """Its name, and the digest of its files if it was read from any."""
+        return f"{self.name}@{self.digest[:16]}" if self.digest else self.name
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of its bodies, the trunk first."""
+        return tuple(body.name for body in self.tree)
+
+    def geom_names(self, *parts: str) -> tuple[str, ...]:
+        """Returns the names of collision shapes, all or those of some parts."""
+        shapes = [shape for body in self.tree for shape in body.shapes]
+        return tuple(shape.name for shape in shapes if not parts or shape.part in parts)
 
     def joint_targets(self, action: jax.Array, scale: float = 1.0) -> jax.Array:
-        """Returns joint targets (..., 12), rad, of actions (..., 12).
+        """Returns joint targets (..., J), rad, of actions (..., J).
 
         They are default + `scale` x the robot's scale x action.
         """
         return jnp.asarray(self.default_joints) + scale * self.action_scale * action
 
-    def shapes(self, contacts: str = "full") -> tuple[CollisionShape, ...]:
-        """Returns the collision shapes of a set, one of `CONTACTS`; InputError for another name."""
-        if contacts not in CONTACTS:
-            raise InputError(f"contacts: unknown set {contacts!r}; allowed: {', '.join(CONTACTS)}")
-        return tuple(shape for shape in self.collision if shape.part in CONTACTS[contacts])
+
+def parts_of(contacts: str) -> tuple[str, ...]:
+    """Returns the parts of a set of collision shapes, one of `CONTACTS`; () for all.
+
+    InputError for another name.
+    """
+    if contacts not in CONTACTS:
+        raise InputError(f"contacts: unknown set {contacts!r}; allowed: {', '.join(CONTACTS)}")
+    return (TRUNK, FOOT) if contacts == "minimal" else ()

@@ -1,0 +1,477 @@
+"""A robot from an MJCF, and from a YAML of what it leaves open."""
+
+import dataclasses
+import fnmatch
+import math
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from mqe_jax.core.errors import InputError, brief, nearest, one_line
+from mqe_jax.core.limits import Length, NonNegative, Positive
+from mqe_jax.core.settings import Range, settings_class
+from mqe_jax.physics.robots import mjcf
+from mqe_jax.physics.robots.model import LEG_JOINTS, ModelRobot
+from mqe_jax.physics.robots.robot import Mirror, Proportions, WalkSettings
+from mqe_jax.physics.robots.shapes import Shapes
+from mqe_jax.physics.robots.skeleton import Foot, Skeleton
+
+GO1_MASS = 11.3  # kg
+GO1_EXTENT = np.array([0.36, 0.57])  # m, of its shapes across and along
+GO1_HEIGHT = 0.30  # m, of the standing trunk
+GO1_GAIN = 20.0  # N m/rad
+TIMESTEP = 0.005  # s, of the physics
+STABLE = 1.0  # derivative gain x physics step / inertia, at most
+DAMPING = 0.02  # s, derivative gain over proportional gain of a robot as high as the Go1
+SAG = 0.13  # rad, of a joint that holds the standing robot
+REACH = (0.125, 0.25, 0.25)  # action scale of a leg's joints, rad
+_JOINT = mujoco.mjtJoint
+_GEOM = mujoco.mjtGeom
+_DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+NEAR = 0.25  # share of the height by which a foot may be above the lowest
+BENT = 0.75  # share of a straight leg's length at which a solved stance stands
+_STRANGE = 1e3  # kg and m beyond which a robot cannot be meant
+
+Values = float | tuple[float, ...] | Mapping[str, float]
+"""A number for all joints, one for each, or one for each of a leg's joints; or numbers by name,
+whose names are joints or patterns such as `*_knee`."""
+
+
+@settings_class
+class RobotFile:
+    """What a YAML says of a robot, for what its MJCF lacks or has otherwise."""
+
+    model: str | None = None
+    """MJCF in the YAML's folder, or menagerie:NAME. Default: the file of the YAML's name."""
+    title: str | None = None
+    """Full name. Default: that of the MJCF."""
+    trunk: str | None = None
+    """Body that is the trunk. Default: the one with a free joint."""
+    feet: tuple[str, ...] = ()
+    """Geoms of the feet. Default: the lowest sphere, else shape, of each limb that ends as low as
+    the lowest."""
+    legs: tuple[str, ...] = ()
+    """First bodies of a quadruped's legs: front left, front right, rear left, rear right. Default:
+    by the places of the feet."""
+    fixed: tuple[str, ...] = ()
+    """Joints that are fixed at angle zero; may be patterns."""
+    stance: str | Values | None = None
+    """Default joint angles, rad, or a keyframe's name. Default: the first keyframe, else a pose
+    with bent knees that is solved."""
+    stand_height: Length | None = None
+    """Height of the standing trunk, m. Default: that of the stance."""
+    torque: Values | None = None
+    """Torque limits, N m. Default: those of the actuators."""
+    stall: Values | None = None
+    """Stall torques, N m. Default: the torque limits."""
+    speed: Values | None = None
+    """Speed limits of the motors, rad/s. Default: none."""
+    limits: Mapping[str, Range] = dataclasses.field(default_factory=dict)
+    """Joint limits by name or pattern, rad. Default: those of the joints."""
+    kp: Positive | None = None
+    """Proportional gain, N m/rad. Default: with which joints sag by 0.13 rad, and at
+    least that of the Go1 times mass and height over its own."""
+    kd: NonNegative | None = None
+    """Derivative gain, N m s/rad. Default: 0.02 s times kp, times the root of the height over the
+    Go1's."""
+    action_scale: Values | None = None
+    """Scale of joint actions, rad. Default: 0.125 at the first joint of a quadruped's legs, else
+    0.25."""
+    weights: str = ""
+    """Robot whose shipped skills it uses. Default: none."""
+
+
+class Reader:
+    """Reads one robot; `robot` returns it."""
+
+    def __init__(self, source: mjcf.Source, settings: RobotFile) -> None:
+        self.source = source
+        self.settings = settings
+        self.notes: list[str] = []
+        self.stances: dict[str, dict[str, float]] = {}
+        self.named: dict[str, str] = {}
+        self.solid: set[str] = set()
+        self.model = self._compile()
+        self.skeleton = Skeleton(source, self.model, self._trunk(), self.solid)
+        self.joints = self.skeleton.joints
+
+    def error(self, what: str) -> InputError:
+        return self.source.fail(what)
+
+    def _compile(self) -> mujoco.MjModel:
+        """Returns the compiled model; sets `stances`, `solid`, and `named`, the geoms' names."""
+        spec = self.source.spec
+        for number, geom in enumerate(spec.geoms):
+            self.named[f"g{number}"] = geom.name or geom.meshname
+            if geom.contype or geom.conaffinity:
+                self.solid.add(f"g{number}")
+            geom.name = f"g{number}"
+            geom.contype = 0  # no hulls of meshes, which take long
+            geom.conaffinity = 0
+        for number, joint in enumerate(spec.joints):
+            joint.name = joint.name or f"joint{number}"
+        for number, body in enumerate(spec.bodies):
+            body.name = body.name or f"body{number}"
+        model = self._checked(spec)
+        for key in range(model.nkey):
+            angles = {}
+            for joint in np.flatnonzero(model.jnt_type == _JOINT.mjJNT_HINGE):
+                angle = model.key_qpos[key, model.jnt_qposadr[joint]]
+                angles[model.joint(int(joint)).name] = float(angle)
+            self.stances[model.key(key).name] = angles
+        fixed = self._match(self.settings.fixed, [joint.name for joint in spec.joints], "fixed")
+        if not fixed:
+            return model
+        for key in [*spec.keys]:
+            spec.delete(key)
+        for actuator in [*spec.actuators]:
+            if actuator.target in fixed:
+                spec.delete(actuator)
+        for joint in [*spec.joints]:
+            if joint.name in fixed:
+                spec.delete(joint)
+        return self._checked(spec)
+
+    def _checked(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise self.error(f"MuJoCo rejects it ({one_line(error)})") from None
+        for name in ("body_mass", "body_inertia", "body_pos", "jnt_pos", "geom_pos", "geom_size"):
+            rows = getattr(model, name).reshape(len(getattr(model, name)), -1)
+            for row in np.flatnonzero(~np.all(np.abs(rows) < _STRANGE, axis=1)):
+                element = {"b": model.body, "j": model.joint, "g": model.geom}[name[0]](int(row))
+                raise self.error(
+                    f"{name} of {self.named.get(element.name, element.name)!r}: is beyond "
+                    f"{_STRANGE:g}; SI units are expected"
+                )
+        return model
+
+    def _match(self, wanted: Sequence[str], known: Sequence[str], key: str) -> set[str]:
+        """Returns the known names that are wanted, by name or pattern."""
+        found = set()
+        for pattern in wanted:
+            matches = fnmatch.filter(known, pattern)
+            if not matches:
+                raise self.error(
+                    f"{key}: {brief(pattern)!r} names nothing{nearest(pattern, known)}; "
+                    f"there are {brief(', '.join(known))}"
+                )
+            found |= {*matches}
+        return found
+
+    def _trunk(self) -> int:
+        model = self.model
+        top = [b for b in range(1, model.nbody) if model.body_parentid[b] == 0]
+        wanted = self.settings.trunk
+        if wanted is not None:
+            names = [model.body(b).name for b in top]
+            self._match([wanted], names, "trunk")
+            return top[names.index(wanted)]
+        free = [b for b in top if int(_JOINT.mjJNT_FREE) in self._kinds(b)]
+        if len(free) == 1:
+            return free[0]
+        if not free and len(top) == 1 and not model.body_jntnum[top[0]]:
+            self.notes.append(f"body {model.body(top[0]).name!r}: has no free joint; it gets one")
+            return top[0]
+        names = ", ".join(repr(model.body(b).name) for b in free or top) or "none"
+        raise self.error(f"worldbody: bodies that may be the trunk: {names}; set trunk")
+
+    def _kinds(self, body: int) -> list[int]:
+        first = self.model.body_jntadr[body]
+        return [int(x) for x in self.model.jnt_type[first : first + self.model.body_jntnum[body]]]
+
+    def robot(self, text: bytes) -> ModelRobot:
+        """Returns the robot; `text` is that of the settings' file."""
+        settings = self.settings
+        skeleton = self.skeleton
+        skeleton.place(next(iter(self.stances.values()), {}))
+        feet = self._feet()
+        skeleton.place({})
+        feet, quadruped = self._ordered(feet)
+        joints = self.joints
+        self._limits()
+        stance = self._stance(feet)
+        shapes = Shapes(skeleton, feet, alone=quadruped)
+        bodies = shapes.bodies()
+        self.notes += shapes.notes
+        height = settings.stand_height or -min(skeleton.bottom(x.body, x.geom) for x in feet)
+        mass = sum(body.link.mass for body in bodies)
+        if not 0.05 <= height <= 5.0 or not 0.05 <= mass <= 5000.0:
+            raise self.error(
+                f"its trunk stands {height:.3g} m high and its mass is {mass:.3g} kg; expected "
+                "0.05 to 5 m and 0.05 to 5000 kg; set stance or stand_height"
+            )
+        bodies[0] = dataclasses.replace(bodies[0], position=(0.0, 0.0, height))
+        torque = self._torque()
+        if settings.speed is None:
+            self.notes.append("actuators: have no speed limit; set speed")
+        size = height / GO1_HEIGHT
+        least = GO1_GAIN * mass / GO1_MASS * size
+        kp, kd = self._gains(max(least, skeleton.holding(feet, mass) / SAG), size)
+        mirror = skeleton.mirror(joints)
+        odd = [name for name, i in zip(joints, mirror.source, strict=True) if i < 0]
+        if odd:
+            self.notes.append(
+                f"joints {brief(', '.join(odd))}: have no counterpart on the other side; in a "
+                "match their angles are not mirrored"
+            )
+        across, along = skeleton.spread(feet)
+        sole = feet[0]
+        foot_z = skeleton.seen(np.array([sole.center]), sole.body)[0, 2]
+        dofs = [self.model.joint(name).dofadr[0] for name in joints]
+        narrow = float((self.upper - self.lower).min())
+        return ModelRobot(
+            name=self.source.path.stem,
+            title=settings.title or self.source.spec.modelname,
+            joints=tuple(joints),
+            bodies=tuple(bodies),
+            soles=tuple((skeleton.names[foot.body], foot.center) for foot in feet),
+            reflection=whole(mirror),
+            four_legged=quadruped,
+            reach=skeleton.reach(),
+            sizes=Proportions(
+                size, *(skeleton.extent() / GO1_EXTENT).tolist(), mass=mass / GO1_MASS
+            ),
+            default_joints=stance,
+            joint_lower=self.lower,
+            joint_upper=self.upper,
+            joint_speed_limit=self._values(settings.speed, "speed", math.inf),
+            torque_limit=torque,
+            stall_torque=self._values(settings.stall, "stall", torque),
+            rotor_inertia=self.model.dof_armature[dofs],
+            joint_damping=self.model.dof_damping[dofs].reshape(len(dofs), -1)[:, 0],
+            friction_loss=self.model.dof_frictionloss[dofs],
+            joint_margin=min(0.12, 0.1 * narrow),
+            kp=kp,
+            kd=kd,
+            action_scale=self._values(
+                settings.action_scale,
+                "action_scale",
+                np.tile(REACH, len(feet)) if quadruped else REACH[-1],
+            ),
+            stand_height=height,
+            foot_radius=float(foot_z - skeleton.bottom(sole.body, sole.geom)),
+            walk=WalkSettings(
+                settings.weights,
+                stance_width=across,
+                stance_length=along,
+                min_knee_height=0.2 * height,
+                min_trunk_height=height / 3.0,
+            ),
+            digest=self.source.digest(text, shapes.meshes),
+            source=str(self.source.path),
+            notes=tuple(self.notes),
+        )
+
+    def _values(self, given: Values | None, key: str, default: np.ndarray | float) -> np.ndarray:
+        """Returns a setting's value for each joint (J,); `default` where it has none."""
+        count = len(self.joints)
+        found = np.broadcast_to(np.asarray(default, float), count).copy()
+        if given is None:
+            return found
+        if isinstance(given, Mapping):
+            for pattern, value in given.items():
+                found[self._chosen(pattern, key)] = value
+            return found
+        listed = np.atleast_1d(np.asarray(given, float))
+        if len(listed) not in (1, LEG_JOINTS, count) or count % len(listed):
+            raise self.error(
+                f"{key}: {len(listed)} numbers; expected 1, {count}, or {LEG_JOINTS} for each leg"
+            )
+        return np.tile(listed, count // len(listed))
+
+    def _chosen(self, pattern: str, key: str) -> list[bool]:
+        """Returns which joints a name or pattern of a setting means (J,)."""
+        names = self._match([pattern], self.joints, key)
+        return [name in names for name in self.joints]
+
+    def _limits(self) -> None:
+        """Sets the joint limits `lower` and `upper` (J,), rad."""
+        model = self.model
+        ids = [model.joint(name).id for name in self.joints]
+        limited = model.jnt_limited[ids].astype(bool)
+        self.lower = np.where(limited, model.jnt_range[ids, 0], -math.pi)
+        self.upper = np.where(limited, model.jnt_range[ids, 1], math.pi)
+        for pattern, (low, high) in self.settings.limits.items():
+            chosen = self._chosen(pattern, "limits")
+            self.lower[chosen] = low
+            self.upper[chosen] = high
+            limited |= chosen
+        for i, joint in enumerate(ids):
+            what = f"joint {self.joints[i]!r}"
+            if model.qpos0[model.jnt_qposadr[joint]]:
+                raise self.error(f"{what}: ref is not 0; turn its body instead")
+            if self.upper[i] - self.lower[i] < 1e-3:
+                raise self.error(f"{what}: its range is empty; set limits")
+            if not limited[i]:
+                self.notes.append(f"{what}: has no range; -3.14 to 3.14 is used; set limits")
+            if model.jnt_stiffness[joint]:
+                self.notes.append(f"{what}: its spring is left out")
+
+    def _stance(self, feet: Sequence[Foot]) -> np.ndarray:
+        """Returns the default joint angles (J,), rad, and places the robot in them."""
+        wanted = self.settings.stance
+        names = self.joints
+        if isinstance(wanted, str) and wanted not in self.stances:
+            known = ", ".join(self.stances) or "none"
+            raise self.error(f"stance: no keyframe {brief(wanted)!r}; there are: {known}")
+        first = wanted if isinstance(wanted, str) else next(iter(self.stances), None)
+        if first is None and (wanted is None or isinstance(wanted, Mapping)):
+            values = self._solved(feet)
+        else:
+            known = self.stances.get(first or "", {})
+            values = np.array([known.get(name, 0.0) for name in names])
+        if wanted is not None and not isinstance(wanted, str):
+            values = self._values(wanted, "stance", values)
+        elif first is None:
+            self.notes.append("keyframe: there is none; the stance is solved; set stance")
+        span = self.upper - self.lower
+        inside = np.clip(values, self.lower + 0.01 * span, self.upper - 0.01 * span)
+        for i in np.flatnonzero(np.abs(inside - values) > 0.02 * span):
+            raise self.error(
+                f"joint {names[i]!r}: {values[i]:.3g} rad of the stance is outside of its limits "
+                f"{self.lower[i]:.3g} to {self.upper[i]:.3g}; set stance"
+            )
+        self._place(inside)
+        return inside
+
+    def _place(self, angles: np.ndarray) -> None:
+        self.skeleton.place(dict(zip(self.joints, angles.tolist(), strict=True)))
+
+    def _solved(self, feet: Sequence[Foot]) -> np.ndarray:
+        """Returns joint angles with the feet below their hips and bent knees."""
+        from scipy.optimize import least_squares  # takes 0.2 s to import
+
+        zero = np.clip(0.0, self.lower, self.upper)
+        self._place(zero)
+        aims = []
+        for foot in feet:
+            anchors = [self.skeleton.anchor(name) for name in foot.joints]
+            here = self.skeleton.seen(np.array([foot.center]), foot.body)[0]
+            path = np.diff([*anchors, here], axis=0)
+            length = np.linalg.norm(path, axis=1)[1:].sum() or np.linalg.norm(path)
+            aims.append([anchors[0][0], here[1], anchors[0][2] - BENT * length])
+        wide = self.upper - self.lower > 2 * math.pi
+        rest = np.where(wide, 0.0, (self.lower + self.upper) / 2)
+
+        def missed(angles: np.ndarray) -> np.ndarray:
+            self._place(angles)
+            at = [self.skeleton.seen(np.array([foot.center]), foot.body)[0] for foot in feet]
+            return np.append(np.subtract(at, aims), 0.01 * (angles - rest))
+
+        start = 0.9 * zero + 0.1 * rest
+        return least_squares(missed, start, bounds=(self.lower, self.upper), max_nfev=200).x
+
+    def _feet(self) -> list[Foot]:
+        """Returns the feet, in the order of the MJCF."""
+        model = self.model
+        named = {self.named[model.geom(g).name]: g for g in range(model.ngeom)}
+        if self.settings.feet:
+            wanted = self._match(self.settings.feet, [x for x in named if x], "feet")
+            chosen = sorted(named[name] for name in wanted)
+            found = [self.skeleton.foot(int(model.geom_bodyid[geom]), geom) for geom in chosen]
+            for foot in found:
+                if foot.body not in self.skeleton.ids or not foot.joints:
+                    raise self.error("feet: a geom is not on a limb of the robot")
+            return found
+        parents = {int(model.body_parentid[body]) for body in self.skeleton.ids}
+        leaves = [b for b in self.skeleton.ids if b not in parents and self.skeleton.path(b)]
+        found = []
+        for body in leaves:
+            solid = self.skeleton.geoms(body, True)
+            round_ones = [g for g in solid if model.geom_type[g] == _GEOM.mjGEOM_SPHERE]
+            among = round_ones or solid
+            if among:
+                found.append(
+                    self.skeleton.foot(
+                        body, min(among, key=lambda g: self.skeleton.bottom(body, g))
+                    )
+                )
+        if not found:
+            raise self.error("no limb ends in a collision shape; add one, and name it under feet")
+        heights = np.array([self.skeleton.bottom(foot.body, foot.geom) for foot in found])
+        low = heights <= heights.min() + NEAR * abs(heights.min())
+        return [foot for foot, is_low in zip(found, low, strict=True) if is_low]
+
+    def _ordered(self, feet: list[Foot]) -> tuple[list[Foot], bool]:
+        """Returns the feet, and whether they are a quadruped's, which sets the joints' order."""
+        limbs = [name for foot in feet for name in foot.joints]
+        alike = all(len(foot.joints) == LEG_JOINTS for foot in feet)
+        if len(feet) != 4 or not alike or sorted(limbs) != sorted(self.joints):
+            return feet, False
+        legs = self.settings.legs
+        if legs:
+            firsts = {self.skeleton.first_body(foot): foot for foot in feet}
+            if sorted(legs) != sorted(firsts):
+                raise self.error(f"legs: expected the bodies {', '.join(firsts)} in some order")
+            ordered = [firsts[name] for name in legs]
+        else:
+            places = {}
+            for foot in feet:
+                x, y, _ = self.skeleton.anchor(foot.joints[0])
+                places.setdefault((x < 0, y < 0), foot)
+            if len(places) < 4:
+                raise self.error("its legs are not one in each quarter about the trunk; set legs")
+            ordered = [places[quarter] for quarter in sorted(places)]
+        self.joints = [name for foot in ordered for name in foot.joints]
+        return ordered, True
+
+    def _gains(self, wanted: float, size: float) -> tuple[float, float]:
+        """Returns proportional and derivative gain; the default ones are low enough to be stable.
+
+        `wanted` is the proportional gain of a robot whose joints are not light.
+        """
+        inertias = self.skeleton.inertias()
+        lightest = float(inertias.min())
+        most = (STABLE * lightest / TIMESTEP**2 / 2, STABLE * lightest / TIMESTEP)
+        kp = self.settings.kp or min(wanted, most[0])
+        kd = self.settings.kd
+        if kd is None:
+            kd = min(DAMPING * kp * size**0.5, most[1])
+        if (kp < wanted and self.settings.kp is None) or kp > 2 * most[0] or kd > 1.5 * most[1]:
+            name = self.joints[int(np.argmin(inertias))]
+            self.notes.append(
+                f"joint {name!r}: is light, so gains above kp {most[0]:.3g} and kd {most[1]:.3g} "
+                f"are not stable; they are {kp:.3g} and {kd:.3g}; set kp and kd"
+            )
+        return kp, kd
+
+    def _torque(self) -> np.ndarray:
+        """Returns the torque limits (J,), N m."""
+        model = self.model
+        found = dict.fromkeys(self.joints, math.inf)
+        driven = set()
+        for number in range(model.nu):
+            if int(model.actuator_trntype[number]) not in _DRIVES:
+                name = model.actuator(number).name
+                raise self.error(f"actuator {name!r}: drives no joint; it must")
+            joint = model.joint(int(model.actuator_trnid[number, 0])).name
+            driven.add(joint)
+            most = [math.inf]
+            if model.actuator_forcelimited[number]:
+                most.append(float(np.abs(model.actuator_forcerange[number]).max()))
+            if model.actuator_ctrllimited[number] and not model.actuator_biasprm[number].any():
+                gain = abs(float(model.actuator_gainprm[number, 0]))
+                most.append(gain * float(np.abs(model.actuator_ctrlrange[number]).max()))
+            if joint in found:
+                found[joint] = abs(float(model.actuator_gear[number, 0])) * min(most)
+        for name in self.joints:
+            joint = model.joint(name).id
+            if model.jnt_actfrclimited[joint]:
+                most = float(np.abs(model.jnt_actfrcrange[joint]).max())
+                found[name] = min(found[name], most)
+        limit = self._values(self.settings.torque, "torque", np.array([*found.values()]))
+        for i in np.flatnonzero(~np.isfinite(limit) | (limit <= 0.0)):
+            name = self.joints[i]
+            what = f"its torque limit is {limit[i]:g}" if name in driven else "has no actuator"
+            raise self.error(f"joint {name!r}: {what}; set torque, or name it under fixed")
+        return limit
+
+
+def whole(mirror: Mirror) -> Mirror:
+    """Returns a reflection in which joints without a counterpart, -1, stay as they are."""
+    alone = mirror.source < 0
+    own = np.where(alone, np.arange(len(alone)), mirror.source)
+    return Mirror(own, np.where(alone, np.float32(1.0), mirror.sign))

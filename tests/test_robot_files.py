@@ -1,0 +1,323 @@
+"""Robots from MJCF files: what is read, what is refused, and what tasks do with them."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mqe_jax
+from mqe_jax.core.errors import InputError
+from mqe_jax.envs import make
+from mqe_jax.export.scene import scene_settings, scene_xml
+from mqe_jax.physics import robots
+from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.model import ModelRobot
+from mqe_jax.physics.robots.quadruped import MIRROR
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "robots"
+DOG = str(EXAMPLES / "dog.xml")
+BIPED = str(EXAMPLES / "biped.xml")
+
+
+def read(file: str | Path) -> ModelRobot:
+    robot = robots.get(str(file))
+    assert isinstance(robot, ModelRobot)
+    return robot
+
+
+def written(folder: Path, text: str, yaml: str = "", name: str = "own") -> ModelRobot:
+    """The robot of an MJCF and a YAML beside it."""
+    (folder / f"{name}.xml").write_text(text)
+    if yaml:
+        (folder / f"{name}.yaml").write_text(yaml)
+    return read(folder / f"{name}.xml")
+
+
+def dog(*changes: tuple[str, str]) -> str:
+    """The text of the dog with changes."""
+    text = Path(DOG).read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def test_a_robot_has_the_masses_limits_and_motors_of_its_mjcf() -> None:
+    robot = read(DOG)
+    own = mujoco.MjModel.from_xml_path(DOG)
+    assert (robot.name, robot.title, robot.num_joints, robot.limb) == ("dog", "Dog", 12, 3)
+    legs = [
+        f"{leg}_{joint}" for leg in ("FL", "FR", "RL", "RR") for joint in ("roll", "pitch", "knee")
+    ]
+    assert robot.joint_names == tuple(legs)
+    model = build_robot(robot, 0).compile()
+    assert sum(model.body_mass) == pytest.approx(sum(own.body_mass))
+    for theirs in range(2, own.nbody):
+        name = own.body(theirs).name
+        for field in ("mass", "ipos", "pos"):
+            np.testing.assert_allclose(
+                getattr(model.body(name), field), getattr(own.body(theirs), field), atol=1e-9
+            )
+        found = np.sort(model.body(name).inertia)
+        np.testing.assert_allclose(found, np.sort(own.body(theirs).inertia), atol=1e-9)
+    ids = [own.joint(name).id for name in robot.joint_names]
+    np.testing.assert_allclose(robot.joint_lower, own.jnt_range[ids, 0])
+    np.testing.assert_allclose(robot.joint_upper, own.jnt_range[ids, 1])
+    np.testing.assert_allclose(robot.torque_limit, np.tile([28.0, 28.0, 40.0], 4))
+    np.testing.assert_allclose(robot.joint_speed_limit, np.tile([22.0, 22.0, 18.0], 4))
+    np.testing.assert_allclose(
+        robot.default_joints, np.array([0, 0.8, -1.5] * 2 + [0, 1, -1.5] * 2)
+    )
+    np.testing.assert_allclose(robot.rotor_inertia, 0.01)
+    np.testing.assert_array_equal(robot.mirror.source, MIRROR.source)
+    np.testing.assert_array_equal(robot.mirror.sign, MIRROR.sign)
+
+
+@pytest.mark.parametrize("file", [DOG, BIPED])
+def test_feet_and_knees_are_where_mujoco_puts_them(file: str) -> None:
+    robot = read(file)
+    model = build_robot(robot, 0, visual=False).compile()
+    data = mujoco.MjData(model)
+    angles = np.random.default_rng(0).uniform(robot.joint_lower, robot.joint_upper)
+    data.qpos[:7] = [0, 0, 0, 1, 0, 0, 0]
+    for name, angle in zip(robot.joint_names, angles, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(model, data)
+    found = robot.foot_positions(jnp.tile(jnp.asarray(angles), (2, 1)))
+    assert found.shape == (2, len(robot.soles), 3)
+    for i, (body, center) in enumerate(robot.soles):
+        turn = data.body(body).xmat.reshape(3, 3)
+        np.testing.assert_allclose(found[1, i], data.body(body).xpos + turn @ center, atol=1e-5)
+        np.testing.assert_allclose(
+            robot.knee_positions(jnp.asarray(angles))[i], data.body(body).xpos, atol=1e-5
+        )
+
+
+def test_a_robot_of_two_legs_is_observed_rewarded_drawn_and_exported() -> None:
+    env = make("go1gate", impl="c", robot=BIPED, control="position", senses=["proprioception"])
+    assert env.action_size == 9 and env.robot.num_joints == 9
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(env.step)
+    for _ in range(3):
+        state = step(state, jnp.zeros((2, 9)))
+    assert bool(jnp.all(jnp.isfinite(state.obs))) and bool(jnp.all(jnp.isfinite(state.reward)))
+    widths = {block.name: block.width for block in env.layouts["onboard"].blocks}
+    assert (widths["joint_position"], widths["action"]) == (9, 9)
+    assert env.mj_model.nbody == env.compiled.model.nbody
+    assert env.mj_model.ngeom > env.compiled.model.ngeom
+    assert mujoco.MjModel.from_xml_string(scene_xml(env)).nu == 18
+    assert len(scene_settings(env)["motors"]["response"]) == 9
+
+
+def test_a_robot_of_two_legs_stands_beside_another() -> None:
+    env = make("go1plane", impl="c", robot=BIPED, control="position", spawn_height=0.66,
+               spawn_velocity=0.0, spawn_joint_scale=(1.0, 1.0))  # fmt: skip
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(env.step)
+    for _ in range(75):
+        state = step(state, jnp.zeros((2, 9)))
+    found = env.read(state.data)
+    assert not bool(state.terminated) and float(jnp.abs(found.euler).max()) < 0.1
+    np.testing.assert_allclose(found.position_w[:, 2], env.robot.stand_height, atol=0.03)
+    with pytest.raises(InputError, match=r"skill: 'walk' needs four legs of three joints; biped"):
+        make("go1plane", impl="c", robot=BIPED)
+
+
+def test_engines_agree_on_a_robot_of_two_legs() -> None:
+    states = []
+    for impl in ("c", "jax"):
+        env: Any = make("go1plane", impl=impl, robot=BIPED, control="torque", num_agents=1)
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+        torque = 0.3 * jax.random.uniform(jax.random.PRNGKey(1), (1, 9), minval=-1.0)
+        states.append(jax.jit(env.step)(state, torque).data)
+    np.testing.assert_allclose(states[0].qpos, states[1].qpos, atol=2e-4)
+
+
+def test_a_file_is_read_again_only_when_it_changes(tmp_path: Path) -> None:
+    first = written(tmp_path, dog(), "speed: 20\n")
+    assert read(tmp_path / "own.xml") is first
+    (tmp_path / "own.yaml").write_text("speed: 21\n# another size\n")
+    second = read(tmp_path / "own.xml")
+    assert second is not first and second.digest != first.digest
+    assert second.joint_speed_limit[0] == 21
+
+
+def test_needs_and_digests_have_the_contents_of_a_robots_files(tmp_path: Path) -> None:
+    written(tmp_path, dog(), "speed: 20\n", "one")
+    written(tmp_path, dog(), "speed: 20\n", "two")
+    envs = [
+        make("go1gate", impl="c", control="position", robot=str(tmp_path / f"{name}.xml"))
+        for name in ("one", "two")
+    ]
+    one, two = (env.describe("policy")["robot"] for env in envs)
+    assert one.startswith("one@") and one.partition("@")[2] == two.partition("@")[2]
+    assert envs[0].digests["robot"] == envs[1].digests["robot"]
+    (tmp_path / "one.yaml").write_text("speed: 30\n")
+    changed = make("go1gate", impl="c", control="position", robot=str(tmp_path / "one.xml"))
+    assert changed.digests["robot"] != envs[0].digests["robot"]
+    assert changed.describe("policy")["robot"] != one
+
+
+def test_a_yaml_overrides_what_the_mjcf_says(tmp_path: Path) -> None:
+    yaml = """
+title: Own
+torque: {"*_knee": 33, FL_roll: 11}
+stall: 44
+speed: [20, 21, 22]
+stance: [0.1, 0.7, -1.4]
+limits: {"*_pitch": [-1, 2]}
+kp: 50
+kd: 0.9
+action_scale: 0.3
+stand_height: 0.36
+"""
+    robot = written(tmp_path, dog(), yaml)
+    assert (robot.title, robot.kp, robot.kd, robot.stand_height) == ("Own", 50, 0.9, 0.36)
+    np.testing.assert_allclose(robot.torque_limit[:6], [11, 28, 33, 28, 28, 33])
+    np.testing.assert_allclose(robot.stall_torque, 44)
+    np.testing.assert_allclose(robot.joint_speed_limit[3:6], [20, 21, 22])
+    np.testing.assert_allclose(robot.default_joints, np.tile([0.1, 0.7, -1.4], 4))
+    np.testing.assert_allclose(robot.joint_upper[1::3], 2)
+    np.testing.assert_allclose(robot.action_scale, 0.3)
+
+
+def test_legs_have_the_usual_order_whatever_that_of_the_file(tmp_path: Path) -> None:
+    swapped = dog(("FL_", "X_"), ("RR_", "FL_"), ("X_", "RR_"))  # front left is called RR
+    robot = written(tmp_path, swapped, "speed: 20")
+    assert robot.joint_names[::3] == ("RR_roll", "FR_roll", "RL_roll", "FL_roll")
+
+
+def test_a_stance_is_solved_where_there_is_none(tmp_path: Path) -> None:
+    text = dog()
+    start = text.index("  <keyframe>")
+    with pytest.warns(UserWarning, match="the stance is solved; set stance"):
+        robot = written(tmp_path, text[:start] + "</mujoco>", "speed: 20")
+    feet = np.asarray(robot.foot_positions(jnp.asarray(robot.default_joints)))
+    np.testing.assert_allclose(feet[:, 2], feet[0, 2], atol=0.01)
+    np.testing.assert_allclose(feet[:, 0], [0.22, 0.22, -0.22, -0.22], atol=0.02)
+    assert 0.3 < robot.stand_height < 0.45
+
+
+def test_joints_that_are_fixed_are_gone(tmp_path: Path) -> None:
+    robot = written(tmp_path, Path(BIPED).read_text(), "fixed: [waist]\nkp: 100")
+    assert "waist" not in robot.joint_names and robot.num_joints == 8
+    assert robot.default_joints[1] == pytest.approx(0.0, abs=0.8)
+    assert sum(body.link.mass for body in robot.tree) == pytest.approx(16.4)
+
+
+def test_missing_meshes_are_dropped_with_a_line(tmp_path: Path) -> None:
+    mesh = '<asset><mesh name="shell" file="shell.obj"/></asset>\n  <worldbody>'
+    text = dog(
+        ("<worldbody>", mesh),
+        (
+            "<freejoint/>",
+            '<freejoint/><geom type="mesh" mesh="shell" contype="0" conaffinity="0"/>',
+        ),
+    )
+    weighs = r"mesh 'shell': its file is missing, and body 'torso' takes its mass from it"
+    with pytest.raises(InputError, match=weighs):
+        written(tmp_path, text, "speed: 20")
+    text = text.replace('mesh="shell" ', 'mesh="shell" mass="0" ')
+    with pytest.warns(UserWarning, match="mesh: 1 files are missing, such as 'shell'"):
+        bare = written(tmp_path, text, "speed: 20")
+    (tmp_path / "shell.obj").write_text(
+        "v 0 0 0\nv 0.3 0 0\nv 0 0.2 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    drawn = read(tmp_path / "own.xml")
+    assert bare.digest == drawn.digest  # looks alone
+    assert drawn.tree[0].looks[0].primitive.kind == "mesh"
+    model = build_robot(drawn, 0).compile()
+    assert model.nmesh == 1 and model.body("trunk").mass[0] == pytest.approx(7.5)
+
+
+def hostile(folder: Path) -> dict[str, tuple[str, str, str]]:
+    """MJCF, YAML and what the error says, by kind."""
+    (folder.parent / "secret.xml").write_text("<mujoco><worldbody/></mujoco>")
+    (folder.parent / "secret.obj").write_text("v 0 0 0\n")
+    (folder / "link.xml").symlink_to(folder.parent / "secret.xml")
+    (folder / "link.obj").symlink_to(folder.parent / "secret.obj")
+    (folder / "again.xml").write_text('<mujoco><include file="again.xml"/></mujoco>')
+    deep = "<body>" * 200 + "</body>" * 200
+    many = "<geom size='.1'/>" * 6000
+    huge = "<!--" + "x" * 2**20 + "-->"
+    bomb = '<!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><mujoco>&b;</mujoco>'
+    torso = 'name="torso"'
+    mesh = "<asset><mesh name='m' file='{}'/></asset><worldbody>"
+    loop = (
+        "<equality><connect name='c' body1='FL_lower' body2='FR_lower' anchor='0 0 0'/></equality>"
+    )
+    plain = "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    zero = plain.replace("</body>", "<body><joint name='j'/><inertial mass='0' pos='0 0 0' "
+                         "diaginertia='0 0 0'/></body></body>")  # fmt: skip
+    return {
+        "no XML": ("<mujoco", "", "damaged, or not XML"),
+        "another format": ("<robot/>", "", "<robot> is not allowed; an MJCF begins with <mujoco>"),
+        "entities": (bomb, "", "document type declaration"),
+        "too large": (f"<mujoco>{huge}</mujoco>", "", "must have at most 1048576"),
+        "too many": (f"<mujoco><worldbody>{many}</worldbody></mujoco>", "", "more than 5000 elem"),
+        "too deep": (f"<mujoco><worldbody>{deep}</worldbody></mujoco>", "", "more than 64 within"),
+        "copies": (dog((f"<body {torso}", f"<replicate count='1000000'/><body {torso}")), "",
+                   "<replicate>: not read"),
+        "include above": ("<mujoco><include file='../secret.xml'/></mujoco>", "", "outside of its"),
+        "include link": ("<mujoco><include file='link.xml'/></mujoco>", "", "outside of its"),
+        "include absolute": ("<mujoco><include file='/etc/hostname'/></mujoco>", "", "outside of"),
+        "include circle": ("<mujoco><include file='again.xml'/></mujoco>", "", "in a circle"),
+        "include none": ("<mujoco><include file='none.xml'/></mujoco>", "", "is not there"),
+        "mesh above": (dog(("<worldbody>", mesh.format("../secret.obj"))), "", "mesh 'm': "),
+        "mesh link": (dog(("<worldbody>", mesh.format("link.obj"))), "", "outside of its folder"),
+        "meshdir": (dog(("<compiler ", "<compiler meshdir='/etc' "),
+                        ("<worldbody>", mesh.format("passwd"))), "", "outside of its folder"),
+        "loop": (dog(("  <actuator>", f"{loop}<actuator>")), "", "<equality>: closed loops"),
+        "tendon": (dog(("  <actuator>", "<tendon/><actuator>")), "", "<tendon>: tendons are not"),
+        "plugin": (dog(("<worldbody>", "<extension/><worldbody>")), "", "<extension>: plugins"),
+        "muscle": (dog(("<actuator>", "<actuator><muscle joint='FL_roll'/>")), "", "<muscle>"),
+        "no joints": (plain, "", "has 0 joints; a robot has 1 to 64"),
+        "zero mass": (zero, "", "MuJoCo rejects it (Error: mass and inertia of moving bodies"),
+        "heavy": (dog(('mass="7"', 'mass="1e9"')), "",
+                  "body_mass of 'torso': is beyond 1000; SI units are expected"),
+        "not a number": (dog(('mass="7"', 'mass="nan"')), "", "<geom>: mass='nan' is not finite"),
+        "slide": (dog(('name="FL_roll"', 'type="slide" name="FL_roll"')), "", "is no hinge; name"),
+        "two trunks": (dog(("<worldbody>", "<worldbody><body name='ball'><freejoint/>"
+                            "<geom size='.1'/></body>")), "", "may be the trunk: 'ball', 'torso'"),
+        "no actuator": (dog(('<motor joint="FL_knee" ctrlrange="-40 40"/>', "")), "",
+                        "joint 'FL_knee': has no actuator; set torque, or name it under fixed"),
+        "no limit": (dog(('<motor joint="FL_knee" ctrlrange="-40 40"/>',
+                          '<motor joint="FL_knee"/>')), "", "its torque limit is inf; set torque"),
+        "stance": (dog((" 0 0.8 -1.5 0 0.8", " 0 0.8 -3.5 0 0.8")), "",
+                   "joint 'FL_knee': -3.5 rad of the stance is outside of its limits"),
+        "unknown key": (dog(), "speeds: 3", "own.yaml: speeds: unknown"),
+        "unknown joint": (dog(), "speed: {FL_nee: 3}", "speed: 'FL_nee' names nothing"),
+        "five numbers": (dog(), "speed: [1, 2, 3, 4, 5]", "speed: 5 numbers; expected 1, 12, or 3"),
+        "model above": (dog(), "model: ../secret.xml", "outside of its folder"),
+    }  # fmt: skip
+
+
+def test_hostile_and_broken_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    kinds = hostile(folder)
+    assert len(kinds) >= 20
+    for kind, (text, yaml, said) in kinds.items():
+        (folder / "own.xml").write_text(text)
+        (folder / "own.yaml").write_text(yaml)
+        began = time.monotonic()
+        with pytest.raises(InputError) as error:
+            robots.get(str(folder / ("own.yaml" if kind == "model above" else "own.xml")))
+        assert said in str(error.value), f"{kind}: {error.value}"
+        assert "\n" not in str(error.value) and len(str(error.value)) < 1000, kind
+        assert time.monotonic() - began < 5.0, kind
+
+
+def test_names_of_robots_that_are_not_there_say_what_is_known() -> None:
+    for name, said in {
+        "go3": r"unknown name 'go3' \(did you mean 'go.'\?\)",
+        "none.xml": "robot: no file 'none.xml'",
+        "menagerie:nothing": "menagerie:nothing",
+    }.items():
+        with pytest.raises(InputError, match=said):
+            mqe_jax.make("go1gate", robot=name, control="position")
