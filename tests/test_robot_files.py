@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax import cli
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs import make
 from mqe_jax.export.scene import scene_settings, scene_xml
@@ -321,3 +322,33 @@ def test_names_of_robots_that_are_not_there_say_what_is_known() -> None:
     }.items():
         with pytest.raises(InputError, match=said):
             mqe_jax.make("go1gate", robot=name, control="position")
+
+
+def test_sizes_of_tasks_follow_the_body_and_the_users_number_wins() -> None:
+    usual = make("go1gate", impl="c", control="position").params
+    env = make("go1gate", impl="c", control="position", robot=BIPED)
+    body = env.robot.proportions
+    assert body.height == pytest.approx(env.robot.stand_height / 0.3)
+    assert env.params.spawn_height == pytest.approx(usual.spawn_height * body.height, abs=1e-3)
+    assert env.params.gate_width == pytest.approx(usual.gate_width * body.width, abs=1e-3)
+    own = make("go1gate", impl="c", control="position", robot=BIPED, gate_width=usual.gate_width)
+    assert own.params.gate_width == usual.gate_width
+    back = own.changed({"robot": "go2"}).params
+    assert (back.spawn_height, back.gate_width) == (usual.spawn_height, usual.gate_width)
+    high = make("go1bridge", impl="c", control="position", robot=BIPED).params
+    above = high.spawn_height - high.ground
+    assert above == pytest.approx((1.4 - 1.02) * body.height, abs=1e-3)
+
+
+def test_the_card_of_a_task_shows_the_robot_and_its_sizes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    command = ["tasks", "go1gate", "--robot", BIPED, "--control", "position", "--impl", "c"]
+    with pytest.warns(UserWarning, match="no speed limit"):
+        robots.files._LOADED.clear()  # pyright: ignore[reportAttributeAccessIssue]
+        assert cli.main(command) == 0
+    shown = capsys.readouterr().out
+    for text in ("biped@", "left_hip_roll", "16.4 kg", "no limit", "140 N m/rad", "set speed"):
+        assert text in shown, text
+    width = make("go1gate", impl="c", control="position", robot=BIPED).params.gate_width
+    assert f"gate_width={width:g}" in shown

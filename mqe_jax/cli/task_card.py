@@ -6,11 +6,14 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from mqe_jax.core.imports import IMPORTED, flags
 from mqe_jax.core.literal import line
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs import SCRIPTED, QuadrupedEnv
 from mqe_jax.envs.facts import facts
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.policies import simple, zoo
 from mqe_jax.presets import default_name, resolve
 from mqe_jax.sensors.suite import ONBOARD
@@ -32,6 +35,7 @@ def describe(env: QuadrupedEnv) -> dict[str, Any]:
             "aim": about.aim,
             "about": about.about,
             "about_of": about.about_of,
+            "robot": _robot(env.robot),
             "teams": [len(team) for team in env.teams],
             "any_size": env.variable_num_agents,
             "time_limit_s": env.params.episode_length,
@@ -52,6 +56,28 @@ def describe(env: QuadrupedEnv) -> dict[str, Any]:
             "training": _trainings(env),
         }
     )
+
+
+def _robot(robot: Robot) -> dict[str, Any]:
+    """Returns what a robot is, and what its files leave open."""
+
+    def span(values: np.ndarray, unit: str) -> str:
+        low, high = float(values.min()), float(values.max())
+        if not np.isfinite(high):
+            return "no limit"
+        return f"{low:.4g} {unit}" if low == high else f"{low:.4g} to {high:.4g} {unit}"
+
+    return {
+        "name": robot.identity,
+        "title": robot.title,
+        "joints": list(robot.joint_names),
+        "mass": f"{sum(body.link.mass for body in robot.tree):.4g} kg",
+        "height": f"{robot.stand_height:.3g} m, standing",
+        "torque": span(robot.torque_limit, "N m"),
+        "speed": span(robot.joint_speed_limit, "rad/s"),
+        "gains": f"{robot.kp:.3g} N m/rad, {robot.kd:.3g} N m s/rad",
+        "notes": list(robot.notes),
+    }
 
 
 def _blocks(env: QuadrupedEnv, group: str) -> list[dict[str, Any]]:
@@ -98,6 +124,10 @@ def show(card: Mapping[str, Any], *, long: bool) -> None:
         "policies": ", ".join(card["policies"]),
     }
     _print_rows("Overview", facts.items())
+    robot = card["robot"]
+    if "@" in robot["name"]:  # of a file
+        shown = {**robot, "joints": ", ".join(robot["joints"]), "notes": "; ".join(robot["notes"])}
+        _print_rows("Robot", ((name, text) for name, text in shown.items() if text))
     if card["control"] == "command":
         _print_rows(f"Action: commands of the skill {card['skill']}", card["commands"].items())
     for group, title in {"observation": "Observation of a robot", "onboard": "Sensors"}.items():

@@ -1,6 +1,7 @@
 """go1bridge, the paper's Traverse Bridge: two robots meet on a bridge wide enough for one."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.objects import Platform
 from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.robots.robot import Proportions
 from mqe_jax.physics.scene import Scene
 from mqe_jax.sensors.scene import Entity
 from mqe_jax.terrain import Plane, SpawnArea, Track
@@ -53,6 +55,9 @@ class BridgeParams(TaskParams):
     """Height of a trunk below which a robot counts as off the bridge, m."""
     rewards: BridgeRewards = BridgeRewards()
     """Weights of the reward terms."""
+
+    def scaled(self, body: Proportions) -> dict[str, Any]:
+        return super().scaled(body) | {"bridge_width": self.bridge_width * body.width}
 
     def __post_init__(self) -> None:
         super().__post_init__()

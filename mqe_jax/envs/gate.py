@@ -5,7 +5,7 @@ By default there are two robots. The gap is wide enough for one.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from mqe_jax.envs.params import TaskParams, check_gap
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.robots.robot import Proportions
 from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Gate, Plane, SpawnArea, Track, rows_of
 
@@ -65,6 +66,10 @@ class GateParams(TaskParams):
     Targets of more robots mirror the rows in which they start."""
     rewards: GateRewards = GateRewards()
     """Weights of the reward terms."""
+
+    def scaled(self, body: Proportions) -> dict[str, Any]:
+        gate = {"gate_width": self.gate_width * body.width}
+        return super().scaled(body) | gate | {"past_gate": self.past_gate * body.length}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,7 +1,7 @@
 """Parameters common to all tasks."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from mqe_jax.core.limits import (
 from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, override, settings_class
 from mqe_jax.envs.randomization import NamedRandomization, Randomization
 from mqe_jax.physics import robots
+from mqe_jax.physics.robots.robot import Proportions
 from mqe_jax.sensors.suite import Senses
 from mqe_jax.skills import agile  # noqa: F401  (skills register themselves)
 from mqe_jax.skills.control import Commander
@@ -131,10 +132,6 @@ class TaskParams:
     """Factor at assistance 0 on the reward terms whose weight is 0 by default; it is 1 at
     assistance 1."""
 
-    follows: ClassVar[Mapping[str, str]] = {"spawn_height": "height", "min_height": "height"}
-    """Parameters whose defaults follow the robot's body, with a field of `Proportions`. Heights
-    are above `ground`."""
-
     def __post_init__(self) -> None:
         commander = self.commander
         commander.skill.check_commands(commander.commands)
@@ -153,28 +150,35 @@ class TaskParams:
         """Height of the surface on which robots start, m."""
         return 0.0
 
+    def scaled(self, body: Proportions) -> dict[str, Any]:
+        """Returns the values of the parameters that follow a robot's body, by name.
+
+        `self` has those for a Go1. A task adds its own.
+        """
+        names = ("spawn_height", "min_height")
+        above = {name: getattr(self, name) - self.ground for name in names}
+        return {
+            name: self.ground + value * body.height if value > 0.0 else getattr(self, name)
+            for name, value in above.items()
+        }
+
     @classmethod
     def suited(cls, robot: str) -> Self:
-        """Returns the defaults for a robot, of which those in `follows` follow its body.
+        """Returns the defaults for a robot.
 
         InputError as of `mqe_jax.physics.robots.get`.
         """
         usual = cls()
-        proportions = robots.get(robot).proportions
-        changes: dict[str, Any] = {"robot": robot}
-        for name, size in cls.follows.items():
-            base = usual.ground if size == "height" else 0.0
-            value = getattr(usual, name)
-            if value > base:
-                factor = getattr(proportions, size)
-                changes[name] = value if factor == 1 else base + (value - base) * factor
-        return override(usual, changes)
+        body = robots.get(robot).proportions
+        scaled = {} if body == Proportions() else usual.scaled(body)
+        plain = {name: np.round(value, 3).tolist() for name, value in scaled.items()}
+        return override(usual, {"robot": robot, **plain})
 
     def changed(self, changes: Mapping[str, Any]) -> Self:
         """Returns the parameters with changes by name.
 
-        With another robot, values in `follows` that are the defaults become those of that robot,
-        unless they are among the changes.
+        With another robot, values that follow its body and are the defaults become those of that
+        robot, unless they are among the changes.
         """
         robot = changes.get("robot", self.robot)
         if robot == self.robot or not isinstance(robot, str):
@@ -183,7 +187,7 @@ class TaskParams:
         after = self.suited(robot)
         follow = {
             name: getattr(after, name)
-            for name in self.follows
+            for name in self.scaled(Proportions())
             if getattr(self, name) == getattr(before, name)
         }
         return override(self, {**follow, **changes})

@@ -3,6 +3,8 @@
 The other robot walks up the seesaw to a platform.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -16,6 +18,7 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds
 from mqe_jax.physics.objects import Platform, Seesaw
 from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.robots.robot import Proportions
 from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import EndWall, Plane, SpawnArea, Track
 
@@ -66,6 +69,12 @@ class SeesawParams(TaskParams):
     m^2."""
     rewards: SeesawRewards = SeesawRewards()
     """Weights of the reward terms."""
+
+    def scaled(self, body: Proportions) -> dict[str, Any]:
+        x, z = self.on_platform
+        top = self.platform.center[2]
+        heights = {"on_platform": (x, top + (z - top) * body.height)}
+        return super().scaled(body) | heights | {"height_base": self.height_base * body.height}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,6 +4,7 @@ By default a team is one robot.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.appearance import grounds, team_colors
 from mqe_jax.physics.objects import Platform, Ring
 from mqe_jax.physics.robots.index import RobotState
+from mqe_jax.physics.robots.robot import Proportions
 from mqe_jax.physics.scene import Scene
 from mqe_jax.sensors.scene import Entity
 from mqe_jax.terrain import Plane, SpawnArea, Track
@@ -64,6 +66,9 @@ class WrestlingParams(TaskParams):
     side drawn at random, so that one is near the edge of the ring. Inactive at assistance 0."""
     rewards: WrestlingRewards = WrestlingRewards()
     """Weights of the reward terms."""
+
+    def scaled(self, body: Proportions) -> dict[str, Any]:
+        return super().scaled(body) | {"ring_depth": self.ring_depth * body.height}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -7,7 +7,14 @@ import numpy as np
 
 from mqe_jax.core.errors import known_name
 from mqe_jax.viz.framing import Camera, fit, goal_points, hidden, smooth, targets
-from mqe_jax.viz.geometry import body_boxes, extent, pose_boxes, pose_frames, shown_bases
+from mqe_jax.viz.geometry import (
+    body_boxes,
+    extent,
+    height_factor,
+    pose_boxes,
+    pose_frames,
+    shown_bases,
+)
 from mqe_jax.viz.recording import Episode
 
 VIEWS = ("follow", "near", "scene", "side")
@@ -64,7 +71,8 @@ def _points(model: mujoco.MjModel, episode: Episode) -> list[np.ndarray]:
     robots = len(shown_bases(model))
     local = body_boxes(model, bodies)
     frames = []
-    margins = _MARGIN * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    margins = height_factor(model) * _MARGIN * corners
     for data in pose_frames(model, episode, range(len(episode))):
         boxes = pose_boxes(data, bodies, local)
         boxes[:robots] = data.xpos[bodies[:robots], None] + margins
@@ -138,5 +146,8 @@ def _beside(model: mujoco.MjModel, episode: Episode) -> list[Camera]:
     robot = shown_bases(model)[0]
     frames = pose_frames(model, episode, range(len(episode)))
     places = [data.xpos[robot, :2].tolist() for data in frames]
-    views = [Camera((x, y, 0.22), 1.3, azimuth=90.0, elevation=-8.0) for x, y in places]
+    factor = height_factor(model)
+    views = [
+        Camera((x, y, 0.22 * factor), 1.3 * factor, azimuth=90.0, elevation=-8.0) for x, y in places
+    ]
     return smooth(views, max(1, round(0.3 / episode.dt)))

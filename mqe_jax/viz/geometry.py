@@ -9,10 +9,16 @@ import numpy as np
 from mqe_jax.envs.sizes import HIGH, OUTSIDE
 from mqe_jax.physics.appearance import GROUND_GROUP, HIDDEN_GROUP
 from mqe_jax.physics.robots.index import trunk_bodies
+from mqe_jax.physics.robots.robot import GO1_HEIGHT
 from mqe_jax.viz.recording import Episode
 
 COLLISION_GROUP = HIDDEN_GROUP
 _SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T  # of a box's corners
+
+
+def height_factor(model: mujoco.MjModel) -> float:
+    """Returns the height of the first robot's standing trunk over that of a Go1."""
+    return float(model.body_pos[trunk_bodies(model)[0], 2]) / GO1_HEIGHT
 
 
 def shown_bases(model: mujoco.MjModel) -> list[int]:

@@ -13,13 +13,12 @@ from mqe_jax.core.limits import Length, NonNegative, Positive
 from mqe_jax.core.settings import Range, settings_class
 from mqe_jax.physics.robots import mjcf
 from mqe_jax.physics.robots.model import LEG_JOINTS, ModelRobot
-from mqe_jax.physics.robots.robot import Mirror, Proportions, WalkSettings
+from mqe_jax.physics.robots.robot import GO1_HEIGHT, Mirror, Proportions, WalkSettings
 from mqe_jax.physics.robots.shapes import Shapes
 from mqe_jax.physics.robots.skeleton import Foot, Skeleton
 
 GO1_MASS = 11.3  # kg
 GO1_EXTENT = np.array([0.36, 0.57])  # m, of its shapes across and along
-GO1_HEIGHT = 0.30  # m, of the standing trunk
 GO1_GAIN = 20.0  # N m/rad
 TIMESTEP = 0.005  # s, of the physics
 STABLE = 1.0  # derivative gain x physics step / inertia, at most

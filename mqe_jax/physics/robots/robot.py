@@ -18,6 +18,8 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.physics.appearance import Color, mix
 
+GO1_HEIGHT = 0.30
+"""Height of a standing Go1's trunk, m."""
 TRUNK = "trunk"
 """Name of the first body, and part of its collision shapes."""
 FOOT = "foot"
