@@ -1,5 +1,6 @@
 """Robots from MJCF files: what is read, what is refused, and what tasks do with them."""
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,20 @@ import pytest
 import mqe_jax
 from mqe_jax import cli
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import override
 from mqe_jax.envs import make
 from mqe_jax.export.scene import scene_settings, scene_xml
 from mqe_jax.physics import robots
 from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.index import Proprioception, RobotState
 from mqe_jax.physics.robots.model import ModelRobot
 from mqe_jax.physics.robots.quadruped import MIRROR
+from mqe_jax.physics.robots.robot import Proportions
+from mqe_jax.skills import agile
+from mqe_jax.walk import training
+from mqe_jax.walk.rewards import reward_terms
+from mqe_jax.walk.training import train_skill
+from mqe_jax.walk_policy import WalkPolicy
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "robots"
 DOG = str(EXAMPLES / "dog.xml")
@@ -352,3 +361,84 @@ def test_the_card_of_a_task_shows_the_robot_and_its_sizes(
         assert text in shown, text
     width = make("go1gate", impl="c", control="position", robot=BIPED).params.gate_width
     assert f"gate_width={width:g}" in shown
+
+
+def rewards_of(robot: ModelRobot, factor: float = 1.0) -> dict[str, float]:
+    """Terms of a robot that crouches and slides, whose lengths, and forces, are multiplied."""
+    count = robot.num_joints
+    state = RobotState(
+        position_w=jnp.array([[0.0, 0.0, 0.3]]),
+        quaternion=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
+        linear_velocity_w=jnp.array([[0.3, 0.1, 0.2]]),
+        angular_velocity_b=jnp.array([[0.1, 0.2, 0.3]]),
+        joint_position=jnp.asarray(robot.default_joints)[None],
+        joint_velocity=0.5 * jnp.ones((1, count)),
+        trunk_force=jnp.zeros(1),
+        active=jnp.ones(1, bool),
+    )
+    targets = jnp.tile(jnp.asarray(robot.default_joints), (3, 1)) + 0.01
+    terms = reward_terms(
+        robot,
+        state,
+        jnp.asarray(WalkPolicy(robot).default_commands("trot")),
+        error=jnp.zeros(3),
+        mean_error=jnp.zeros(3),
+        phases=jnp.array([0.2, 0.7, 0.7, 0.2]),
+        targets=targets,
+        applied=targets[0],
+        foot_force=factor * jnp.array([5.0, 9.0, 2.0, 7.0]),
+        strength=jnp.ones(()),
+        tolerance=1.0,
+    )
+    return {name: float(value) for name, value in terms.items()}
+
+
+def test_rewards_of_skills_are_relative_to_mass_and_height() -> None:
+    robot = read(DOG)
+    usual = rewards_of(dataclasses.replace(robot, sizes=Proportions()))
+    heavy = rewards_of(dataclasses.replace(robot, sizes=Proportions(mass=4.0)), factor=4.0)
+    tall = rewards_of(dataclasses.replace(robot, sizes=Proportions(height=2.0)))
+    assert heavy["swing_force"] == pytest.approx(usual["swing_force"])
+    assert heavy["torque"] == pytest.approx(usual["torque"] / 16)
+    assert tall["torque"] == pytest.approx(usual["torque"] / 4)
+    assert tall["body_height"] == pytest.approx(usual["body_height"] / 4)
+    assert tall["roll_pitch_rate"] == pytest.approx(2 * usual["roll_pitch_rate"])
+    assert usual["body_height"] > 0 and usual["torque"] > 0
+
+
+def test_small_robots_trot_faster_and_walk_slower() -> None:
+    small = dataclasses.replace(read(DOG), sizes=Proportions(height=0.25))
+    skill = agile.AgileSkill(small)
+    np.testing.assert_allclose(
+        skill.trained_ranges(("vx", "vy", "yaw_rate")), [[-0.75, 1.25], [-0.5, 0.5], [-2.5, 2.5]]
+    )
+    memory = skill.init_memory()
+    params = agile.NETWORKS.init(jax.random.PRNGKey(0))
+    sensed = Proprioception(
+        jnp.array([0.0, 0, -1]), jnp.asarray(small.default_joints), jnp.zeros(12)
+    )
+    _, after = skill.targets(params, memory, jnp.zeros(3), sensed)
+    assert float(after.gait) == pytest.approx(2 * 0.02 * 3.0)
+
+
+def test_the_training_of_a_skill_knows_how_the_robots_joints_mirror(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = dog(
+        (
+            '<joint name="FR_roll" class="roll"/>',
+            '<joint name="FR_roll" class="roll" axis="-1 0 0"/>',
+        )
+    )
+    odd = written(tmp_path, text, "speed: 20")
+    np.testing.assert_array_equal(odd.mirror.sign[[0, 3, 6, 9]], [1, 1, -1, -1])
+    configs = []
+    monkeypatch.setattr(training, "train", lambda env, config, *_, **__: configs.append(config))
+    few = override(training.AGILE, {"num_envs": 2, "total_steps": 48, "rollout_steps": 24})
+    train_skill("agile", tmp_path / "run", few, robot=odd.source, impl="c")
+    network = configs[0].network
+    assert network.mirror_signs == (1, 1, 1, 1, 1, 1, -1, 1, 1, -1, 1, 1)
+    assert configs[0].env["robot"] == odd.source
+    robot = read(BIPED)
+    with pytest.raises(InputError, match="agile' needs four legs of three joints; biped"):
+        train_skill("agile", tmp_path / "two", few, robot=robot.source, impl="c")

@@ -79,9 +79,9 @@ def stands(velocity: jax.Array) -> jax.Array:
     return _pace(velocity) < STAND
 
 
-def frequency(velocity: jax.Array) -> jax.Array:
+def frequency(velocity: jax.Array, tempo: float = 1.0) -> jax.Array:
     """Returns the frequency () of the trot, Hz, at a commanded velocity (3,)."""
-    low, high = FREQUENCY
+    low, high = (tempo * hertz for hertz in FREQUENCY)
     return low + (high - low) * jnp.minimum(_pace(velocity), 1.0)
 
 
@@ -94,9 +94,14 @@ def foot_phases(gait: jax.Array, velocity: jax.Array) -> jax.Array:
     return jnp.where(stands(velocity), 0.25, phases)
 
 
-def advance_gait(gait: jax.Array, velocity: jax.Array) -> jax.Array:
+def advance_gait(gait: jax.Array, velocity: jax.Array, tempo: float = 1.0) -> jax.Array:
     """Advances the gait phase by one step."""
-    return jnp.mod(gait + STEP * frequency(velocity), 1.0)
+    return jnp.mod(gait + STEP * frequency(velocity, tempo), 1.0)
+
+
+def tempo(robot: Robot) -> float:
+    """Returns the factor on the trot's frequency: that of a pendulum as long as the legs."""
+    return robot.proportions.height**-0.5
 
 
 def frame(robot: Robot, sensed: Proprioception, action: jax.Array) -> jax.Array:
@@ -118,6 +123,18 @@ def infer(params: Params, inputs: jax.Array, *, precision: str = "highest") -> j
     return layers(params["body"], inputs, precision)
 
 
+def _slowed(command: Command, factor: float) -> Command:
+    """Returns a command of velocity with smaller ranges; turns keep theirs."""
+    if command.name == "yaw_rate" or command.trained is None:
+        return command
+    low, high = command.trained
+    return command._replace(
+        gain=factor * command.gain,
+        limit=factor * command.limit,
+        trained=(factor * low, factor * high),
+    )
+
+
 @register
 class AgileSkill(Skill):
     """The agile skill."""
@@ -126,6 +143,12 @@ class AgileSkill(Skill):
     commands = COMMANDS
     period = STEP
     turn = 3.0
+
+    def __init__(self, robot: Robot) -> None:
+        super().__init__(robot)
+        slow = min(robot.proportions.height, 1.0) ** 0.5  # smaller robots walk slower
+        if slow < 1.0:
+            self.commands = tuple(_slowed(command, slow) for command in COMMANDS)
 
     def init_memory(self) -> AgileMemory:
         return AgileMemory(jnp.zeros((LENGTH, FRAME_SIZE)), jnp.zeros(NUM_JOINTS), jnp.zeros(()))
@@ -142,7 +165,7 @@ class AgileSkill(Skill):
         chosen = frames[LENGTH - 1 - np.array(OFFSETS)]
         inputs = jnp.concatenate([chosen.ravel(), now(memory.gait, command)])
         action = jnp.clip(infer(params, inputs, precision=PRECISION), -ACTION_CLIP, ACTION_CLIP)
-        gait = advance_gait(memory.gait, command)
+        gait = advance_gait(memory.gait, command, tempo(self.robot))
         return self.robot.joint_targets(action), AgileMemory(frames, action, gait)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:

@@ -22,7 +22,7 @@ from mqe_jax.envs.reward import weigh
 from mqe_jax.envs.state import Moment, State
 from mqe_jax.physics.robots.index import Proprioception, RobotState
 from mqe_jax.physics.robots.quadruped import NUM_JOINTS
-from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.physics.robots.robot import Proportions, Robot
 from mqe_jax.physics.rotation import quaternion_to_euler, rotate, rotate_inverse
 from mqe_jax.physics.scene import Scene
 from mqe_jax.terrain import Plane, Track
@@ -72,7 +72,12 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         self.trainee = trainees.make(skill, robot)
         self.name = skill  # pyright: ignore[reportAttributeAccessIssue]
         self.skill = self.trainee.skill
+        self.body = robot.proportions
         lagged = dataclasses.replace(RANDOMIZATION, action_lag=self.task.action_lag)
+        if self.body != Proportions():
+            payload = tuple(self.body.mass * x for x in RANDOMIZATION.payload or ())
+            shift = tuple(self.body.length * x for x in RANDOMIZATION.center_of_mass or ())
+            lagged = dataclasses.replace(lagged, payload=payload, center_of_mass=shift)
         changes = {
             "skill": skill,
             "episode_length": self.task.episode_length,
@@ -97,7 +102,8 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         turn = jnp.pi if self.task.command_period > 0 else 0.0
         yaw = jax.random.uniform(yaw_key, (), minval=-turn, maxval=turn)
         stand = self.robot.stand_height
-        height = jax.random.uniform(height_key, (), minval=stand + 0.03, maxval=stand + 0.12)
+        low, high = (stand + self.body.height * above for above in (0.03, 0.12))
+        height = jax.random.uniform(height_key, (), minval=low, maxval=high)
         return jnp.stack([jnp.zeros(()), jnp.zeros(()), height, yaw])[None]
 
     def reset_task(self, key: jax.Array, state: State, robot_state: RobotState) -> WalkState:
@@ -156,9 +162,10 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         begins = (walk.shove_steps == 0) & shoved
         angle = jax.random.uniform(angle_key, (), maxval=2 * jnp.pi)
         up = jax.random.uniform(up_key, (), minval=-0.3, maxval=0.3)
-        size = walk.spec.shove * jax.random.uniform(size_key, ())
+        size = self.body.mass * walk.spec.shove * jax.random.uniform(size_key, ())
         force = size * jnp.stack([jnp.cos(angle), jnp.sin(angle), up])
-        point = jnp.asarray(SHOVED) * jax.random.uniform(point_key, (3,), jnp.float32, -1.0, 1.0)
+        half = SHOVED * [self.body.length, self.body.width, self.body.height]
+        point = jnp.asarray(half) * jax.random.uniform(point_key, (3,), jnp.float32, -1.0, 1.0)
         arm = rotate(state.data.qpos[self.index.base_qpos[0, 3:]], point)
         length = jax.random.uniform(
             length_key, (), minval=self.task.shove_length[0], maxval=self.task.shove_length[1]
@@ -182,7 +189,8 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
         left = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)])
         forces = jnp.zeros((len(mass), 6)).at[:, :3].set(mass[:, None] * turn)
-        forces = forces.at[trunk, :2].add(walk.force[0] * along + walk.force[1] * left)
+        push = walk.force[0] * along + walk.force[1] * left
+        forces = forces.at[trunk, :2].add(self.body.mass * push)
         return forces.at[trunk].add(walk.shove) if self.task.shove else forces
 
     def step_task(self, before: Moment[WalkState], after: Moment[WalkState]) -> WalkState:
@@ -300,7 +308,8 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         phases = self.trainee.foot_phases(walk.gait, walk.spec.commands)
         optional = {}
         if self.task.shove:
-            optional["shove"] = walk.shove * jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
+            scale = jnp.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
+            optional["shove"] = walk.shove / self.body.mass * scale
         if self.task.action_lag:
             optional["action_lag"] = random.action_lag[None].astype(jnp.float32)
         return {
@@ -308,18 +317,18 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
             "linear_velocity": 2.0 * rotate_inverse(quaternion, robot_state.linear_velocity_w[0]),
             "angular_velocity": 0.25 * robot_state.angular_velocity_b[0],
             "up": rotate_inverse(quaternion, jnp.asarray(_UP)),
-            "height": 5.0 * height - 5.0 * self.robot.stand_height,
-            "foot_height": 10.0 * (feet[:, 2] + height),
+            "height": (5.0 * height - 5.0 * self.robot.stand_height) / self.body.height,
+            "foot_height": 10.0 * (feet[:, 2] + height) / self.body.height,
             "phases": jnp.cos(2 * jnp.pi * phases),
-            "foot_force": jnp.tanh(self.foot_force(state.data) / 50.0),
+            "foot_force": jnp.tanh(self.foot_force(state.data) / (50.0 * self.body.mass)),
             "mean_error": 2.0 * walk.mean_error,
             "force": walk.force / 20.0,
             **optional,
             "slope": walk.slope * 4.0,
-            "center_of_mass": random.center_of_mass[0] * 20.0,
+            "center_of_mass": random.center_of_mass[0] * (20.0 / self.body.length),
             "motor_strength": (random.motor_strength - 1.0) * 5.0,
             "friction": random.friction - 1.0,
-            "payload": random.payload / 2.0,
+            "payload": random.payload / (2.0 * self.body.mass),
         }
 
     @property

@@ -9,16 +9,16 @@ without gradient. Regression on `LATENT_TARGET` trains the adaptation network. T
 history is 9 frames. Its network sees five of them, the newest commands and the clock.
 
 The left-right symmetry of a quadruped is a loss: a mirrored observation deserves the mirrored
-action. Mirroring exchanges left and right legs and reverses y, roll, yaw and the hip joints. The
-parameters of the four gaits stay: exchanging a gait's left and right feet shifts its phase, which
-the clock shows.
+action. Mirroring exchanges left and right legs and reverses y, roll, yaw and joints such as hips.
+The parameters of the four gaits stay: exchanging a gait's left and right feet shifts its phase,
+which the clock shows.
 
 Source: walk-these-ways, Margolis and Agrawal, arXiv 2212.03238.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from mqe_jax.core.limits import Horizon, NonNegative
 from mqe_jax.core.settings import FileName, fail, settings_class
 from mqe_jax.core.types import Mask, Memory, NetworkMemory, Params
 from mqe_jax.physics import robots
-from mqe_jax.physics.robots.quadruped import MIRROR, NUM_JOINTS
+from mqe_jax.physics.robots.quadruped import MIRROR, NUM_JOINTS, NUM_LEGS
 from mqe_jax.physics.robots.robot import Mirror
 from mqe_jax.skills import agile
 from mqe_jax.skills.weights import Networks
@@ -73,8 +73,8 @@ class Form:
     """Numbers of an observation in a row; only the newest observation has the others too."""
     infer: Callable[..., tuple[jax.Array, Any]]
     """From weights and inputs (..., n) to actions (..., 12), and latents or None."""
-    mirror: Mirror
-    """Mirror of an input."""
+    mirror: Callable[[Mirror], Mirror]
+    """From the mirror of the joints to that of an input."""
 
     @property
     def past(self) -> int:
@@ -91,13 +91,16 @@ class Form:
             return flat
         return jnp.concatenate([flat, obs[..., self.row_size :]], axis=-1)
 
-    def symmetry_loss(self, params: Any, inputs: jax.Array, mean: jax.Array) -> jax.Array:
+    def symmetry_loss(
+        self, params: Any, inputs: jax.Array, mean: jax.Array, joints: Mirror
+    ) -> jax.Array:
         """Returns the mean square error () of mirrored inputs' actions against mirrored actions.
 
-        `inputs` are (B, n), the actions `mean` (B, 12).
+        `inputs` are (B, n), the actions `mean` (B, 12); `joints` is the mirror of the joints.
         """
-        other, _ = self.infer(params, self.mirror.reflect(inputs), precision=_PRECISION)
-        return jnp.mean(jnp.square(other - MIRROR.reflect(mean)))
+        mirrored = self.mirror(joints).reflect(inputs)
+        other, _ = self.infer(params, mirrored, precision=_PRECISION)
+        return jnp.mean(jnp.square(other - joints.reflect(mean)))
 
 
 WALK_FORM = Form(
@@ -105,7 +108,9 @@ WALK_FORM = Form(
     rows=np.arange(HISTORY),
     row_size=OBSERVATION_SIZE,
     infer=walk_policy.infer,
-    mirror=_join(*[_join(_GRAVITY, _COMMANDS, MIRROR, MIRROR, MIRROR, MIRROR, _FEET)] * HISTORY),
+    mirror=lambda joints: _join(
+        *[_join(_GRAVITY, _COMMANDS, joints, joints, joints, joints, _FEET)] * HISTORY
+    ),
 )
 AGILE_FORM = Form(
     networks=agile.NETWORKS,
@@ -115,8 +120,8 @@ AGILE_FORM = Form(
         agile.infer(params, inputs, precision=precision),
         None,
     ),
-    mirror=_join(
-        *[_join(_GRAVITY, MIRROR, MIRROR, MIRROR)] * len(agile.OFFSETS),
+    mirror=lambda joints: _join(
+        *[_join(_GRAVITY, joints, joints, joints)] * len(agile.OFFSETS),
         _signs(*(command.mirror for command in agile.COMMANDS)),
         _signs(-1.0, -1.0),  # the clock: the other pair of feet
     ),
@@ -133,6 +138,8 @@ class HistorySettings(GaussianSettings):
     """Steps of a chunk, at whose first one the history is stored."""
     symmetry_coef: NonNegative = 0.5
     """Weight of the loss of left-right symmetry."""
+    mirror_signs: tuple[Literal[-1, 1], ...] = (-1, 1, 1) * NUM_LEGS
+    """Signs of the joint angles of a mirrored robot. `train_skill` sets those of the robot."""
 
     form: ClassVar[Form]
     """What is specific to this network."""
@@ -141,6 +148,8 @@ class HistorySettings(GaussianSettings):
         form = self.form
         inputs = next(iter(form.networks.widths.values()))[0]
         expected = inputs - (len(form.rows) - 1) * form.row_size
+        if len(self.mirror_signs) != NUM_JOINTS:
+            fail("network.mirror_signs", self.mirror_signs, f"{NUM_JOINTS} numbers, -1 or 1")
         if (dims.agents, dims.observation, dims.action) != (1, expected, NUM_JOINTS):
             fail(
                 "network.name",
@@ -182,6 +191,8 @@ def windows(memory: jax.Array, is_first: jax.Array, obs: jax.Array, kept: np.nda
 
 
 def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
+    joints = Mirror(MIRROR.source, np.array(settings.mirror_signs, np.float32))
+
     def init(key: jax.Array) -> Params:
         policy_key, critic_key = jax.random.split(key)
         if settings.weights is None:
@@ -245,7 +256,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
             error = jnp.mean(jnp.square(latent - privileged[..., LATENT_TARGET]))
             losses["adaptation"] = settings.adaptation_coef * error
         if settings.symmetry_coef > 0:
-            asymmetry = form.symmetry_loss(params["policy"], inputs, mean)
+            asymmetry = form.symmetry_loss(params["policy"], inputs, mean, joints)
             losses["symmetry"] = settings.symmetry_coef * asymmetry
         return ChunkResult(
             log_prob(action, mean[..., None, :], log_std[..., None, :]),

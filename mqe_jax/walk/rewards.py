@@ -85,14 +85,18 @@ def reward_terms(
 
     `phases` are those of the feet (4,). `targets` are the joint targets of the last three steps,
     newest first (3, 12), and `applied` the one that the motors had. `tolerance` is that of
-    `WalkTask`. The others are as in `WalkState`.
+    `WalkTask`. The others are as in `WalkState`. Lengths, forces, torques and rates count relative
+    to the robot's height and mass.
     """
     target, previous_target, earlier_target = targets
+    size = robot.proportions.height
+    weight = robot.proportions.mass
     quaternion = robot_state.quaternion[0]
     height = robot_state.position_w[0, 2]
     joint_position = robot_state.joint_position[0]
     joint_velocity = robot_state.joint_velocity[0]
     contact = desired_contact(phases)
+    force = foot_force / weight
     velocity_b = rotate_inverse(quaternion, robot_state.linear_velocity_w[0])
     rate = robot_state.angular_velocity_b[0]
 
@@ -119,7 +123,7 @@ def reward_terms(
     )
     place = stance + shift[:, None] * speed * 0.5 / commands[4]
     swing = 1.0 - jnp.abs(1.0 - 2.0 * jnp.clip(2.0 * phases - 1.0, 0.0, 1.0))
-    wanted_height = commands[9] * swing + robot.foot_radius
+    wanted_height = commands[9] * size * swing + robot.foot_radius
 
     up = rotate_inverse(quaternion, jnp.array([0.0, 0.0, 1.0]))
     tilt = euler_to_quaternion(jnp.stack([commands[11], commands[10], jnp.zeros(())]))
@@ -138,19 +142,21 @@ def reward_terms(
         "track_mean_velocity": _closeness(mean_error[:2], 0.055 * tolerance),
         "track_yaw": _closeness(error[2:], 0.14 * tolerance),
         "track_mean_yaw": _closeness(mean_error[2:], 0.055 * tolerance),
-        "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(foot_force) / 100.0))),
-        "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / 10.0))),
-        "body_height": jnp.square(height - robot.stand_height - commands[3]),
+        "swing_force": jnp.mean((1 - contact) * (1 - jnp.exp(-jnp.square(force) / 100.0))),
+        "stance_speed": jnp.mean(contact * (1 - jnp.exp(-foot_speed / size / 10.0))),
+        "body_height": jnp.square((height - robot.stand_height - commands[3]) / size),
         "orientation": jnp.sum(jnp.square(up[:2] - wanted_up[:2])),
-        "raibert": jnp.sum(jnp.square(feet_heading - place)),
-        "footswing_height": jnp.sum((1 - contact) * jnp.square(foot_height - wanted_height)),
-        "foot_slip": jnp.sum(jnp.where(foot_force > 1.0, foot_speed_xy, 0.0)),
+        "raibert": jnp.sum(jnp.square((feet_heading - place) / size)),
+        "footswing_height": jnp.sum(
+            (1 - contact) * jnp.square((foot_height - wanted_height) / size)
+        ),
+        "foot_slip": jnp.sum(jnp.where(force > 1.0, foot_speed_xy / size, 0.0)),
         "smoothness": jnp.sum(jnp.square(target - previous_target)),
         "second_smoothness": jnp.sum(jnp.square(target - 2 * previous_target + earlier_target)),
-        "torque": jnp.sum(jnp.square(torque)),
-        "joint_velocity": jnp.sum(jnp.square(joint_velocity)),
+        "torque": jnp.sum(jnp.square(torque / (weight * size))),
+        "joint_velocity": size * jnp.sum(jnp.square(joint_velocity)),
         "joint_limit": jnp.sum(beyond),
         "limb_contact": jnp.sum(kneeling).astype(jnp.float32),
-        "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]),
-        "roll_pitch_rate": jnp.sum(jnp.square(rate[:2])),
+        "vertical_speed": jnp.square(robot_state.linear_velocity_w[0, 2]) / size,
+        "roll_pitch_rate": size * jnp.sum(jnp.square(rate[:2])),
     }

@@ -54,13 +54,15 @@ class WalkTask:
     slope_share: Fraction = 0.5
     """Fraction of the episodes' specs that have a slope."""
     force: Force = 40.0
-    """Maximum sustained horizontal force on the trunk, N."""
+    """Maximum sustained horizontal force on the trunk of a Go1, N; on others in proportion to the
+    mass."""
     push: Velocity = 0.9
     """Maximum instantaneous change of the trunk's velocity, m/s."""
     push_period: TimeLimit = 4.0
     """Mean time between pushes, s."""
     shove: Force = 0.0
-    """Maximum force of a shove at a random point of the trunk, as by a robot or a box, N."""
+    """Maximum force of a shove at a random point of a Go1's trunk, as by a robot or a box, N; on
+    others in proportion to the mass."""
     shove_length: Range = (0.2, 1.0)
     """Duration of a shove, s."""
     shove_period: TimeLimit = 5.0

@@ -117,7 +117,12 @@ class Agile(Trainee):
     def commands(self, velocity: jax.Array) -> jax.Array:
         """Returns the commands (15,) of the trot with a velocity (3,)."""
         default = jnp.asarray(WalkPolicy(self.robot).default_commands("trot"))
-        return default.at[:3].set(velocity).at[4].set(agile.frequency(velocity))
+        return (
+            default.at[:3]
+            .set(velocity)
+            .at[4]
+            .set(agile.frequency(velocity, agile.tempo(self.robot)))
+        )
 
     def observe(self, memory: WalkMemory, commands: jax.Array, sensed: Proprioception) -> jax.Array:
         frame = agile.frame(self.robot, sensed, memory.action)

@@ -6,10 +6,12 @@ Settings are those of walk-these-ways (arXiv 2212.03238) where known.
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from mqe_jax.core.settings import checked, fail, override, to_mapping
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.physics import robots
+from mqe_jax.physics.robots.quadruped import MIRROR
 from mqe_jax.train.config import (
     PPO,
     Checkpointing,
@@ -129,6 +131,11 @@ def train_skill(
     if weights is not None:
         network.form.networks.load(body, weights)
         config = override(config, {"network.weights": str(Path(weights).resolve())})
+    if not np.array_equal(body.mirror.source, MIRROR.source):  # left and right differ
+        config = override(config, {"network.symmetry_coef": 0.0})
+    elif not np.array_equal(body.mirror.sign, MIRROR.sign):
+        signs = [int(sign) for sign in body.mirror.sign]
+        config = override(config, {"network.mirror_signs": signs})
     env = WalkEnv(body, task or default_task, skill=skill, impl=impl, num_envs=config.num_envs)
     config = override(config, {"env": {"control": env.control, **to_mapping(env.params)}})
 
