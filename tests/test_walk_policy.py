@@ -580,7 +580,7 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
         left = observation(joints, gravity, commands, 0.15)
         right = observation(mirrored, gravity * [1, -1, 1], other, 0.65)
         np.testing.assert_allclose(
-            WALK_FORM.mirror.reflect(jnp.tile(left, 30))[:70], right, atol=1e-5
+            WALK_FORM.mirror(MIRROR).reflect(jnp.tile(left, 30))[:70], right, atol=1e-5
         )
 
 
@@ -590,7 +590,7 @@ def test_descending_the_loss_makes_a_policy_symmetric() -> None:
 
     @jax.jit
     def loss(params: walk_policy.Params) -> jax.Array:
-        return WALK_FORM.symmetry_loss(params, flat, walk_policy.infer(params, flat)[0])
+        return WALK_FORM.symmetry_loss(params, flat, walk_policy.infer(params, flat)[0], MIRROR)
 
     before = float(loss(params))
     descend = jax.jit(
@@ -682,7 +682,9 @@ def test_a_mirrored_input_is_that_of_the_mirrored_robot() -> None:
         velocity = jnp.array([1.0, 0.5, -2.0]) * (side if mirror else 1.0)
         return jnp.concatenate([*rows, agile.now(jnp.float32(0.7 if mirror else 0.2), velocity)])
 
-    np.testing.assert_allclose(AGILE_FORM.mirror.reflect(inputs(False)), inputs(True), atol=1e-5)
+    np.testing.assert_allclose(
+        AGILE_FORM.mirror(MIRROR).reflect(inputs(False)), inputs(True), atol=1e-5
+    )
     flipped = trainee.foot_phases(jnp.float32(0.7), jnp.array([1.0, 0.0, 0.0]))
     straight = trainee.foot_phases(jnp.float32(0.2), jnp.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(flipped, straight[jnp.array([1, 0, 3, 2])], atol=1e-6)
