@@ -1,20 +1,22 @@
 """MkDocs hooks: pages generated from the code, and conversion of links and formulas.
 
 Generated: the pages `FILES`, one page per task (clip, sizes, observation, rewards, parameters) with
-an overview, and the pages reference/MODULE.md in the navigation of mkdocs.yml. LaTeX becomes
-MathML. Links to modules lead to their reference pages, other links to files outside docs/ to the
-repository's address, `[project.urls]` in pyproject.toml. If it is not set they become paths: the
-built site then needs neither the repository nor another host. The page of `mqe play-site` is part
-of the site if it is in build/play; otherwise the site says how to build it.
+an overview, the tables that end settings.md, and the pages reference/MODULE.md in the navigation of
+mkdocs.yml. LaTeX becomes MathML. Links to modules lead to their reference pages, other links to
+files outside docs/ to the repository's address, `[project.urls]` in pyproject.toml. If it is not
+set they become paths: the built site then needs neither the repository nor another host. The page
+of `mqe play-site` is part of the site if it is in build/play; otherwise the site says how to build
+it.
 """
 
 import contextlib
 import functools
 import io
+import itertools
 import posixpath
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,9 +80,11 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Converts links and formulas of a page; the page about playing gets its link."""
+    """Converts links and formulas of a page; adds the link to play and the tables of settings."""
     if page.file.src_uri == "play.md":
         markdown = play_link(markdown, _playable())
+    if page.file.src_uri == "settings.md":
+        markdown = f"{markdown}\n{all_settings()}"
     folder = posixpath.dirname(page.file.src_uri)
     return formulas(links(markdown, repository(), folder, _reference(config)))
 
@@ -210,8 +214,52 @@ def overview(tasks: Mapping[str, Any]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def all_settings() -> str:
+    """Returns tables of all settings of a training, and of the parameters that tasks share."""
+    from mqe_jax.envs.facts import fields
+    from mqe_jax.envs.params import TaskParams
+    from mqe_jax.envs.registry import SHIPPED
+    from mqe_jax.presets import resolve
+    from mqe_jax.train.config import TrainConfig
+    from mqe_jax.train.networks import NETWORKS
+
+    columns = [
+        "total_steps",
+        "num_envs",
+        "rollout_steps",
+        "ppo.gamma",
+        "ppo.entropy_coef",
+        "imitation.teacher",
+    ]
+    tasks = []
+    for name in SHIPPED:
+        values = {x.name: _shown(x.value) for x in fields(resolve(name))}
+        tasks.append([f"[`{name}`](tasks/{name}.md)", *(values[column] for column in columns)])
+    every = [x for x in fields(TrainConfig()) if x.name != "task"]
+    settings = sorted(every, key=lambda x: "." in x.name)  # general ones first
+    sections = [
+        "## Default settings of each task",
+        _rows(["task", *(f"`{name}`" for name in columns)], tasks),
+        "## All settings of a training",
+        "The defaults are those of a settings file that leaves them out.",
+        _table(settings, "default"),
+    ]
+    usual = {x.name for x in settings}
+    for name in sorted(NETWORKS.keys() - {TrainConfig().network.name}):
+        own = [x for x in fields(NETWORKS[name](), "network.") if x.name not in usual]
+        sections += [f"### With `network.name: {name}`", _table(own, "default")]
+    sections += [
+        "## Parameters of all tasks",
+        "A task may have other defaults: see [its page](tasks/index.md). "
+        "[Ranges of `randomization`](reference/envs.randomization.md) have names of their own.",
+        _table(fields(TaskParams()), "default"),
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
 def task_page(task: Any) -> str:
     """Returns the page of a task."""
+    from mqe_jax.cli.task_card import describe
     from mqe_jax.envs import SCRIPTED
     from mqe_jax.envs.facts import facts
 
@@ -232,8 +280,13 @@ def task_page(task: Any) -> str:
     commands = {
         f"mqe render {name}{flags} -o clip.webp": f"a clip of the {policy} policy",
         f"mqe view {name}{flags}": "live, in the browser",
-        f"mqe train {name}": "train a policy",
     }
+    for training in describe(env)["training"]:
+        millions = f"{training['steps'] / 1e6:g} M steps"
+        commands[training["command"]] = f"{millions} of {training['environments']} environments"
+    term = about.rewards[0]
+    twice = f"--set rewards.{term.name}={2 * term.value:g}"
+    commands[f"mqe train {name} {twice}"] = "with twice the weight of a reward"
     ranges = [f"`{name}` {text}" for name, text in about.actions.items()]
     width = max(map(len, commands))
     lines = "\n".join(f"{command:{width}}  # {text}" for command, text in commands.items())
@@ -250,17 +303,18 @@ def task_page(task: Any) -> str:
         task.aim,
         *media,
         f"```bash\n{lines}\n```",
-        "[Settings of the training, and what to expect](../results/settings.md).",
+        "[What a training reaches](../results/settings.md). [All settings](../settings.md).",
         "\n".join([*lead, about.about]),
         f"## Observation of an agent\n\n{env.observation_size} numbers:",
         "| block | width | meaning |\n|---|---|---|\n" + "\n".join(rows),
         f"A critic may also see the privileged observation, {env.privileged_observation_size} "
         "numbers.",
         "## Reward terms\n\n" + _table(about.rewards, "weight"),
-        "Set a weight with `--set rewards.NAME=VALUE` or `make(task, rewards={...})`.",
+        "Set a weight with `--set rewards.NAME=VALUE` or `make(task, rewards={...})`. Terms whose "
+        "weight is 0 are for [training](../shaping.md).",
         "## Parameters\n\n" + _table(about.parameters, "default"),
         "Set one with `--set NAME=VALUE` or `make(task, NAME=VALUE)`. "
-        "All tasks share [further parameters](../reference/envs.params.md).",
+        "All tasks share [further parameters](../settings.md#parameters-of-all-tasks).",
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -269,10 +323,17 @@ def _clip(name: str) -> str | None:
     return f"../clips/{name}.webp" if (ROOT / "docs" / "clips" / f"{name}.webp").is_file() else None
 
 
-def _table(fields: Sequence[Field], column: str) -> str:
-    """Returns a table of parameters or reward terms."""
-    rows = [f"| `{x.name}` | {_shown(x.value)} | {_cell(x.meaning)} |" for x in fields]
-    return "\n".join([f"| name | {column} | meaning |", "|---|---|---|", *rows])
+def _table(fields: Iterable[Field], column: str) -> str:
+    """Returns a table of settings, parameters or reward terms."""
+    rows = [[f"`{x.name}`", _shown(x.value), x.allowed, _cell(x.meaning)] for x in fields]
+    return _rows(["name", column, "allowed", "meaning"], rows)
+
+
+def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Returns a table; a column without content, such as of what is allowed, is left out."""
+    lines = [head, ["---"] * len(head), *rows]
+    kept = [any(row[i] for row in lines[2:]) for i in range(len(head))]
+    return "\n".join(f"| {' | '.join(itertools.compress(line, kept))} |" for line in lines)
 
 
 def _cell(text: str) -> str:
@@ -285,4 +346,8 @@ def _package() -> Any:
 
 
 def _shown(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else f"`{value}`"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if type(value) is int:
+        return f"{value:_}"
+    return f"`{list(value) if isinstance(value, tuple) else value}`"

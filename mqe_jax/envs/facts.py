@@ -69,7 +69,7 @@ def facts(env: QuadrupedEnv) -> Facts:
     described = [(kind.name, body.strip()) for kind, (_, _, body) in pairs if body]
     of, about = next(iter(described), (env.name, ""))
     usual = vars(TaskParams())
-    fields = list(_fields(env.params))
+    parameters = list(fields(env.params))
     given = vars(env.params)
     shared = {name for name in usual if given[name] == usual[name]}
     return Facts(
@@ -78,9 +78,9 @@ def facts(env: QuadrupedEnv) -> Facts:
         about=re.sub(r"see `\w+Rewards`", "the terms below", about),
         actions=_actions(env),
         ends=_ends(env),
-        rewards=list(_fields(env.weights)),
-        parameters=[field for field in fields if field.name.partition(".")[0] not in shared],
-        shared=[field for field in fields if field.name.partition(".")[0] in shared],
+        rewards=list(fields(env.weights)),
+        parameters=[field for field in parameters if field.name.partition(".")[0] not in shared],
+        shared=[field for field in parameters if field.name.partition(".")[0] in shared],
     )
 
 
@@ -106,8 +106,11 @@ def _ends(env: QuadrupedEnv) -> str:
     return ", ".join(ends)
 
 
-def _fields(values: Any, prefix: str = "") -> Iterator[Field]:
-    """Yields the fields of settings, those of their class first, then those of its bases."""
+def fields(values: Any, prefix: str = "") -> Iterator[Field]:
+    """Yields the fields of settings, those of their class first, then those of its bases.
+
+    Reward weights and randomisation ranges are left out.
+    """
     kind = type(values)
     texts = [meanings(base) for base in kind.__mro__]
     last = texts[-2] if len(texts) > 1 else {}
@@ -116,7 +119,7 @@ def _fields(values: Any, prefix: str = "") -> Iterator[Field]:
         value = getattr(values, name)
         if dataclasses.is_dataclass(value):  # an object of the scene, or a group
             if name not in _GROUPS:
-                yield from _fields(value, f"{prefix}{name}.")
+                yield from fields(value, f"{prefix}{name}.")
             continue
         text = next((text[name] for text in texts if name in text), "")
         yield Field(f"{prefix}{name}", value, allowed(hints[name]), " ".join(text.split()))
