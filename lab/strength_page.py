@@ -2,10 +2,10 @@
 
 `python -m lab.strength_page` reads the rates that `python -m lab.measure lab/strength.yaml --part
 PART` measured, as results/strength/PART.csv, mixed teams in crossplay_TASK.json and best responses
-in exploitability.csv. Version 0.3.0 measured pool_TASK.json (teams trained with pools of mates) and
-oracle.json (mixtures). `python -m lab.strength_page --rates FOLDER` first copies the results of
-every part that is below FOLDER; best responses and mixed teams of tasks that it lacks stay. The
-table of other conditions has a row for each task that is measured under all of them.
+in exploitability.csv. Version 0.3.0 measured oracle.json (mixtures). `python -m lab.strength_page
+--rates FOLDER` first copies the results of every part that is below FOLDER; best responses and
+mixed teams of tasks that it lacks stay. The table of other conditions has a row for each task that
+is measured under all of them.
 """
 
 import argparse
@@ -35,7 +35,6 @@ SECTIONS = {
     "exploitability.md": ("exploitability",),
     "robustness.md": ("robustness",),
     "mates.md": ("mates",),
-    "pools.md": ("pools",),
     "skills.md": ("walk",),
 }
 """Filled sections of each page."""
@@ -55,7 +54,6 @@ MATCHES = (
     "go1football-1vs1",
     "go1football-2vs2",
 )
-POOLS = ("go1gate", "go1seesaw", "go1sheep-easy", "go1sheep-hard", "go1football-defender")
 PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
 MEMBER_EPISODES = 256
 CONDITIONS = {
@@ -232,16 +230,6 @@ def mates(task: str) -> dict[str, Rate]:
     return {name: Rate(*map(float, mean)) for name, mean in found.items()}
 
 
-def team(task: str, first: str, second: str) -> Rate:
-    """Returns the success of a team whose agent 0 follows one policy, the others another one."""
-    for data in (published(f"pool_{task}"), published(f"crossplay_{task}")):
-        if {first, second} <= {*data["policies"]}:
-            i = data["policies"].index(first)
-            j = data["policies"].index(second)
-            return Rate(*(data["success"][key][i][j] for key in Rate._fields))
-    raise InputError(f"results/strength: has no team of {first} and {second}")
-
-
 def drawn_mates(task: str) -> dict[str, tuple[Rate]]:
     """Returns the means over mixed teams that are drawn, by label."""
     labels = {"same": "own mate", "cross": "other seed", "scripted": "scripted", "idle": "idle"}
@@ -255,32 +243,6 @@ def mixed() -> str:
         found = mates(task)
         body.append([f"`{task}`", *(found[name].percent for name in ("same", "cross", "gap"))])
     return table(("task", "own mate, %", "other seed, %", "difference, points"), body)
-
-
-def pool(task: str) -> list[Rate]:
-    """Returns a team's success before and after it trained with a pool: of its robots together,
-    with a new mate.
-    """
-    data = published(f"pool_{task}")
-    before = data["start"]
-    after = data["policies"][0]
-    new = data["policies"][-1]
-    return [
-        team(task, *pair)
-        for pair in ((before, before), (after, after), (new, before), (new, after))
-    ]
-
-
-def pools() -> str:
-    """Returns the table of teams before and after they trained with a pool of mates."""
-    body = [[f"`{task}`", *(each.percent for each in pool(task))] for task in POOLS]
-    return table(("task", "own mate before, %", "after, %", "new mate before, %", "after, %"), body)
-
-
-def drawn_pool(task: str) -> dict[str, tuple[Rate]]:
-    """Returns the rates of `pool` that are drawn, by label."""
-    labels = ("own mate, before", "own mate, after", "new mate, before", "new mate, after")
-    return {label: (each,) for label, each in zip(labels, pool(task), strict=True)}
 
 
 def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -> bytes:
@@ -369,7 +331,6 @@ def tables() -> dict[str, str]:
         "exploitability": exploitability(),
         "robustness": robustness(robust_rates()),
         "mates": mixed(),
-        "pools": pools(),
         "walk": walk(rates("matches")),
     }
 
@@ -386,7 +347,6 @@ def pictures() -> dict[str, bytes]:
         "strength.png": draw_rates(teams, label),
         "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
         "mates.png": draw_rates({task: drawn_mates(task) for task in COOPERATIVE}, "success, %"),
-        "pools.png": draw_rates({task: drawn_pool(task) for task in POOLS}, "success, %"),
         "robustness.png": draw_heat(robust_rates()),
         "exploitability.png": draw_leads(rows("exploitability")),
     }

@@ -219,9 +219,3 @@ def test_parts_that_a_folder_has_are_copied(data: Path, tmp_path: Path) -> None:
         for file in data.iterdir()
         if file.read_bytes() != before[file.name]
     }
-
-
-@pytest.mark.parametrize("task", strength_page.POOLS)
-def test_a_pool_of_mates_has_neither_the_team_nor_the_new_mate(task: str) -> None:
-    pool = strength_page.published(f"pool_{task}")
-    assert len(pool["mates"]) == 3 and not {pool["start"], pool["policies"][-1]} & {*pool["mates"]}
