@@ -738,6 +738,20 @@ def test_files_and_policies_of_run_folders_are_told_from_names(
         Path(folder).mkdir()
     for file in ("run/policy.safetensors", "go1gate/policy.safetensors", "weights"):
         Path(file).write_text("a")
+    shipped = str(zoo.file_of("go1gate"))
     values = {"task": "go1gate", "start": "run", "env": {"skill_weights": "weights"}}
     values |= {"opponents": ["idle", "empty", "none", "", "x" * 300, "\0"], "seed": 1}
     assert {*provenance.digests(values)} == {"run", "weights"}
+    assert provenance.digests({"start": "go1gate"})["go1gate"] == provenance.digest(shipped)
+
+
+def test_a_result_of_a_shipped_policy_comes_from_its_contents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zoo, "FOLDER", tmp_path)
+    assert provenance.digests({"policy": "go1gate"}) == {}
+    found = []
+    for content in (b"one", b"other"):
+        (tmp_path / "go1gate.safetensors").write_bytes(content)
+        found.append(provenance.digests({"policy": "go1gate"})["go1gate"])
+    assert found[0] != found[1]

@@ -11,6 +11,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import parsing, read_json, write_atomically
 from mqe_jax.core.settings import leaves, to_mapping
 from mqe_jax.envs.registry import TASKS
+from mqe_jax.policies import zoo
 from mqe_jax.train.policy import POLICY_FILE
 
 
@@ -27,10 +28,11 @@ def provenance(**passed: Any) -> dict[str, Any]:
 def digests(values: Any) -> dict[str, str]:
     """Returns the SHA-256 of every file that a text in nested values names.
 
-    For a run folder it is that of its policy.
+    For a run folder it is that of its policy, for a task that of its shipped policy.
     """
-    named = {text: digest(text) for text in _texts(values) if text and text not in TASKS}
-    return {text: found for text, found in named.items() if found is not None}
+    files_of = {text: zoo.file_of(text) if text in TASKS else text for text in _texts(values)}
+    found = {text: digest(file) for text, file in files_of.items() if file}
+    return {text: each for text, each in found.items() if each is not None}
 
 
 def digest(path: str | Path) -> str | None:
@@ -41,11 +43,13 @@ def digest(path: str | Path) -> str | None:
 
 
 def _texts(values: Any) -> Iterator[str]:
-    """Yields the texts in nested mappings and lists, without names of mappings."""
+    """Yields the texts in nested mappings and lists that can name files or policies."""
     if isinstance(values, str):
         yield values
-    elif isinstance(values, Mapping | list):
-        for value in values.values() if isinstance(values, Mapping) else values:
+    elif isinstance(values, Mapping):
+        yield from _texts([values[name] for name in values if name not in ("task", "tasks")])
+    elif isinstance(values, list):
+        for value in values:
             yield from _texts(value)
 
 
