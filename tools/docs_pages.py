@@ -223,14 +223,7 @@ def all_settings() -> str:
     from mqe_jax.train.config import TrainConfig
     from mqe_jax.train.networks import NETWORKS
 
-    columns = [
-        "total_steps",
-        "num_envs",
-        "rollout_steps",
-        "ppo.gamma",
-        "ppo.entropy_coef",
-        "imitation.teacher",
-    ]
+    columns = ["total_steps", "num_envs", "ppo.gamma", "ppo.entropy_coef", "imitation.teacher"]
     tasks = []
     for name in SHIPPED:
         values = {x.name: _shown(x.value) for x in fields(resolve(name))}
