@@ -1,5 +1,7 @@
 """Spheres and capsules in place of shapes of other kinds: all engines support them."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -38,7 +40,7 @@ def fit(points: np.ndarray, most: int = ROW) -> list[Primitive]:
     """
     _, principal = np.linalg.eigh(np.cov((points - points.mean(axis=0)).T))
     rows = [_row(points, axes, most) for axes in (np.eye(3), principal)]
-    return min(rows, key=lambda row: round(sum(_volume(each) for each in row), 9))
+    return min(rows, key=lambda row: round(volume(row), 9))
 
 
 def _row(points: np.ndarray, axes: np.ndarray, most: int) -> list[Primitive]:
@@ -61,6 +63,11 @@ def _row(points: np.ndarray, axes: np.ndarray, most: int) -> list[Primitive]:
             ends = (_triple(center - reach), _triple(center + reach))
             found.append(Primitive("capsule", float(radius), *ends))
     return found
+
+
+def volume(primitives: Sequence[Primitive]) -> float:
+    """Returns the sum of the volumes of spheres and capsules, m^3."""
+    return sum(_volume(each) for each in primitives)
 
 
 def _volume(primitive: Primitive) -> float:

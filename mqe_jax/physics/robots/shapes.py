@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from mqe_jax.core.errors import brief
-from mqe_jax.physics.robots.fitting import ROW, cloud, fit
+from mqe_jax.physics.robots.fitting import ROW, cloud, fit, volume
 from mqe_jax.physics.robots.robot import (
     FOOT,
     TRUNK,
@@ -33,6 +33,7 @@ _KINDS: dict[int, Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "
 }
 _ROUND = (int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_CAPSULE))
 _UP = np.array([0.0, 0.0, 1.0])
+SLACK = 0.7  # share of the volume of capsules about all at which each shape has its own
 SHORT = 0.05  # m, between two joints for which there is no capsule
 SLIM = 0.06  # radius over length of a capsule between two joints
 FEW = 2  # round shapes of a body that are kept as they are; more become one
@@ -104,7 +105,11 @@ class Shapes:
         if solid and plain and len(solid) <= FEW:
             found = [self._primitive(g) for g in solid]
         elif solid or drawn:
-            found = fit(np.concatenate([cloud(self.model, g) for g in solid or drawn]))
+            clouds = [cloud(self.model, g) for g in solid or drawn]
+            found = fit(np.concatenate(clouds))
+            alone = [each for points in clouds for each in fit(points, 1)]
+            if len(alone) <= ROW and volume(alone) < SLACK * volume(found):
+                found = alone
             self.meshes |= {self._mesh(g) for g in solid or drawn} - {""}
         else:
             found = self._bones(body)
