@@ -86,6 +86,14 @@ def test_rooms_import_from_those_above() -> None:
             assert {module.split(".")[0] for module in imported(path, {*every})} <= above, name
 
 
+def test_only_skills_know_how_many_joints_a_quadruped_has() -> None:
+    every = modules()
+    room = "physics.robots.quadruped"
+    users = {name for name, path in every.items() if room in imported(path, {*every})}
+    own = {name for name in users if not name.startswith(("walk", "skills."))}
+    assert own == {"physics.robots.go1", "physics.robots.go2"}
+
+
 def test_commands_do_not_import_each_other() -> None:
     every = {name: path for name, path in modules().items() if name.startswith("cli")}
     graph = {name: imported(path, {*every}) & every.keys() - {name} for name, path in every.items()}

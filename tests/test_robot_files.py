@@ -442,3 +442,39 @@ def test_the_training_of_a_skill_knows_how_the_robots_joints_mirror(
     robot = read(BIPED)
     with pytest.raises(InputError, match="agile' needs four legs of three joints; biped"):
         train_skill("agile", tmp_path / "two", few, robot=robot.source, impl="c")
+
+
+PAGE = Path(__file__).parents[1] / "docs" / "robot_files.md"
+SMALL = "--impl c --num-envs 4 --total-steps 96 --ppo.minibatches 1 --ppo.epochs 1".split()
+FEW: dict[str, list[str]] = {
+    "tasks": ["--impl", "c"],
+    "skill train": [*SMALL, "--rollout-steps", "12", "--network.chunk-length", "6"],
+    "skill eval": ["--impl", "c", "--episodes", "4", "--scenario", "flat"],
+    "train": [*SMALL, "--rollout-steps", "12"],
+    "eval": ["--impl", "c", "--episodes", "4"],
+}
+"""Flags that make the page's commands small."""
+
+
+@pytest.mark.soak
+def test_the_commands_of_the_page_lead_from_a_file_to_a_trained_team(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(EXAMPLES.parent)
+    block = PAGE.read_text().split("```bash\n")[1].split("```")[0]
+    ran = []
+    for line in block.splitlines():
+        words = line.split()[1:]
+        name = " ".join(words[:2]) if words[0] == "skill" else words[0]
+        if name != "view":  # waits for a browser
+            assert cli.main([*words, *FEW[name]]) == 0, capsys.readouterr().err
+            ran.append(name)
+    assert ran == list(FEW)
+    assert "dog@" in (tmp_path / "runs/agile-dog/agile.safetensors").read_bytes().decode("latin")
+    assert "success" in capsys.readouterr().out
+
+
+def test_a_path_is_a_robot_too() -> None:
+    env = make("go1plane", impl="c", control="position", robot=Path(BIPED))
+    assert env.params.robot == BIPED and env.robot is read(BIPED)

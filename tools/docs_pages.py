@@ -286,7 +286,7 @@ def task_page(task: Any) -> str:
     lead = [
         f"- Robots: {' vs '.join(str(len(team)) for team in env.teams)}.",
         f"- Action: commands of the skill `{env.params.skill}` ({', '.join(ranges)}). "
-        "With control `position` or `torque`, 12 numbers.",
+        "With control `position` or `torque`, a number for each joint.",
     ]
     rows = [
         f"| `{b.name}` | {b.width} | {b.meaning or ''} |" for b in env.observation_layout.blocks

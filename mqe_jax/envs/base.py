@@ -523,7 +523,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         return out & robot_state.active
 
     def _ctrl(self, targets: jax.Array) -> jax.Array:
-        """Returns the engine's control (nu,) from targets of all robots (R, 12)."""
+        """Returns the engine's control (nu,) from targets of all robots (R, J)."""
         return scatter(np.zeros(self.compiled.model.nu), self.index.actuator, targets)
 
     def _sample_robots(self, pose: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -1,6 +1,7 @@
 """Parameters common to all tasks."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
@@ -181,6 +182,9 @@ class TaskParams:
         robot, unless they are among the changes.
         """
         robot = changes.get("robot", self.robot)
+        if isinstance(robot, Path):
+            robot = str(robot)
+            changes = {**changes, "robot": robot}
         if robot == self.robot or not isinstance(robot, str):
             return override(self, changes)
         before = self.suited(self.robot)

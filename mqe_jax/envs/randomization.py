@@ -78,7 +78,7 @@ class RandomizedParams:
     motor_strength: jax.Array
     """Factor on all torques (R,)."""
     motor_offset: jax.Array
-    """Offset of the joint targets (R, 12), rad; not in the privileged observation."""
+    """Offset of the joint targets (R, J), rad; not in the privileged observation."""
     joint_mechanics: jax.Array
     """Factor on rotor inertia, damping and dry friction (R,); not in the privileged observation."""
     action_lag: jax.Array

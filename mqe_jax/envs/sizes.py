@@ -149,7 +149,7 @@ class Sizes:
         )
 
     def hold(self, target: jax.Array, active: jax.Array) -> jax.Array:
-        """Returns actuator targets (R, 12), neutral for the agents that are not active (A,)."""
+        """Returns actuator targets (R, J), neutral for the agents that are not active (A,)."""
         if not self._vary:
             return target
         agents = len(active)

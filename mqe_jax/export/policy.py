@@ -6,14 +6,14 @@ each output `next_X` is the input `X` of the next step. Of a match, the graph is
 
 | control | outputs besides `action` (N, A, D) and the recurrent states |
 |---|---|
-| `command` | `commands` (N, A, C), `joint_target` (N, A, 12), rad |
-| `position` | `joint_target` (N, A, 12), rad |
-| `torque` | `torque` (N, A, 12), N m |
+| `command` | `commands` (N, A, C), `joint_target` (N, A, J), rad |
+| `position` | `joint_target` (N, A, J), rad |
+| `torque` | `torque` (N, A, J), N m |
 
 Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vector in the trunk
-frame, `joint_position` and `joint_velocity` (N, A, 12), rad and rad/s. Recurrent states: those of
+frame, `joint_position` and `joint_velocity` (N, A, J), rad and rad/s. Recurrent states: those of
 the skill, of the walk policy `walk_history` (N, A, 30, 70), `walk_action`, `walk_previous_action`
-(N, A, 12) and `walk_gait` (N, A), and those of the network: `memory` if it is one array, else
+(N, A, J) and `walk_gait` (N, A), and those of the network: `memory` if it is one array, else
 `memory_NAME`.
 """
 

@@ -7,10 +7,10 @@ In an environment step the graphs run in this order; the physics steps are betwe
 |---|---|---|
 | `policy` | a team | `obs` (A, O), or state and `team` (); `noise` (K,), recurrent states |
 | `control` | the task | state, `action` (A, D), `drive` (A, D), `driven` (A,), `noise` (K,) |
-| `skill` | a robot | `command` (C,), `gravity` (3,), joint states (12,), recurrent states |
+| `skill` | a robot | `command` (C,), `gravity` (3,), joint states (J,), recurrent states |
 | `judge` | the task | state after the step, `before_qpos`, `before_qvel`, `before_sensordata` |
 
-The policy's output is `action` (A, D), the skill's `joint_target` (12,), rad; `TaskFunctions` has
+The policy's output is `action` (A, D), the skill's `joint_target` (J,), rad; `TaskFunctions` has
 those of the task. The state is `qpos`, `qvel`, `sensordata`, `step` (environment steps since the
 reset), and where the task has them `anchors` and its own fields as `task_NAME`. Every array has a
 leading batch axis N. `noise` are standard normal numbers. The next value of an input X is the
@@ -101,7 +101,7 @@ class TaskFunctions:
     def control(self, inputs: Arrays) -> dict[str, jax.Array]:
         """Returns what the skill and the physics get in a step.
 
-        `command` (R, C), `gravity` (R, 3), `joint_position` and `joint_velocity` (R, 12) are the
+        `command` (R, C), `gravity` (R, 3), `joint_position` and `joint_velocity` (R, J) are the
         skill's inputs for the R robots. Only tasks that have them return `next_qvel` (nv,), the
         velocities with those of NPCs, and `xfrc_applied` (nbody, 6), external forces, N and N m.
         `drive` replaces the actions of the agents where `driven` is 1, in the robot's own frame.

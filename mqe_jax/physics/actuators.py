@@ -59,7 +59,7 @@ class NetworkActuators:
     """An actuator network, which computes torques from joint targets at every physics step.
 
     Its recurrent state: joint position errors (rad) and velocities (rad/s) of the last two physics
-    steps (2, R, 12).
+    steps (2, R, J).
     """
 
     physics: Engine
@@ -80,7 +80,7 @@ class NetworkActuators:
         fields: Mapping[str, jax.Array],
         xfrc_applied: jax.Array | None,
     ) -> "tuple[mjx.Data, Any, jax.Array]":
-        """Advances the physics by one environment step under joint targets (R, 12), rad.
+        """Advances the physics by one environment step under joint targets (R, J), rad.
 
         Returns as `Engine.step`, with the next recurrent state.
         """

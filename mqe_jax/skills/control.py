@@ -3,10 +3,10 @@
 | mode | per robot | meaning |
 |---|---|---|
 | `command` | one per command of the action (3) | the skill's commands, by default velocities |
-| `position` | 12 | joint target = default + scale x action, then PD at every physics step |
-| `torque` | 12 | joint torque = action x torque limit |
+| `position` | J | joint target = default + scale x action, then PD at every physics step |
+| `torque` | J | joint torque = action x torque limit |
 
-Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the
+J is the number of a robot's joints. Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the
 command, a negative one by the lowest, both times the skill's gain / limit. PD control runs inside
 the physics engine, at every physics step.
 """
@@ -45,7 +45,7 @@ class ControlState:
     skill: Any
     """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of agents and
     NPC robots, if these have another skill."""
-    delayed: jax.Array  # past actuator targets, newest first (lag + 1, R, 12)
+    delayed: jax.Array  # past actuator targets, newest first (lag + 1, R, J)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Controller(Commander):
 
     @property
     def neutral(self) -> np.ndarray:
-        """Neutral actuator targets (R, 12), used without an action."""
+        """Neutral actuator targets (R, J), used without an action."""
         rest = np.tile(self.robot.default_joints, (self.num_robots, 1)).astype(np.float32)
         if self.mode == "torque":
             rest[: self.num_agents] = 0.0
@@ -207,7 +207,7 @@ class Controller(Commander):
         npc_commands: jax.Array | None = None,
         lag: jax.Array | int = 0,
     ) -> tuple[jax.Array, ControlState]:
-        """Computes the actuator targets (R, 12) of all robots from the agents' actions.
+        """Computes the actuator targets (R, J) of all robots from the agents' actions.
 
         Args:
             state: control state.
