@@ -6,9 +6,9 @@
 | `position` | J | joint target = default + scale x action, then PD at every physics step |
 | `torque` | J | joint torque = action x torque limit |
 
-J is the number of a robot's joints. Actions lie in [-1, 1]. In `command`, a positive action is scaled by the highest change of the
-command, a negative one by the lowest, both times the skill's gain / limit. PD control runs inside
-the physics engine, at every physics step.
+J is the number of a robot's joints. Actions lie in [-1, 1]. In `command`, a positive action is
+scaled by the highest change of the command, a negative one by the lowest, both times the skill's
+gain / limit. PD control runs inside the physics engine, at every physics step.
 """
 
 from __future__ import annotations
