@@ -1,8 +1,10 @@
 """Robots from MJCF files: what is read, what is refused, and what tasks do with them."""
 
 import dataclasses
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -478,3 +480,23 @@ def test_the_commands_of_the_page_lead_from_a_file_to_a_trained_team(
 def test_a_path_is_a_robot_too() -> None:
     env = make("go1plane", impl="c", control="position", robot=Path(BIPED))
     assert env.params.robot == BIPED and env.robot is read(BIPED)
+
+
+def test_robots_of_the_menagerie_come_from_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    class MenagerieError(Exception):
+        pass
+
+    def get(name: str) -> Any:
+        if name != "own_dog":
+            raise MenagerieError(f"Unknown robot {name!r}.")
+        return SimpleNamespace(default_model="dog", xml=lambda entry: EXAMPLES / f"{entry}.xml")
+
+    package = SimpleNamespace(get=get, MenagerieError=MenagerieError)
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", package)
+    env = make("go1plane", impl="c", control="position", robot="menagerie:own_dog")
+    assert env.robot.joint_names[0] == "FL_roll" and env.robot.call == "menagerie:own_dog"
+    with pytest.raises(InputError, match=r"menagerie:cat: Unknown robot 'cat'"):
+        robots.get("menagerie:cat")
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
+    with pytest.raises(InputError, match=r"needs the package mujoco-menagerie: pip install"):
+        robots.get("menagerie:unitree_a1")
