@@ -54,17 +54,21 @@ MATCHES = (
     "go1football-1vs1",
     "go1football-2vs2",
 )
-PARTS = ("cooperative", "matches", "population", "robustness", "robustness-matches")
+PARTS = ("cooperative", "matches", "population", "stress", "robustness")
 MEMBER_EPISODES = 256
 CONDITIONS = {
     "usual": "usual",
-    "slippery": "friction",
-    "payload": "payload",
-    "weak-motors": "motors",
-    "delay": "delay",
+    "friction 0.5": "friction",
+    "payload 3 kg": "payload",
+    "motors 80%": "motors",
+    "delay up to 40 ms": "delay",
+    "errors of readings": "readings",
     "noise": "noise",
+    "pushes of 0.3 m/s": "pushes",
+    "everything": "everything",
     "go2": "Go2",
 }
+"""Headings by condition."""
 INK = "#23252b"
 BLUE = "#4f86e0"
 RED = "#b5316f"
@@ -175,34 +179,36 @@ def exploitability() -> str:
     return table(("match", "lead over the shipped team, points", "over the mixture, points"), body)
 
 
-def robustness(found: Rates) -> str:
-    """Returns the table of the worst condition."""
+def robustness(found: Rates, former: Rates) -> str:
+    """Returns the table of success, in matches of wins, by task and condition; in parentheses that
+    of the teams of version 0.3.0, where it is known.
+    """
     body = []
     for task in robust_tasks(found):
-        every = {name: robust(found, task, name) for name in CONDITIONS if name != "usual"}
-        worst = min(every, key=lambda name: every[name].value)
-        body.append([f"`{task}`", CONDITIONS[worst], every[worst].percent])
-    return table(("task", "worst condition", "success or wins, %"), body)
+        before = by_condition(former, task)
+        cells = []
+        for name, now in by_condition(found, task).items():
+            then = f" ({100 * before[name].value:.0f})" if name in before else ""
+            cells.append(f"{100 * now.value:.0f}{then}")
+        body.append([f"`{task}`", *cells])
+    return table(("task", *CONDITIONS.values()), body)
 
 
 def robust_rates() -> Rates:
-    """Returns the rates under other conditions, of matches too if they are measured."""
-    return rates("robustness") | rates("robustness-matches")
+    """Returns the rates under other conditions."""
+    return rates("stress") | rates("robustness")
 
 
-def robust(found: Rates, task: str, condition: str) -> Rate:
-    """Returns success, in a match wins, under a condition."""
-    return found[task, condition, "win_rate" if task in MATCHES else "success_rate"]
+def by_condition(found: Rates, task: str) -> dict[str, Rate]:
+    """Returns success, in a match wins, by condition."""
+    kind = "win_rate" if task in MATCHES else "success_rate"
+    return {name: found[task, name, kind] for name in CONDITIONS if (task, name, kind) in found}
 
 
 def robust_tasks(found: Rates) -> list[str]:
     """Returns the tasks that are measured under all conditions."""
-    measured = {(task, condition) for task, condition, _ in found}
-    return [
-        task
-        for task in (*COOPERATIVE, *MATCHES)
-        if all((task, name) in measured for name in CONDITIONS)
-    ]
+    every = (*COOPERATIVE, *MATCHES)
+    return [task for task in every if len(by_condition(found, task)) == len(CONDITIONS)]
 
 
 def walk(found: Rates) -> str:
@@ -307,7 +313,7 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
 def draw_heat(found: Rates) -> bytes:
     """Returns a picture of success, in matches of wins, under each condition."""
     tasks = robust_tasks(found)
-    values = [[100 * robust(found, task, name).value for name in CONDITIONS] for task in tasks]
+    values = [[100 * each.value for each in by_condition(found, task).values()] for task in tasks]
     figure = Figure((7.6, 0.7 + 0.3 * len(tasks)), dpi=105, layout="constrained")
     axes = figure.subplots()
     axes.imshow(values, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.75)
@@ -329,7 +335,7 @@ def tables() -> dict[str, str]:
         "strength": strength(rates("cooperative"), rates("matches")),
         "population": population(rates("population")),
         "exploitability": exploitability(),
-        "robustness": robustness(robust_rates()),
+        "robustness": robustness(robust_rates(), rates("former")),
         "mates": mixed(),
         "walk": walk(rates("matches")),
     }

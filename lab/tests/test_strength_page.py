@@ -125,19 +125,21 @@ def test_every_match_has_best_responses_of_two_seeds_and_the_page_shows_the_larg
         assert text == Rate(**bounds[task]["exploitability_lower_bound"]).percent
 
 
-def test_a_match_has_a_row_once_all_conditions_are_measured(data: Path) -> None:
-    (data / "robustness-matches.csv").unlink(missing_ok=True)
-    before = strength_page.tables()["robustness"]
+def test_a_task_has_a_row_once_all_conditions_are_measured(data: Path) -> None:
+    for name in ("stress", "robustness", "former"):
+        write(data / f"{name}.csv", {})
+    gate = {("go1gate", name, "success_rate"): 0.75 for name in strength_page.CONDITIONS}
+    write(data / "stress.csv", gate)
     picture = strength_page.draw_heat(strength_page.robust_rates())
-    assert [line[0] for line in lines(before)] == [
-        f"`{task}`" for task in strength_page.COOPERATIVE
-    ]
     tug = {("go1tug", name, "win_rate"): 1.0 for name in strength_page.CONDITIONS}
-    tug |= {("go1tug", "delay", "win_rate"): 0.25, ("go1tug", "go2", "win_rate"): 0.5}
-    write(data / "robustness-matches.csv", tug | {("go1bridge", "usual", "win_rate"): 1.0})
-    after = strength_page.tables()["robustness"]
-    assert after.startswith(before)
-    assert lines(after)[6:] == [["`go1tug`", "delay", Rate.of(0.25, 256).percent]]
+    tug[("go1tug", "noise", "win_rate")] = 0.25
+    write(data / "robustness.csv", tug | {("go1bridge", "usual", "win_rate"): 1.0})
+    write(data / "former.csv", {("go1tug", "noise", "win_rate"): 0.125})
+    conditions = [*strength_page.CONDITIONS]
+    wins = ["100"] * len(conditions)
+    wins[conditions.index("noise")] = "25 (12)"
+    expected = [["`go1gate`", *["75"] * len(conditions)], ["`go1tug`", *wins]]
+    assert lines(strength_page.tables()["robustness"]) == expected
     larger = strength_page.draw_heat(strength_page.robust_rates())
     assert Image.open(io.BytesIO(larger)).height > Image.open(io.BytesIO(picture)).height
 
