@@ -143,7 +143,7 @@ def test_a_shipped_policy_brings_the_skill_that_it_needs(task: str) -> None:
 def test_parameters_are_those_that_policies_need_beyond_the_defaults(
     task: str, changes: Any, expected: Any
 ) -> None:
-    policy = load_policy("go1seesaw")
+    policy = load_policy("results/cooperative/go1seesaw-seed10.safetensors")
     policies = [
         dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **change))
         for change in changes
