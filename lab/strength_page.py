@@ -181,15 +181,16 @@ def exploitability() -> str:
 
 def robustness(found: Rates, former: Rates) -> str:
     """Returns the table of success, in matches of wins, by task and condition; in parentheses that
-    of the teams of version 0.3.0, where it is known.
+    of the teams of version 0.3.0 that were replaced.
     """
     body = []
-    for task in robust_tasks(found):
+    for task in (*COOPERATIVE, *MATCHES):
+        now = by_condition(found, task)
         before = by_condition(former, task)
         cells = []
-        for name, now in by_condition(found, task).items():
-            then = f" ({100 * before[name].value:.0f})" if name in before else ""
-            cells.append(f"{100 * now.value:.0f}{then}")
+        for name in CONDITIONS:
+            parts = [f"{100 * each[name].value:.0f}" for each in (now, before) if name in each]
+            cells.append(" ".join([*parts[:1], *(f"({part})" for part in parts[1:])]))
         body.append([f"`{task}`", *cells])
     return table(("task", *CONDITIONS.values()), body)
 
@@ -200,15 +201,16 @@ def robust_rates() -> Rates:
 
 
 def by_condition(found: Rates, task: str) -> dict[str, Rate]:
-    """Returns success, in a match wins, by condition."""
+    """Returns success, in a match wins, by condition, as far as it is measured."""
     kind = "win_rate" if task in MATCHES else "success_rate"
     return {name: found[task, name, kind] for name in CONDITIONS if (task, name, kind) in found}
 
 
-def robust_tasks(found: Rates) -> list[str]:
-    """Returns the tasks that are measured under all conditions."""
-    every = (*COOPERATIVE, *MATCHES)
-    return [task for task in every if len(by_condition(found, task)) == len(CONDITIONS)]
+def worst(found: Rates, task: str) -> str:
+    """Returns the lowest rate under a disturbance alone, of README's table."""
+    alone = by_condition(found, task)
+    name = min(alone.keys() - {"usual", "everything", "go2"}, key=lambda name: alone[name].value)
+    return f"{100 * alone[name].value:.0f} ({CONDITIONS[name]})"
 
 
 def walk(found: Rates) -> str:
@@ -312,14 +314,19 @@ def draw_leads(data: Sequence[dict[str, str]]) -> bytes:
 
 def draw_heat(found: Rates) -> bytes:
     """Returns a picture of success, in matches of wins, under each condition."""
-    tasks = robust_tasks(found)
-    values = [[100 * each.value for each in by_condition(found, task).values()] for task in tasks]
+    tasks = (*COOPERATIVE, *MATCHES)
+    known = [by_condition(found, task) for task in tasks]
+    values = [
+        [100 * each[name].value if name in each else np.nan for name in CONDITIONS]
+        for each in known
+    ]
     figure = Figure((7.6, 0.7 + 0.3 * len(tasks)), dpi=105, layout="constrained")
     axes = figure.subplots()
     axes.imshow(values, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.75)
     for i, line in enumerate(values):
         for j, value in enumerate(line):
-            axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=8, color=INK)
+            text = "" if np.isnan(value) else f"{value:.0f}"
+            axes.text(j, i, text, ha="center", va="center", fontsize=8, color=INK)
     axes.axhline(len(COOPERATIVE) - 0.5, color="white", lw=3)
     axes.set_xticks(range(len(CONDITIONS)), list(CONDITIONS.values()), fontsize=8)
     axes.set_yticks(range(len(tasks)), tasks, fontsize=8)

@@ -125,23 +125,27 @@ def test_every_match_has_best_responses_of_two_seeds_and_the_page_shows_the_larg
         assert text == Rate(**bounds[task]["exploitability_lower_bound"]).percent
 
 
-def test_a_task_has_a_row_once_all_conditions_are_measured(data: Path) -> None:
-    for name in ("stress", "robustness", "former"):
-        write(data / f"{name}.csv", {})
-    gate = {("go1gate", name, "success_rate"): 0.75 for name in strength_page.CONDITIONS}
-    write(data / "stress.csv", gate)
-    picture = strength_page.draw_heat(strength_page.robust_rates())
-    tug = {("go1tug", name, "win_rate"): 1.0 for name in strength_page.CONDITIONS}
-    tug[("go1tug", "noise", "win_rate")] = 0.25
-    write(data / "robustness.csv", tug | {("go1bridge", "usual", "win_rate"): 1.0})
-    write(data / "former.csv", {("go1tug", "noise", "win_rate"): 0.125})
-    conditions = [*strength_page.CONDITIONS]
-    wins = ["100"] * len(conditions)
-    wins[conditions.index("noise")] = "25 (12)"
-    expected = [["`go1gate`", *["75"] * len(conditions)], ["`go1tug`", *wins]]
-    assert lines(strength_page.tables()["robustness"]) == expected
-    larger = strength_page.draw_heat(strength_page.robust_rates())
-    assert Image.open(io.BytesIO(larger)).height > Image.open(io.BytesIO(picture)).height
+def test_conditions_are_shown_as_far_as_they_are_measured(data: Path) -> None:
+    write(data / "stress.csv", {("go1gate", "usual", "success_rate"): 0.75})
+    tug = {"usual": 1.0, "friction 0.5": 0.25, "everything": 0.125, "go2": 0.0}
+    write(data / "robustness.csv", {("go1tug", x, "win_rate"): tug[x] for x in tug})
+    write(data / "former.csv", {("go1tug", "friction 0.5", "win_rate"): 0.125})
+    found = strength_page.tables()["robustness"].splitlines()[2:]
+    rows = {line[1]: line[2:-1] for line in ([x.strip() for x in row.split("|")] for row in found)}
+    assert rows["`go1gate`"] == ["75", *[""] * (len(strength_page.CONDITIONS) - 1)]
+    cells = dict(zip(strength_page.CONDITIONS, rows["`go1tug`"], strict=True))
+    assert (cells["friction 0.5"], cells["everything"], cells["noise"]) == ("25 (12)", "12", "")
+    assert strength_page.worst(strength_page.robust_rates(), "go1tug") == "25 (friction)"
+    picture = Image.open(io.BytesIO(strength_page.draw_heat(strength_page.robust_rates())))
+    assert picture.convert("RGB").getcolors(1) is None
+
+
+def test_the_readme_shows_the_worst_condition() -> None:
+    found = strength_page.robust_rates()
+    for line in (strength_page.ROOT / "README.md").read_text("utf-8").splitlines():
+        if line.startswith("| [") and "`go1" in line:
+            task = line.split("`")[1]
+            assert line.strip("| ").split(" | ")[-1] == strength_page.worst(found, task)
 
 
 def test_the_smallest_lead_counts_losses(data: Path) -> None:
