@@ -209,7 +209,8 @@ def by_condition(found: Rates, task: str) -> dict[str, Rate]:
 def worst(found: Rates, task: str) -> str:
     """Returns the lowest rate under a disturbance alone, of README's table."""
     alone = by_condition(found, task)
-    name = min(alone.keys() - {"usual", "everything", "go2"}, key=lambda name: alone[name].value)
+    names = [name for name in alone if name not in ("usual", "everything", "go2")]
+    name = min(names, key=lambda name: alone[name].value)
     return f"{100 * alone[name].value:.0f} ({CONDITIONS[name]})"
 
 
