@@ -31,8 +31,8 @@ class Source:
 
     config: Annotated[str | None, tyro.conf.arg(metavar="FILE|NAME")] = None
     """YAML file of settings (missing ones have the defaults of `TrainConfig`), or the name of a
-    shipped one: demo, laptop, student, league, sizes, tuned/TASK, paper/ALGORITHM. Default: with
-    --algorithm, the paper's settings; else the task's tuned ones, else league (a match) or the
+    shipped one: demo, laptop, student, robust, league, sizes, tuned/TASK, paper/ALGORITHM. Default:
+    with --algorithm, the paper's settings; else the task's tuned ones, else league (a match) or the
     paper's MAPPO."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """mappo, jrpo, mat, ippo or dual-clip: overrides the settings that define the algorithm."""
