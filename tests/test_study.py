@@ -745,6 +745,16 @@ def test_files_and_policies_of_run_folders_are_told_from_names(
     assert provenance.digests({"start": "go1gate"})["go1gate"] == provenance.digest(shipped)
 
 
+def test_a_result_comes_from_all_files_of_a_robot(tmp_path: Path) -> None:
+    robot = tmp_path / "dog.xml"
+    robot.write_bytes(Path("examples/robots/dog.xml").read_bytes())
+    found = []
+    for speed in (20, 30):
+        (tmp_path / "dog.yaml").write_text(f"speed: {speed}")
+        found.append(provenance.digests({"env.robot": str(robot)})[str(robot)])
+    assert found[0] != found[1]
+
+
 def test_a_result_of_a_shipped_policy_comes_from_its_contents(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

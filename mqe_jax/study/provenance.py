@@ -11,6 +11,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import parsing, read_json, write_atomically
 from mqe_jax.core.settings import leaves, to_mapping
 from mqe_jax.envs.registry import TASKS
+from mqe_jax.physics import robots
 from mqe_jax.policies import zoo
 from mqe_jax.train.policy import POLICY_FILE
 
@@ -28,11 +29,17 @@ def provenance(**passed: Any) -> dict[str, Any]:
 def digests(values: Any) -> dict[str, str]:
     """Returns the SHA-256 of every file that a text in nested values names.
 
-    For a run folder it is that of its policy, for a task that of its shipped policy.
+    For a run folder it is that of its policy, for a task that of its shipped policy, for a robot
+    that of all its files.
     """
-    files_of = {text: zoo.file_of(text) if text in TASKS else text for text in _texts(values)}
-    found = {text: digest(file) for text, file in files_of.items() if file}
+    found = {text: _digest_of(name.rpartition(".")[2], text) for name, text in _texts(values)}
     return {text: each for text, each in found.items() if each is not None}
+
+
+def _digest_of(name: str, text: str) -> str | None:
+    if name == "robot" and robots.is_file(text):
+        return robots.get(text).digest
+    return digest(zoo.file_of(text) if text in TASKS else text)
 
 
 def digest(path: str | Path) -> str | None:
@@ -42,15 +49,18 @@ def digest(path: str | Path) -> str | None:
     return files.digest(file) if os.path.isfile(file) else None
 
 
-def _texts(values: Any) -> Iterator[str]:
-    """Yields the texts in nested mappings and lists that can name files or policies."""
-    if isinstance(values, str):
-        yield values
+def _texts(values: Any, of: str = "") -> Iterator[tuple[str, str]]:
+    """Yields the texts in nested mappings and lists that can name files or policies, after the
+    name that they have in a mapping.
+    """
+    if isinstance(values, str) and values and of not in ("task", "tasks"):
+        yield of, values
     elif isinstance(values, Mapping):
-        yield from _texts([values[name] for name in values if name not in ("task", "tasks")])
+        for name, value in values.items():
+            yield from _texts(value, name)
     elif isinstance(values, list):
         for value in values:
-            yield from _texts(value)
+            yield from _texts(value, of)
 
 
 def check_provenance(file: Path, wanted: Mapping[str, Any]) -> None:
