@@ -4,8 +4,7 @@
 PART` measured, as results/strength/PART.csv, mixed teams in crossplay_TASK.json and best responses
 in exploitability.csv. Version 0.3.0 measured oracle.json (mixtures). `python -m lab.strength_page
 --rates FOLDER` first copies the results of every part that is below FOLDER; best responses and
-mixed teams of tasks that it lacks stay. The table of other conditions has a row for each task that
-is measured under all of them.
+mixed teams of tasks that it lacks stay. former.csv has rates of the teams of version 0.3.0.
 """
 
 import argparse
