@@ -118,6 +118,7 @@ class _Reader:
         self.files: list[Path] = []
         self.elements = 0
         self.weights: set[str] = set()
+        self.weighed = "auto"
 
     def error(self, what: str) -> InputError:
         return InputError(f"robot: {self.path}: {what}")
@@ -130,6 +131,8 @@ class _Reader:
         for compiler in root.iter("compiler"):
             meshdir = compiler.get("meshdir", compiler.get("assetdir", meshdir))
         self._filter(root)
+        for compiler in root.iter("compiler"):
+            self.weighed = compiler.get("inertiafromgeom", self.weighed)
         meshes, missing = self._meshes(root, meshdir)
         assets = {}
         for i, mesh in enumerate(_files(root)):
@@ -211,6 +214,8 @@ class _Reader:
                     )
                 if tag not in KEPT.get(str(element.tag), ()):
                     element.remove(child)
+            if element.get("coordinate", "local") != "local":
+                raise self.error("<compiler>: coordinate='global' is not read; use 'local'")
             if element.tag == "compiler":
                 element.attrib = {x: element.attrib[x] for x in _COMPILER if x in element.attrib}
             for name in _UNUSED:
@@ -268,7 +273,7 @@ class _Reader:
         if parent.tag == "body":
             body = parent
         inherited = parent.get("childclass", inherited)
-        light = body is not None and any(child.tag == "inertial" for child in body)
+        light = self.weighed != "true" and body is not None and body.find("inertial") is not None
         for child in [*parent]:
             self._strip(child, absent, body, inherited, defaults)
             name = child.get("mesh")
@@ -281,7 +286,7 @@ class _Reader:
                 at = "" if body is None else body.get("name", "")
                 raise self.error(
                     f"mesh {brief(name)!r}: its file is missing, and body {brief(at)!r} takes its "
-                    "mass from it; add the file, or an <inertial>"
+                    "mass from it; add the file, or an <inertial> without inertiafromgeom='true'"
                 )
             if weighs:
                 self.weights.add(name)
