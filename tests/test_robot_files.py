@@ -234,6 +234,10 @@ def test_missing_meshes_are_dropped_with_a_line(tmp_path: Path) -> None:
     weighs = r"mesh 'shell': its file is missing, and body 'torso' takes its mass from it"
     with pytest.raises(InputError, match=weighs):
         written(tmp_path, text, "speed: 20")
+    inertial = '<inertial pos="0 0 0" mass="3" diaginertia="0.1 0.1 0.1"/><freejoint/>'
+    ignored = text.replace("<freejoint/>", inertial)
+    with pytest.raises(InputError, match=weighs):
+        written(tmp_path, ignored.replace("<compiler ", '<compiler inertiafromgeom="true" '))
     text = text.replace('mesh="shell" ', 'mesh="shell" mass="0" ')
     with pytest.warns(UserWarning, match="mesh: 1 files are missing, such as 'shell'"):
         bare = written(tmp_path, text, "speed: 20")
@@ -291,7 +295,7 @@ def hostile(folder: Path) -> dict[str, tuple[str, str, str]]:
         "no joints": (plain, "", "has 0 joints; a robot has 1 to 64"),
         "zero mass": (zero, "", "MuJoCo rejects it (Error: mass and inertia of moving bodies"),
         "heavy": (dog(('mass="7"', 'mass="1e9"')), "",
-                  "body_mass of 'torso': is beyond 1000; SI units are expected"),
+                  "body_mass of 'torso': is beyond 0 to 1000; SI units are expected"),
         "not a number": (dog(('mass="7"', 'mass="nan"')), "", "<geom>: mass='nan' is not finite"),
         "slide": (dog(('name="FL_roll"', 'type="slide" name="FL_roll"')), "", "is no hinge; name"),
         "two trunks": (dog(("<worldbody>", "<worldbody><body name='ball'><freejoint/>"
@@ -305,6 +309,16 @@ def hostile(folder: Path) -> dict[str, tuple[str, str, str]]:
         "unknown key": (dog(), "speeds: 3", "own.yaml: speeds: unknown"),
         "unknown joint": (dog(), "speed: {FL_nee: 3}", "speed: 'FL_nee' names nothing"),
         "five numbers": (dog(), "speed: [1, 2, 3, 4, 5]", "speed: 5 numbers; expected 1, 12, or 3"),
+        "two motors": (dog(("<actuator>", "<actuator><velocity joint='FL_knee' kv='1'/>")), "",
+                       "joint 'FL_knee': has two actuators; set torque"),
+        "strong": (dog(("-40 40", "-1e30 1e30")), "", "its torque limit is 1e+30; set torque"),
+        "armature": (dog(('armature="0.01"', 'armature="-1"')), "", "dof_armature of 'FL_roll':"),
+        "range": (dog(('range="-0.8 0.8"', 'range="-1e20 1e20"')), "", "jnt_range of 'FL_roll':"),
+        "global": (dog(("<compiler ", "<compiler coordinate='global' ")), "", "use 'local'"),
+        "lying": (dog(("0.37 1 0 0 0", "0.37 0.7 0.7 0 0")), "", "'torso': its z axis is not up"),
+        "no speed": (dog(), "speed: 0", "speed: 0 is not allowed; it must be a positive number, a"),
+        "stall": (dog(), "stall: -5", "stall: -5 is not allowed; it must be a positive number"),
+        "kinds": (dog(), "stance: true", "stance: True is not allowed; it must be the name of a"),
         "model above": (dog(), "model: ../secret.xml", "outside of its folder"),
     }  # fmt: skip
 
@@ -323,6 +337,47 @@ def test_hostile_and_broken_files_are_refused_in_one_line(tmp_path: Path) -> Non
         assert said in str(error.value), f"{kind}: {error.value}"
         assert "\n" not in str(error.value) and len(str(error.value)) < 1000, kind
         assert time.monotonic() - began < 5.0, kind
+
+
+@pytest.mark.parametrize(
+    ("change", "yaml", "said"),
+    [
+        (('ctrlrange="-40 40"', 'forcerange="-3 40"'), "", "range is -3 to 40; the smaller end"),
+        (('<body name="FL_upper"', '<body gravcomp="1" name="FL_upper"'), "", "gravcomp is left"),
+        (("", ""), 'speed: {"*_knee": 20}', "joints FL_roll, FL_pitch, .*: have no speed limit"),
+    ],
+)
+def test_what_is_left_out_is_noted(
+    change: tuple[str, str], yaml: str, said: str, tmp_path: Path
+) -> None:
+    with pytest.warns(UserWarning, match=said):
+        written(tmp_path, dog(change), yaml)
+
+
+FOOT = 'type="sphere" size="0.026"'
+TETRAHEDRON = "v 0 0 0\nv 0.03 0 0\nv 0 0.02 0\nv 0 0 0.03\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.mark.parametrize(
+    "foot",
+    [
+        'name="{}" contype="0" conaffinity="0" size="0.026" type="sphere"',
+        'type="mesh" mesh="foot"',
+    ],
+)
+def test_feet_that_are_named_collide(foot: str, tmp_path: Path) -> None:
+    mesh = '<asset><mesh name="foot" file="foot.obj"/></asset><worldbody>'
+    (tmp_path / "foot.obj").write_text(TETRAHEDRON)
+    text = dog(("<worldbody>", mesh))
+    for number in range(4):
+        text = text.replace(FOOT, foot.format(f"foot{number}"), 1)
+    robot = written(tmp_path, text, 'feet: ["foot*"]\nspeed: 20')
+    assert robot.four_legged and len(robot.geom_names("foot")) == 4
+
+
+def test_the_first_of_keyframes_without_names_is_the_stance(tmp_path: Path) -> None:
+    text = dog(('name="stand" ', ""), ("</keyframe>", "<key/></keyframe>"))
+    assert written(tmp_path, text, "speed: 20").default_joints[1] == 0.8
 
 
 def test_names_of_robots_that_are_not_there_say_what_is_known() -> None:

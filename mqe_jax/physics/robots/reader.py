@@ -4,9 +4,11 @@ import dataclasses
 import fnmatch
 import math
 from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
+import pydantic
 
 from mqe_jax.core.errors import InputError, brief, nearest, one_line
 from mqe_jax.core.limits import Length, NonNegative, Positive
@@ -29,12 +31,49 @@ _JOINT = mujoco.mjtJoint
 _GEOM = mujoco.mjtGeom
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 NEAR = 0.25  # share of the height by which a foot may be above the lowest
+UPRIGHT = 0.7  # vertical part of the trunk's z axis, at least
 BENT = 0.75  # share of a straight leg's length at which a solved stance stands
-_STRANGE = 1e3  # kg and m beyond which a robot cannot be meant
+TORQUE = 1e5  # N m of a joint, at most
+_PLACE = (-1e3, 1e3)  # m
+_SIZE = (0.0, 1e3)  # kg, kg m^2, m, N m, N m s/rad
+_BOUNDS = {
+    "body_mass": _SIZE,
+    "body_inertia": _SIZE,
+    "body_pos": _PLACE,
+    "jnt_pos": _PLACE,
+    "jnt_range": (-1e2, 1e2),  # rad
+    "geom_pos": _PLACE,
+    "geom_size": _SIZE,
+    "dof_armature": _SIZE,
+    "dof_damping": _SIZE,
+    "dof_frictionloss": _SIZE,
+}
+"""Numbers of a model beyond which a robot cannot be meant."""
 
-Values = float | tuple[float, ...] | Mapping[str, float]
+
+def _said(allowed: str) -> pydantic.WrapValidator:
+    """Returns what says which kinds are allowed, in place of the errors of each."""
+
+    def check(value: Any, handler: pydantic.ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return handler(value)
+        except ValueError:
+            raise ValueError(allowed) from None
+
+    return pydantic.WrapValidator(check)
+
+
+Values = Annotated[
+    float | tuple[float, ...] | Mapping[str, float],
+    _said("a number, a list of numbers, or a mapping of joints to numbers"),
+]
 """A number for all joints, one for each, or one for each of a leg's joints; or numbers by name,
 whose names are joints or patterns such as `*_knee`."""
+Positives = Annotated[
+    Positive | tuple[Positive, ...] | Mapping[str, Positive],
+    _said("a positive number, a list of them, or a mapping of joints to them"),
+]
+"""`Values` that are positive."""
 
 
 @settings_class
@@ -55,16 +94,19 @@ class RobotFile:
     by the places of the feet."""
     fixed: tuple[str, ...] = ()
     """Joints that are fixed at angle zero; may be patterns."""
-    stance: str | Values | None = None
+    stance: Annotated[
+        str | float | tuple[float, ...] | Mapping[str, float] | None,
+        _said("the name of a keyframe, a list of angles, or a mapping of joints to angles"),
+    ] = None
     """Default joint angles, rad, or a keyframe's name. Default: the first keyframe, else a pose
     with bent knees that is solved."""
     stand_height: Length | None = None
     """Height of the standing trunk, m. Default: that of the stance."""
-    torque: Values | None = None
+    torque: Positives | None = None
     """Torque limits, N m. Default: those of the actuators."""
-    stall: Values | None = None
+    stall: Positives | None = None
     """Stall torques, N m. Default: the torque limits."""
-    speed: Values | None = None
+    speed: Positives | None = None
     """Speed limits of the motors, rad/s. Default: none."""
     limits: Mapping[str, Range] = dataclasses.field(default_factory=dict)
     """Joint limits by name or pattern, rad. Default: those of the joints."""
@@ -89,6 +131,7 @@ class Reader:
         self.settings = settings
         self.notes: list[str] = []
         self.stances: dict[str, dict[str, float]] = {}
+        self.upright: dict[str, dict[str, float]] = {}
         self.named: dict[str, str] = {}
         self.solid: set[str] = set()
         self.model = self._compile()
@@ -99,7 +142,11 @@ class Reader:
         return self.source.fail(what)
 
     def _compile(self) -> mujoco.MjModel:
-        """Returns the compiled model; sets `stances`, `solid`, and `named`, the geoms' names."""
+        """Returns the compiled model.
+
+        Sets `stances`, `upright`, the vertical part of each body's z axis in them, `solid`, and
+        `named`, the geoms' names.
+        """
         spec = self.source.spec
         for number, geom in enumerate(spec.geoms):
             self.named[f"g{number}"] = geom.name or geom.meshname
@@ -113,12 +160,17 @@ class Reader:
         for number, body in enumerate(spec.bodies):
             body.name = body.name or f"body{number}"
         model = self._checked(spec)
+        data = mujoco.MjData(model)
         for key in range(model.nkey):
+            data.qpos = model.key_qpos[key]
+            mujoco.mj_kinematics(model, data)
+            upright = {model.body(b).name: float(data.xmat[b, 8]) for b in range(model.nbody)}
+            self.upright.setdefault(model.key(key).name, upright)
             angles = {}
             for joint in np.flatnonzero(model.jnt_type == _JOINT.mjJNT_HINGE):
                 angle = model.key_qpos[key, model.jnt_qposadr[joint]]
                 angles[model.joint(int(joint)).name] = float(angle)
-            self.stances[model.key(key).name] = angles
+            self.stances.setdefault(model.key(key).name, angles)
         fixed = self._match(self.settings.fixed, [joint.name for joint in spec.joints], "fixed")
         if not fixed:
             return model
@@ -137,13 +189,16 @@ class Reader:
             model = spec.compile()
         except ValueError as error:
             raise self.error(f"MuJoCo rejects it ({one_line(error)})") from None
-        for name in ("body_mass", "body_inertia", "body_pos", "jnt_pos", "geom_pos", "geom_size"):
-            rows = getattr(model, name).reshape(len(getattr(model, name)), -1)
-            for row in np.flatnonzero(~np.all(np.abs(rows) < _STRANGE, axis=1)):
-                element = {"b": model.body, "j": model.joint, "g": model.geom}[name[0]](int(row))
+        for name, (low, high) in _BOUNDS.items():
+            values = getattr(model, name)
+            inside = (values >= low) & (values <= high)
+            for row in np.flatnonzero(~inside.all(axis=tuple(range(1, values.ndim)))):
+                number = int(model.dof_jntid[row] if name[0] == "d" else row)
+                of = {"b": model.body, "g": model.geom}.get(name[0], model.joint)
+                element = of(number).name
+                shown = brief(self.named.get(element) or element)
                 raise self.error(
-                    f"{name} of {self.named.get(element.name, element.name)!r}: is beyond "
-                    f"{_STRANGE:g}; SI units are expected"
+                    f"{name} of {shown!r}: is beyond {low:g} to {high:g}; SI units are expected"
                 )
         return model
 
@@ -204,8 +259,14 @@ class Reader:
             )
         bodies[0] = dataclasses.replace(bodies[0], position=(0.0, 0.0, height))
         torque = self._torque()
-        if settings.speed is None:
-            self.notes.append("actuators: have no speed limit; set speed")
+        speed = self._values(settings.speed, "speed", math.inf)
+        endless = [name for name, most in zip(joints, speed, strict=True) if most == math.inf]
+        if endless:
+            what = "actuators" if settings.speed is None else f"joints {brief(', '.join(endless))}"
+            self.notes.append(f"{what}: have no speed limit; set speed")
+        lifted = [skeleton.names[b] for b in skeleton.ids if self.model.body_gravcomp[b]]
+        if lifted:
+            self.notes.append(f"bodies {brief(', '.join(lifted))}: their gravcomp is left out")
         size = height / GO1_HEIGHT
         least = GO1_GAIN * mass / GO1_MASS * size
         kp, kd = self._gains(max(least, skeleton.holding(feet, mass) / SAG), size)
@@ -236,7 +297,7 @@ class Reader:
             default_joints=stance,
             joint_lower=self.lower,
             joint_upper=self.upper,
-            joint_speed_limit=self._values(settings.speed, "speed", math.inf),
+            joint_speed_limit=speed,
             torque_limit=torque,
             stall_torque=self._values(settings.stall, "stall", torque),
             rotor_inertia=self.model.dof_armature[dofs],
@@ -317,6 +378,13 @@ class Reader:
             known = ", ".join(self.stances) or "none"
             raise self.error(f"stance: no keyframe {brief(wanted)!r}; there are: {known}")
         first = wanted if isinstance(wanted, str) else next(iter(self.stances), None)
+        trunk = self.model.body(self.skeleton.root).name
+        rest = float(self.skeleton.data.xmat[self.skeleton.root, 8])
+        if self.upright.get(first or "", {}).get(trunk, rest) < UPRIGHT:
+            raise self.error(
+                f"body {brief(trunk)!r}: its z axis is not up where the robot stands; a trunk has "
+                "x forward and z up; turn its frame, or set stance"
+            )
         if first is None and (wanted is None or isinstance(wanted, Mapping)):
             values = self._solved(feet)
         else:
@@ -366,10 +434,17 @@ class Reader:
     def _feet(self) -> list[Foot]:
         """Returns the feet, in the order of the MJCF."""
         model = self.model
-        named = {self.named[model.geom(g).name]: g for g in range(model.ngeom)}
+        named: dict[str, list[int]] = {}
+        for geom in range(model.ngeom):
+            named.setdefault(self.named[model.geom(geom).name], []).append(geom)
         if self.settings.feet:
             wanted = self._match(self.settings.feet, [x for x in named if x], "feet")
-            chosen = sorted(named[name] for name in wanted)
+            chosen = []
+            for name in wanted:
+                alike = named[name]
+                chosen += [g for g in alike if model.geom(g).name in self.solid] or alike
+            chosen.sort()
+            self.solid |= {model.geom(geom).name for geom in chosen}
             found = [self.skeleton.foot(int(model.geom_bodyid[geom]), geom) for geom in chosen]
             for foot in found:
                 if foot.body not in self.skeleton.ids or not foot.joints:
@@ -447,26 +522,40 @@ class Reader:
                 name = model.actuator(number).name
                 raise self.error(f"actuator {name!r}: drives no joint; it must")
             joint = model.joint(int(model.actuator_trnid[number, 0])).name
-            driven.add(joint)
+            if joint not in found:
+                continue
             most = [math.inf]
             if model.actuator_forcelimited[number]:
-                most.append(float(np.abs(model.actuator_forcerange[number]).max()))
+                most.append(self._end(joint, model.actuator_forcerange[number]))
             if model.actuator_ctrllimited[number] and not model.actuator_biasprm[number].any():
                 gain = abs(float(model.actuator_gainprm[number, 0]))
-                most.append(gain * float(np.abs(model.actuator_ctrlrange[number]).max()))
-            if joint in found:
-                found[joint] = abs(float(model.actuator_gear[number, 0])) * min(most)
+                most.append(gain * self._end(joint, model.actuator_ctrlrange[number]))
+            found[joint] = abs(float(model.actuator_gear[number, 0])) * min(most)
+            if joint in driven:
+                found[joint] = math.nan
+            driven.add(joint)
         for name in self.joints:
             joint = model.joint(name).id
             if model.jnt_actfrclimited[joint]:
-                most = float(np.abs(model.jnt_actfrcrange[joint]).max())
-                found[name] = min(found[name], most)
+                found[name] = min(found[name], self._end(name, model.jnt_actfrcrange[joint]))
         limit = self._values(self.settings.torque, "torque", np.array([*found.values()]))
-        for i in np.flatnonzero(~np.isfinite(limit) | (limit <= 0.0)):
+        for i in np.flatnonzero(~((limit > 0.0) & (limit <= TORQUE))):
             name = self.joints[i]
             what = f"its torque limit is {limit[i]:g}" if name in driven else "has no actuator"
+            if math.isnan(limit[i]):
+                what = "has two actuators"
             raise self.error(f"joint {name!r}: {what}; set torque, or name it under fixed")
         return limit
+
+    def _end(self, joint: str, ends: np.ndarray) -> float:
+        """Returns the magnitude of the end of a range that is nearer to zero."""
+        low, high = ends.tolist()
+        if -low != high:
+            self.notes.append(
+                f"joint {joint!r}: its actuator's range is {low:g} to {high:g}; the smaller end is "
+                "used both ways; set torque"
+            )
+        return min(-low, high)
 
 
 def whole(mirror: Mirror) -> Mirror:
