@@ -85,6 +85,7 @@ MJCF_ELEMENTS = 5000  # of an MJCF
 MJCF_DEPTH = 64  # of its elements within each other
 MESH_BYTES = 2**25  # of a mesh
 MESHES_BYTES = 2**27  # of all meshes of a robot
+MESH_POINTS = 2 * 10**6  # of a robot's geoms, those of one mesh counted by each geom
 ROBOT_BODIES = 256
 ROBOT_JOINTS = 64
 WEIGHT = 1e4  # magnitude of a policy's or a skill's weight; trained ones are below 10

@@ -6,7 +6,9 @@ The bounds are in `mqe_jax.core.limits`.
 """
 
 import dataclasses
+import functools
 import hashlib
+import os
 import re
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -170,8 +172,9 @@ class _Reader:
             for number, child in reversed([*enumerate(element)]):
                 if child.tag == "include":
                     file = self._within(self.folder / child.get("file", ""), "include")
-                    if not file.is_file():
-                        raise self.error(f"includes {child.get('file')!r}, which is not there")
+                    if not os.path.isfile(file):
+                        name = brief(child.get("file", ""))
+                        raise self.error(f"includes {name!r}, which is not there")
                     part = self._parse(file, (*above, path))
                     element[number : number + 1] = [*part]
         return root
@@ -236,6 +239,7 @@ class _Reader:
         found = {}
         missing = []
         size = 0
+        once = functools.cache(read_bytes)
         for assets in root.iter("asset"):
             for mesh in [*assets.iter("mesh")]:
                 file = mesh.get("file")
@@ -245,14 +249,14 @@ class _Reader:
                 mesh.set("name", name)
                 path = self._within(self.folder / meshdir / file, f"mesh {brief(name)!r}")
                 self.files.append(path)
-                if path.is_file() and path.suffix.lower() in _SURFACES:
-                    found[name] = read_bytes(path, limits.MESH_BYTES)
+                if os.path.isfile(path) and path.suffix.lower() in _SURFACES:
+                    found[name] = once(path, limits.MESH_BYTES)
                     size += len(found[name])
+                    if size > limits.MESHES_BYTES:
+                        raise self.error(f"its meshes have more than {limits.MESHES_BYTES} bytes")
                 else:
                     missing.append(name)
                     assets.remove(mesh)
-        if size > limits.MESHES_BYTES:
-            raise self.error(f"its meshes have {size} bytes; at most {limits.MESHES_BYTES}")
         for world in root.iter("worldbody"):
             self._strip(world, set(missing), None, "", _defaults(root))
         return found, tuple(missing)
