@@ -1,6 +1,7 @@
 """Files of robots: what `robot=` names, read once until the files change."""
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -42,7 +43,7 @@ def load(name: str) -> ModelRobot:
             raise InputError(f"robot: {beside}: {error}") from None
     source = mjcf.read(path)
     robot = dataclasses.replace(Reader(source, settings).robot(text), source=name)
-    stamps = _stamps([str(x) for x in (*source.files, *([beside] if beside else []))])
+    stamps = _stamps([str(x) for x in (*source.files, beside or path.with_suffix(".yaml"))])
     _LOADED[name] = stamps, robot
     for note in robot.notes:
         warn(f"robot: {path.name}: {note}")
@@ -65,18 +66,18 @@ def _files(name: str) -> tuple[Path, Path | None]:
     """Returns the MJCF and the YAML beside it, if there is one."""
     if name.startswith(MENAGERIE):
         return _menagerie(name.removeprefix(MENAGERIE)), None
-    path = Path(name).expanduser()
-    if not path.is_file():
+    path = Path(os.path.expanduser(name))
+    if not os.path.isfile(path):  # Path.is_file raises an OSError for a long name
         raise InputError(f"robot: no file {brief(name)!r}")
     if path.suffix not in (".yaml", ".yml"):
         beside = path.with_suffix(".yaml")
-        return path, _within(path, beside) if beside.is_file() else None
+        return path, _within(path, beside) if os.path.isfile(beside) else None
     given = parse_yaml(read_text(path, limits.YAML_BYTES, "YAML"), str(path))
     wanted = given.get("model") if isinstance(given, Mapping) else None
     if isinstance(wanted, str) and wanted.startswith(MENAGERIE):
         return _menagerie(wanted.removeprefix(MENAGERIE)), path
     model = path.parent / wanted if isinstance(wanted, str) else path.with_suffix(".xml")
-    if not _within(path, model).is_file():
+    if not os.path.isfile(_within(path, model)):
         raise InputError(f"robot: {path}: model: no file {brief(str(model))!r}")
     return model, path
 
