@@ -15,6 +15,7 @@ import pytest
 
 import mqe_jax
 from mqe_jax import cli
+from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.envs import make
@@ -151,8 +152,9 @@ def test_engines_agree_on_a_robot_of_two_legs() -> None:
 
 
 def test_a_file_is_read_again_only_when_it_changes(tmp_path: Path) -> None:
+    bare = written(tmp_path, dog())
     first = written(tmp_path, dog(), "speed: 20\n")
-    assert read(tmp_path / "own.xml") is first
+    assert read(tmp_path / "own.xml") is first and first is not bare
     (tmp_path / "own.yaml").write_text("speed: 21\n# another size\n")
     second = read(tmp_path / "own.xml")
     assert second is not first and second.digest != first.digest
@@ -318,6 +320,14 @@ def hostile(folder: Path) -> dict[str, tuple[str, str, str]]:
         "lying": (dog(("0.37 1 0 0 0", "0.37 0.7 0.7 0 0")), "", "'torso': its z axis is not up"),
         "no speed": (dog(), "speed: 0", "speed: 0 is not allowed; it must be a positive number, a"),
         "stall": (dog(), "stall: -5", "stall: -5 is not allowed; it must be a positive number"),
+        "base": (dog(("FL_roll", "base")), "", "joint 'base': the trunk's free joint has"),
+        "hinged trunk": (dog(("<freejoint/>", "<joint name='yaw'/>"), ("0 0 0.37 1 0 0 0", "0")),
+                         "trunk: torso\ntorque: 20", "joint 'yaw': turns the trunk; name it under"),
+        "twin": (dog(('class="roll"/>', 'class="roll"/><joint class="roll"/>'),
+                     ("<key name", "<!--<key name"), ("</keyframe>", "--></keyframe>")),
+                 "torque: 20", "turns only what another turns; name it under fixed"),
+        "all fixed": (dog(), 'fixed: ["*"]', "has 0 joints; a robot has 1 to 64"),
+        "include long": (f"<mujoco><include file='{'z' * 400}'/></mujoco>", "", "is not there"),
         "kinds": (dog(), "stance: true", "stance: True is not allowed; it must be the name of a"),
         "model above": (dog(), "model: ../secret.xml", "outside of its folder"),
     }  # fmt: skip
@@ -344,6 +354,11 @@ def test_hostile_and_broken_files_are_refused_in_one_line(tmp_path: Path) -> Non
     [
         (('ctrlrange="-40 40"', 'forcerange="-3 40"'), "", "range is -3 to 40; the smaller end"),
         (('<body name="FL_upper"', '<body gravcomp="1" name="FL_upper"'), "", "gravcomp is left"),
+        (
+            (" 0 0.8 -1.5 0 0.8", " 0 0.8 -2.5 0 0.8"),
+            "",
+            "bodies FL_lower: end limbs without a foot",
+        ),
         (("", ""), 'speed: {"*_knee": 20}', "joints FL_roll, FL_pitch, .*: have no speed limit"),
     ],
 )
@@ -352,6 +367,30 @@ def test_what_is_left_out_is_noted(
 ) -> None:
     with pytest.warns(UserWarning, match=said):
         written(tmp_path, dog(change), yaml)
+
+
+def test_names_are_free_and_a_trunk_without_a_joint_gets_one(tmp_path: Path) -> None:
+    text = dog(('"FL_hip"', '"trunk"'), ('"FL_upper"', '"trunk_"'), ("FL_roll", "joint0"))
+    robot = written(tmp_path, text, "speed: 20", "names")
+    assert [body.name for body in robot.tree][:3] == ["trunk", "trunk__", "trunk_"]
+    text = dog(("<freejoint/>", ""), ("0 0 0.37 1 0 0 0 ", ""))
+    with pytest.warns(UserWarning, match="body 'torso': has no free joint; it gets one"):
+        free = written(tmp_path, text, "speed: 20", "free")
+    np.testing.assert_allclose(free.default_joints, read(DOG).default_joints)
+
+
+def test_the_vertices_of_meshes_are_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "foot.obj").write_text(TETRAHEDRON)
+    mesh = '<asset><mesh name="foot" file="foot.obj"/></asset><worldbody>'
+    text = dog(("<worldbody>", mesh), (FOOT, 'type="mesh" mesh="foot"'))
+    monkeypatch.setattr(limits, "MESH_POINTS", 15)
+    with pytest.raises(InputError, match="its geoms show 16 vertices of meshes; at most 15"):
+        written(tmp_path, text)
+    monkeypatch.setattr(limits, "MESHES_BYTES", 15)
+    with pytest.raises(InputError, match="its meshes have more than 15 bytes"):
+        written(tmp_path, text + " ")
 
 
 FOOT = 'type="sphere" size="0.026"'
@@ -384,6 +423,8 @@ def test_names_of_robots_that_are_not_there_say_what_is_known() -> None:
     for name, said in {
         "go3": r"unknown name 'go3' \(did you mean 'go.'\?\)",
         "none.xml": "robot: no file 'none.xml'",
+        "~nobody/x.xml": "robot: no file '~nobody/x.xml'",
+        f"{'x' * 300}.xml": "robot: no file 'xxx",
         "menagerie:nothing": "menagerie:nothing",
     }.items():
         with pytest.raises(InputError, match=said):

@@ -7,7 +7,7 @@ import numpy as np
 
 from mqe_jax.physics.appearance import HIDDEN_GROUP, ROBOT_COLORS, VISUAL_GROUP, bodies
 from mqe_jax.physics.collision import robot_bits
-from mqe_jax.physics.robots.robot import Hinge, Link, Primitive, Robot, parts_of
+from mqe_jax.physics.robots.robot import BASE, Hinge, Link, Primitive, Robot, parts_of
 
 _GEOM_TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -81,7 +81,7 @@ def build_robot(
         made[part.name] = body
         _add_inertial(body, part.link)
         if not part.parent:
-            body.add_freejoint(name="base")
+            body.add_freejoint(name=BASE)
         for hinge in part.hinges:
             _add_hinge(body, robot, hinge, joint_mechanics)
         for shape in part.shapes:
@@ -113,7 +113,7 @@ def build_robot(
                 group=VISUAL_GROUP,
             )
         if visual and numbered and not part.parent:
-            back = max(look.primitive.top for look in part.looks)
+            back = max(each.primitive.top for each in part.looks or part.shapes)
             bodies.back_number(body, number + 1, back)
     for i, name in enumerate(robot.joint_names):
         limit = robot.torque_limit[i]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mqe_jax.physics.robots.robot import FOOT, TRUNK, Robot, parts_of
+from mqe_jax.physics.robots.robot import BASE, FOOT, TRUNK, Robot, parts_of
 from mqe_jax.physics.rotation import quaternion_to_euler, rotate_inverse
 
 
@@ -93,7 +93,7 @@ def index_robots(
     """Builds the index tables of a compiled model's robots by looking up names."""
     numbers = range(num_robots)
     soles = robot.geom_names(FOOT)
-    bases = [model.joint(prefix(i) + "base") for i in numbers]
+    bases = [model.joint(prefix(i) + BASE) for i in numbers]
 
     def table(lookup: Callable[[str], Any], names: Sequence[str]) -> np.ndarray:
         return np.array([[lookup(prefix(i) + name) for name in names] for i in numbers], np.int32)

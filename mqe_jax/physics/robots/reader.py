@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pydantic
 
+from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError, brief, nearest, one_line
 from mqe_jax.core.limits import Length, NonNegative, Positive
 from mqe_jax.core.settings import Range, settings_class
@@ -17,7 +18,7 @@ from mqe_jax.physics.robots import mjcf
 from mqe_jax.physics.robots.model import LEG_JOINTS, ModelRobot
 from mqe_jax.physics.robots.robot import GO1_HEIGHT, Mirror, Proportions, WalkSettings
 from mqe_jax.physics.robots.shapes import Shapes
-from mqe_jax.physics.robots.skeleton import Foot, Skeleton
+from mqe_jax.physics.robots.skeleton import Foot, Skeleton, free_name
 
 GO1_MASS = 11.3  # kg
 GO1_EXTENT = np.array([0.36, 0.57])  # m, of its shapes across and along
@@ -155,10 +156,9 @@ class Reader:
             geom.name = f"g{number}"
             geom.contype = 0  # no hulls of meshes, which take long
             geom.conaffinity = 0
-        for number, joint in enumerate(spec.joints):
-            joint.name = joint.name or f"joint{number}"
-        for number, body in enumerate(spec.bodies):
-            body.name = body.name or f"body{number}"
+        _name(spec.bodies, "body")
+        self._free(spec)
+        _name(spec.joints, "joint")
         model = self._checked(spec)
         data = mujoco.MjData(model)
         for key in range(model.nkey):
@@ -171,7 +171,8 @@ class Reader:
                 angle = model.key_qpos[key, model.jnt_qposadr[joint]]
                 angles[model.joint(int(joint)).name] = float(angle)
             self.stances.setdefault(model.key(key).name, angles)
-        fixed = self._match(self.settings.fixed, [joint.name for joint in spec.joints], "fixed")
+        moved = [joint.name for joint in spec.joints if joint.type != _JOINT.mjJNT_FREE]
+        fixed = self._match(self.settings.fixed, moved, "fixed")
         if not fixed:
             return model
         for key in [*spec.keys]:
@@ -182,13 +183,30 @@ class Reader:
         for joint in [*spec.joints]:
             if joint.name in fixed:
                 spec.delete(joint)
+        self._free(spec)
         return self._checked(spec)
+
+    def _free(self, spec: mujoco.MjSpec) -> None:
+        """Gives the only body of the world a free joint if it has no joint."""
+        top = spec.worldbody.bodies
+        if len(top) != 1 or top[0].joints:
+            return
+        top[0].add_freejoint()
+        for key in spec.keys:
+            key.qpos = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *key.qpos]
+        self.notes.append(f"body {brief(top[0].name)!r}: has no free joint; it gets one")
 
     def _checked(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
         try:
             model = spec.compile()
         except ValueError as error:
             raise self.error(f"MuJoCo rejects it ({one_line(error)})") from None
+        meshes = model.geom_dataid[model.geom_type == int(_GEOM.mjGEOM_MESH)]
+        points = int(model.mesh_vertnum[meshes].sum())
+        if points > limits.MESH_POINTS:
+            raise self.error(
+                f"its geoms show {points} vertices of meshes; at most {limits.MESH_POINTS}"
+            )
         for name, (low, high) in _BOUNDS.items():
             values = getattr(model, name)
             inside = (values >= low) & (values <= high)
@@ -221,14 +239,13 @@ class Reader:
         wanted = self.settings.trunk
         if wanted is not None:
             names = [model.body(b).name for b in top]
-            self._match([wanted], names, "trunk")
-            return top[names.index(wanted)]
+            chosen = self._match([wanted], names, "trunk")
+            if len(chosen) > 1:
+                raise self.error(f"trunk: {brief(wanted)!r} names {len(chosen)} bodies; name one")
+            return top[names.index(chosen.pop())]
         free = [b for b in top if int(_JOINT.mjJNT_FREE) in self._kinds(b)]
         if len(free) == 1:
             return free[0]
-        if not free and len(top) == 1 and not model.body_jntnum[top[0]]:
-            self.notes.append(f"body {model.body(top[0]).name!r}: has no free joint; it gets one")
-            return top[0]
         names = ", ".join(repr(model.body(b).name) for b in free or top) or "none"
         raise self.error(f"worldbody: bodies that may be the trunk: {names}; set trunk")
 
@@ -467,7 +484,15 @@ class Reader:
             raise self.error("no limb ends in a collision shape; add one, and name it under feet")
         heights = np.array([self.skeleton.bottom(foot.body, foot.geom) for foot in found])
         low = heights <= heights.min() + NEAR * abs(heights.min())
-        return [foot for foot, is_low in zip(found, low, strict=True) if is_low]
+        feet = [foot for foot, is_low in zip(found, low, strict=True) if is_low]
+        if len(feet) < len(leaves) and len(leaves) >= 4:
+            others = {*leaves} - {foot.body for foot in feet}
+            names = brief(", ".join(self.skeleton.names[body] for body in sorted(others)))
+            self.notes.append(
+                f"bodies {names}: end limbs without a foot (above the lowest, or no collision "
+                "shape), so the robot is no quadruped; set feet"
+            )
+        return feet
 
     def _ordered(self, feet: list[Foot]) -> tuple[list[Foot], bool]:
         """Returns the feet, and whether they are a quadruped's, which sets the joints' order."""
@@ -556,6 +581,13 @@ class Reader:
                 "used both ways; set torque"
             )
         return min(-low, high)
+
+
+def _name(elements: Sequence[Any], what: str) -> None:
+    """Names elements that have no name."""
+    taken = {each.name for each in elements}
+    for number, each in enumerate(elements):
+        each.name = each.name or free_name(f"{what}{number}", taken)
 
 
 def whole(mirror: Mirror) -> Mirror:

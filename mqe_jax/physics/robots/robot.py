@@ -22,6 +22,8 @@ GO1_HEIGHT = 0.30
 """Height of a standing Go1's trunk, m."""
 TRUNK = "trunk"
 """Name of the first body, and part of its collision shapes."""
+BASE = "base"
+"""Name of the first body's free joint."""
 FOOT = "foot"
 """Part of the feet's collision shapes."""
 CONTACTS = ("full", "minimal")

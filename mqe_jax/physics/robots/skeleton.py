@@ -10,8 +10,9 @@ from mqe_jax.core import limits
 from mqe_jax.core.errors import InputError
 from mqe_jax.physics.robots import mjcf
 from mqe_jax.physics.robots.fitting import cloud
-from mqe_jax.physics.robots.robot import TRUNK, Mirror, Vector
+from mqe_jax.physics.robots.robot import BASE, TRUNK, Mirror, Vector
 
+SINGULAR = 1e-9  # least eigenvalue of inertias, relative to their own, of joints that differ
 _JOINT = mujoco.mjtJoint
 _GEOM = mujoco.mjtGeom
 
@@ -63,21 +64,24 @@ class Skeleton:
     def _body_names(self) -> dict[int, str]:
         names = {body: self.model.body(body).name for body in self.ids}
         others = {name for body, name in names.items() if body != self.root}
-        if TRUNK in others:
-            names = {b: f"{x}_" if x == TRUNK else x for b, x in names.items()}
-        return names | {self.root: TRUNK}
+        other = free_name(TRUNK, others)
+        return {b: other if x == TRUNK else x for b, x in names.items()} | {self.root: TRUNK}
 
     def _joint_ids(self) -> list[int]:
         found = []
         for joint in range(self.model.njnt):
             if self.model.jnt_bodyid[joint] not in self.ids:
                 continue
+            name = self.model.joint(joint).name
             kind = self.model.jnt_type[joint]
             if kind == _JOINT.mjJNT_FREE and self.model.jnt_bodyid[joint] == self.root:
                 continue
             if kind != _JOINT.mjJNT_HINGE:
-                name = self.model.joint(joint).name
                 raise self.error(f"joint {name!r}: is no hinge; name it under fixed")
+            if self.model.jnt_bodyid[joint] == self.root:
+                raise self.error(f"joint {name!r}: turns the trunk; name it under fixed")
+            if name == BASE:
+                raise self.error(f"joint {name!r}: the trunk's free joint has this name; rename it")
             found.append(joint)
         return found
 
@@ -117,7 +121,14 @@ class Skeleton:
         matrix = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, self.data, matrix)
         own = [dof for dof in range(model.nv) if model.dof_bodyid[dof] in self.ids]
-        inverse = np.linalg.inv((matrix - np.diag(model.dof_armature))[np.ix_(own, own)])
+        matrix = (matrix - np.diag(model.dof_armature))[np.ix_(own, own)]
+        scale = np.sqrt(np.diag(matrix).clip(1e-12))
+        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+        if values[0] < SINGULAR:
+            dof = own[int(np.abs(vectors[:, 0]).argmax())]
+            name = self.joint_name(int(model.dof_jntid[dof]))
+            raise self.error(f"joint {name!r}: turns only what another turns; name it under fixed")
+        inverse = np.linalg.inv(matrix)
         dofs = [own.index(model.joint(name).dofadr[0]) for name in self.joints]
         return 1.0 / np.diag(inverse)[dofs]
 
@@ -199,6 +210,13 @@ class Skeleton:
             if cost[source[i]] > 0.1:
                 source[i] = -1
         return Mirror(source, sign)
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """Returns a name that is not taken, with underscores at its end if it is."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 def triple(values: Any) -> Vector:
