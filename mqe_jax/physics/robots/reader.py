@@ -34,6 +34,7 @@ _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT
 NEAR = 0.25  # share of the height by which a foot may be above the lowest
 UPRIGHT = 0.7  # vertical part of the trunk's z axis, at least
 BENT = 0.75  # share of a straight leg's length at which a solved stance stands
+WIDEST = 200.0  # rad, range of a joint, at most
 TORQUE = 1e5  # N m of a joint, at most
 _PLACE = (-1e3, 1e3)  # m
 _SIZE = (0.0, 1e3)  # kg, kg m^2, m, N m, N m s/rad
@@ -380,8 +381,9 @@ class Reader:
             what = f"joint {self.joints[i]!r}"
             if model.qpos0[model.jnt_qposadr[joint]]:
                 raise self.error(f"{what}: ref is not 0; turn its body instead")
-            if self.upper[i] - self.lower[i] < 1e-3:
-                raise self.error(f"{what}: its range is empty; set limits")
+            if not 1e-3 <= self.upper[i] - self.lower[i] <= WIDEST:
+                ends = f"{self.lower[i]:g} to {self.upper[i]:g}"
+                raise self.error(f"{what}: its range is {ends}, empty or too wide; set limits")
             if not limited[i]:
                 self.notes.append(f"{what}: has no range; -3.14 to 3.14 is used; set limits")
             if model.jnt_stiffness[joint]:
@@ -400,7 +402,7 @@ class Reader:
         if self.upright.get(first or "", {}).get(trunk, rest) < UPRIGHT:
             raise self.error(
                 f"body {brief(trunk)!r}: its z axis is not up where the robot stands; a trunk has "
-                "x forward and z up; turn its frame, or set stance"
+                "x forward and z up; turn its frame, or its pose in the keyframe"
             )
         if first is None and (wanted is None or isinstance(wanted, Mapping)):
             values = self._solved(feet)
