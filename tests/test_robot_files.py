@@ -352,7 +352,11 @@ def test_hostile_and_broken_files_are_refused_in_one_line(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("change", "yaml", "said"),
     [
-        (('ctrlrange="-40 40"', 'forcerange="-3 40"'), "", "range is -3 to 40; the smaller end"),
+        (
+            ('ctrlrange="-40 40"', 'forcerange="-3 40"'),
+            "",
+            "FL_knee, FR_knee, .*: the ends of their torques differ; the smaller",
+        ),
         (('<body name="FL_upper"', '<body gravcomp="1" name="FL_upper"'), "", "gravcomp is left"),
         (
             (" 0 0.8 -1.5 0 0.8", " 0 0.8 -2.5 0 0.8"),
@@ -377,6 +381,9 @@ def test_names_are_free_and_a_trunk_without_a_joint_gets_one(tmp_path: Path) -> 
     with pytest.warns(UserWarning, match="body 'torso': has no free joint; it gets one"):
         free = written(tmp_path, text, "speed: 20", "free")
     np.testing.assert_allclose(free.default_joints, read(DOG).default_joints)
+    text = text.replace('pos="0 0 0.4"', 'pos="0 0 0.4" euler="1.6 0 0"')
+    with pytest.raises(InputError, match="body 'torso': its z axis is not up"):
+        written(tmp_path, text, "speed: 20", "lying")
 
 
 def test_the_vertices_of_meshes_are_bounded(

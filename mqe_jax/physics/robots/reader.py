@@ -136,6 +136,7 @@ class Reader:
         self.upright: dict[str, dict[str, float]] = {}
         self.named: dict[str, str] = {}
         self.solid: set[str] = set()
+        self.uneven: set[str] = set()  # joints whose torques have unlike ends
         self.model = self._compile()
         self.skeleton = Skeleton(source, self.model, self._trunk(), self.solid)
         self.joints = self.skeleton.joints
@@ -158,9 +159,11 @@ class Reader:
             geom.contype = 0  # no hulls of meshes, which take long
             geom.conaffinity = 0
         _name(spec.bodies, "body")
-        self._free(spec)
+        freed = self._free(spec)
         _name(spec.joints, "joint")
         model = self._checked(spec)
+        if freed:
+            model.key_qpos[:, :7] = model.qpos0[:7]
         data = mujoco.MjData(model)
         for key in range(model.nkey):
             data.qpos = model.key_qpos[key]
@@ -187,15 +190,16 @@ class Reader:
         self._free(spec)
         return self._checked(spec)
 
-    def _free(self, spec: mujoco.MjSpec) -> None:
-        """Gives the only body of the world a free joint if it has no joint."""
+    def _free(self, spec: mujoco.MjSpec) -> bool:
+        """Gives the only body of the world a free joint if it has no joint; says whether."""
         top = spec.worldbody.bodies
         if len(top) != 1 or top[0].joints:
-            return
+            return False
         top[0].add_freejoint()
         for key in spec.keys:
-            key.qpos = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *key.qpos]
+            key.qpos = [*np.zeros(7), *key.qpos]
         self.notes.append(f"body {brief(top[0].name)!r}: has no free joint; it gets one")
+        return True
 
     def _checked(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
         try:
@@ -572,16 +576,23 @@ class Reader:
             if math.isnan(limit[i]):
                 what = "has two actuators"
             raise self.error(f"joint {name!r}: {what}; set torque, or name it under fixed")
+        uneven = [
+            name
+            for name, most in zip(self.joints, limit, strict=True)
+            if name in self.uneven and most == found[name]
+        ]
+        if uneven:
+            self.notes.append(
+                f"joints {brief(', '.join(uneven))}: the ends of their torques differ; the smaller "
+                "is used both ways; set torque"
+            )
         return limit
 
     def _end(self, joint: str, ends: np.ndarray) -> float:
         """Returns the magnitude of the end of a range that is nearer to zero."""
         low, high = ends.tolist()
         if -low != high:
-            self.notes.append(
-                f"joint {joint!r}: its actuator's range is {low:g} to {high:g}; the smaller end is "
-                "used both ways; set torque"
-            )
+            self.uneven.add(joint)
         return min(-low, high)
 
 
