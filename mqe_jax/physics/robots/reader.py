@@ -164,6 +164,12 @@ class Reader:
         model = self._checked(spec)
         if freed:
             model.key_qpos[:, :7] = model.qpos0[:7]
+        self._read_stances(model)
+        moved = [joint.name for joint in spec.joints if joint.type != _JOINT.mjJNT_FREE]
+        fixed = self._match(self.settings.fixed, moved, "fixed")
+        return self._without(fixed) if fixed else model
+
+    def _read_stances(self, model: mujoco.MjModel) -> None:
         data = mujoco.MjData(model)
         for key in range(model.nkey):
             data.qpos = model.key_qpos[key]
@@ -175,10 +181,10 @@ class Reader:
                 angle = model.key_qpos[key, model.jnt_qposadr[joint]]
                 angles[model.joint(int(joint)).name] = float(angle)
             self.stances.setdefault(model.key(key).name, angles)
-        moved = [joint.name for joint in spec.joints if joint.type != _JOINT.mjJNT_FREE]
-        fixed = self._match(self.settings.fixed, moved, "fixed")
-        if not fixed:
-            return model
+
+    def _without(self, fixed: set[str]) -> mujoco.MjModel:
+        """Returns the model without some joints, and without what refers to them."""
+        spec = self.source.spec
         for key in [*spec.keys]:
             spec.delete(key)
         for actuator in [*spec.actuators]:
