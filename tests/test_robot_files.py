@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from mqe_jax.physics.robots.build import build_robot
 from mqe_jax.physics.robots.index import Proprioception, RobotState
 from mqe_jax.physics.robots.model import ModelRobot
 from mqe_jax.physics.robots.quadruped import MIRROR
-from mqe_jax.physics.robots.robot import Proportions
+from mqe_jax.physics.robots.robot import FOOT, Proportions
 from mqe_jax.skills import agile
 from mqe_jax.walk import training
 from mqe_jax.walk.rewards import reward_terms
@@ -204,6 +205,20 @@ def test_legs_have_the_usual_order_whatever_that_of_the_file(tmp_path: Path) -> 
     swapped = dog(("FL_", "X_"), ("RR_", "FL_"), ("X_", "RR_"))  # front left is called RR
     robot = written(tmp_path, swapped, "speed: 20")
     assert robot.joint_names[::3] == ("RR_roll", "FR_roll", "RL_roll", "FL_roll")
+
+
+def test_contacts_of_feet_have_the_order_of_the_legs(tmp_path: Path) -> None:
+    """Rewards compare each foot's force with its phase."""
+    tree = ElementTree.parse(DOG)
+    (trunk,) = (body for body in tree.iter("body") if body.find("freejoint") is not None)
+    legs = trunk.findall("body")
+    for leg in legs:
+        trunk.remove(leg)
+    trunk.extend(reversed(legs))
+    robot = written(tmp_path, ElementTree.tostring(tree.getroot(), "unicode"), "speed: 20")
+    assert robot.joint_names == read(DOG).joint_names
+    names = [body.name for body in robot.tree if body.shapes[-1].name in robot.geom_names(FOOT)]
+    assert names == [body for body, _ in robot.soles]
 
 
 def test_a_stance_is_solved_where_there_is_none(tmp_path: Path) -> None:
@@ -391,7 +406,7 @@ def test_the_vertices_of_meshes_are_bounded(
 ) -> None:
     (tmp_path / "foot.obj").write_text(TETRAHEDRON)
     mesh = '<asset><mesh name="foot" file="foot.obj"/></asset><worldbody>'
-    text = dog(("<worldbody>", mesh), (FOOT, 'type="mesh" mesh="foot"'))
+    text = dog(("<worldbody>", mesh), (BALL, 'type="mesh" mesh="foot"'))
     monkeypatch.setattr(limits, "MESH_POINTS", 15)
     with pytest.raises(InputError, match="its geoms show 16 vertices of meshes; at most 15"):
         written(tmp_path, text)
@@ -400,7 +415,7 @@ def test_the_vertices_of_meshes_are_bounded(
         written(tmp_path, text + " ")
 
 
-FOOT = 'type="sphere" size="0.026"'
+BALL = 'type="sphere" size="0.026"'
 TETRAHEDRON = "v 0 0 0\nv 0.03 0 0\nv 0 0.02 0\nv 0 0 0.03\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
@@ -416,7 +431,7 @@ def test_feet_that_are_named_collide(foot: str, tmp_path: Path) -> None:
     (tmp_path / "foot.obj").write_text(TETRAHEDRON)
     text = dog(("<worldbody>", mesh))
     for number in range(4):
-        text = text.replace(FOOT, foot.format(f"foot{number}"), 1)
+        text = text.replace(BALL, foot.format(f"foot{number}"), 1)
     robot = written(tmp_path, text, 'feet: ["foot*"]\nspeed: 20')
     assert robot.four_legged and len(robot.geom_names("foot")) == 4
 

@@ -16,7 +16,7 @@ from mqe_jax.core.limits import Length, NonNegative, Positive
 from mqe_jax.core.settings import Range, settings_class
 from mqe_jax.physics.robots import mjcf
 from mqe_jax.physics.robots.model import LEG_JOINTS, ModelRobot
-from mqe_jax.physics.robots.robot import GO1_HEIGHT, Mirror, Proportions, WalkSettings
+from mqe_jax.physics.robots.robot import GO1_HEIGHT, Body, Mirror, Proportions, WalkSettings
 from mqe_jax.physics.robots.shapes import Shapes
 from mqe_jax.physics.robots.skeleton import Foot, Skeleton, free_name
 
@@ -276,7 +276,7 @@ class Reader:
         self._limits()
         stance = self._stance(feet)
         shapes = Shapes(skeleton, feet, alone=quadruped)
-        bodies = shapes.bodies()
+        bodies = _by_limb(shapes.bodies(), [skeleton.names[foot.body] for foot in feet])
         self.notes += shapes.notes
         height = settings.stand_height or -min(skeleton.bottom(x.body, x.geom) for x in feet)
         mass = sum(body.link.mass for body in bodies)
@@ -607,6 +607,19 @@ def _name(elements: Sequence[Any], what: str) -> None:
     taken = {each.name for each in elements}
     for number, each in enumerate(elements):
         each.name = each.name or free_name(f"{what}{number}", taken)
+
+
+def _by_limb(bodies: Sequence[Body], feet: Sequence[str]) -> list[Body]:
+    """Returns bodies, parents first, with those of the limbs in the order of their feet."""
+    parents = {body.name: body.parent for body in bodies}
+    limb: dict[str, int] = {}
+    for number, name in enumerate(feet):
+        while parents[name]:
+            limb[name] = number
+            name = parents[name]
+    for body in bodies:
+        limb.setdefault(body.name, limb.get(body.parent, -1))
+    return sorted(bodies, key=lambda body: limb[body.name])
 
 
 def whole(mirror: Mirror) -> Mirror:
