@@ -134,8 +134,8 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
         own = {name: value for name, value in own.items() if value != usual[name]}
         if needs.senses:
             own["senses"] = needs.senses
-        if "@" in own.get("robot", ""):  # of a file, which the training's settings name
-            own["robot"] = policy.config.env.get("robot", own["robot"])
+        if "robot" in own:
+            own |= _robots_of(policy, own.pop("robot"))
         if needs.skill_weights:
             own["skill_weights"] = policy.config.env.get("skill_weights")
         params = own | {name: value for name, value in params.items() if value is not None}
@@ -144,6 +144,13 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
     if usual and all(policy.needs.control == "command" for policy in trained):
         skills.append(TASKS[task].Params().actions("command"))
     return params | together(skills)
+
+
+def _robots_of(policy: TrainedPolicy, needed: str) -> dict[str, Any]:
+    """Returns the parameter that names a policy's robots; the training's settings name files."""
+    unlike = needed.split(", ")
+    name, value = ("robots", unlike) if len(unlike) > 1 else ("robot", needed)
+    return {name: policy.config.env.get(name, value) if "@" in needed else value}
 
 
 def environment(

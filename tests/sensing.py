@@ -72,7 +72,7 @@ class Shapes:
         self.env = env
         spec = mujoco.MjSpec()
         layout = env.compiled.layout
-        radius = np.hypot(*env.robot.leg_root)
+        radius = np.hypot(*env.robots[0].leg_root)
         self.bodies: list[int] = []  # of the scene, that the shapes follow; -1 for walls
         self.places: list[Any] = []  # of walls: x, y, yaw and the anchor to which they belong
 

@@ -68,7 +68,7 @@ def placed(
     qpos[index.base_qpos] = np.c_[
         position, _quaternion(np.zeros_like(position) if euler is None else euler)
     ]
-    qpos[index.joint_qpos] = env.robot.default_joints
+    qpos[index.joint_qpos] = env.robots[0].default_joints
     for name, coordinates in (objects or {}).items():
         qpos[env.objects[name].qpos] = coordinates
     return _with(state, qpos=qpos, qvel=np.zeros_like(state.data.qvel))

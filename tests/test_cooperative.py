@@ -96,7 +96,7 @@ def ground_height(env: Any, x: float, y: float) -> float:
 def test_endings(task: str) -> None:
     env = made(task)
     pose = np.array(env.spawn_poses())
-    height = [ground_height(env, x, y) + env.robot.stand_height + 0.01 for x, y, _ in pose]
+    height = [ground_height(env, x, y) + env.robots[0].stand_height + 0.01 for x, y, _ in pose]
     position = np.c_[pose[:, :2], height]
     euler = np.c_[np.zeros((len(pose), 2)), pose[:, 2]]
 

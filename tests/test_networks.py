@@ -255,7 +255,7 @@ def test_a_network_is_evaluated_resumed_trained_with_seeds_viewed_and_exported(
         session.advance()
     assert session.episodes.tolist() == [1] * 4 and np.all(np.isfinite(session.rewards))
     sizes = {"observation_size": policy.dims[1], "moving": lambda action: action}
-    described: Any = SimpleNamespace(name="probe", control=env.control, robot=env.robot, **sizes)
+    described: Any = SimpleNamespace(name="probe", control=env.control, robots=env.robots, **sizes)
     assert export_error(policy, described) < 2e-5
 
 

@@ -164,6 +164,6 @@ def test_it_is_exported(own: Own) -> None:
     obs = np.random.default_rng(0).normal(size=(3, 1, policy.dims.observation)).astype(np.float32)
     names = ["action", "joint_target"]
     action, target = onnxruntime.InferenceSession(graph).run(names, {"obs": obs})
-    expected = own.robot.joint_targets(jnp.asarray(action) / REWARD, 1.0)
+    expected = own.robots[0].joint_targets(jnp.asarray(action) / REWARD, 1.0)
     np.testing.assert_allclose(target, expected, atol=1e-5)
     assert np.abs(action).max() > 0.1

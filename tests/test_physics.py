@@ -303,13 +303,12 @@ def test_a_crowd_fits_into_the_buffers(task: str) -> None:
             )
             data.qpos[index.base_qpos[:, :2]] = place
             data.qpos[index.base_qpos[:, 2]] = (
-                3.0 - depth + env.robot.stand_height + STACK * np.arange(robots)
+                3.0 - depth + env.robots[0].stand_height + STACK * np.arange(robots)
             )
             touched.append(0)
             for _ in range(100):
-                data.ctrl[index.actuator] = env.robot.default_joints + 0.2 * random.standard_normal(
-                    (robots, 12)
-                )
+                swing = 0.2 * random.standard_normal((robots, 12))
+                data.ctrl[index.actuator] = env.robots[0].default_joints + swing
                 mujoco.mj_step(model, data, 4)
                 contacts.append(data.ncon)
                 rows.append(data.nefc)
@@ -384,7 +383,7 @@ def test_a_step_that_drops_contacts_is_counted(impl: str, limit: dict[str, Any])
     qpos = np.array(start.data.qpos)
     qvel = np.zeros_like(start.data.qvel)
     qpos[:, env.index.base_qpos[0]] = [(1, 0, height, 1, 0, 0, 0) for height in (0.3, 1.3, 0.3)]
-    qpos[:, env.index.joint_qpos[0]] = env.robot.default_joints
+    qpos[:, env.index.joint_qpos[0]] = env.robots[0].default_joints
     qvel[:, env.index.base_qvel[0, 2]] = 0.0, 0.0, 3.0
     start = dataclasses.replace(
         start, data=start.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))

@@ -17,6 +17,7 @@ from mqe_jax.envs.autoreset import KEPT, SEEN, autoreset
 from mqe_jax.envs.observation import others
 from mqe_jax.envs.reward import crowding
 from mqe_jax.physics import rotation
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.skills.control import Controller
@@ -222,7 +223,7 @@ def test_the_privileged_observation_has_everything_in_its_place() -> None:
             "linear_velocity": v[of : of + 3],
             "angular_velocity": v[of + 3 : of + 6],
             "joint_position": [q[model.joint(name).qposadr[0]] for name in legs]
-            - env.robot.default_joints,
+            - env.robots[0].default_joints,
             "joint_velocity": [v[model.joint(name).dofadr[0]] for name in legs],
         }
         expected |= {f"robot{robot}/{name}": value for name, value in values.items()}
@@ -315,7 +316,7 @@ def test_shaping_fades_with_the_assistance() -> None:
 def test_targets_are_scaled_actions_delayed_by_the_lag(mode: str) -> None:
     skill: Any = SimpleNamespace()
     controller = Controller(
-        skill, (), np.zeros(0), {}, mode, GO1, 3, 2, None, lag=2, position_scale=1.5
+        skill, (), np.zeros(0), {}, mode, Fleet([GO1] * 3), 2, (), lag=2, position_scale=1.5
     )
     still = Proprioception(jnp.zeros((3, 3)), jnp.zeros((3, 12)), jnp.zeros((3, 12)))
     actions = jax.random.uniform(KEY, (4, 2, 12), minval=-1.0)

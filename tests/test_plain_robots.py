@@ -42,17 +42,16 @@ def limited(motors: Motors, force: float, joint: int, speeds: np.ndarray) -> flo
 
 def armature(motors: Motors, torque: np.ndarray, joint: int, speeds: np.ndarray) -> float:
     """The armature of a joint, kg m^2, at the speeds of all joints under torques."""
+    response = motors.runs[0].response
     leg = slice(3 * (joint // 3), 3 * (joint // 3) + 3)
     own = joint % 3
     top = float(motors.speed[joint])
     full = motors.timestep * float(motors.torque[joint]) / (0.15 * top)
     fast = np.abs(speeds[leg]).max() / motors.speed[leg].min()
     share = min(max((fast - 0.85) / 0.15, 0.0), 1.0)
-    reach = (
-        abs(speeds[joint]) + motors.timestep * motors.response[own] @ np.abs(torque[leg])
-    ) / top
-    needed = min(4.0 / motors.response[own, own] * (reach - 1.0), full) if reach > 1.25 else 0.0
-    inertia = 1.0 / motors.response[own, own]
+    reach = (abs(speeds[joint]) + motors.timestep * response[own] @ np.abs(torque[leg])) / top
+    needed = min(4.0 / response[own, own] * (reach - 1.0), full) if reach > 1.25 else 0.0
+    inertia = 1.0 / response[own, own]
     line = float(motors.stall[joint]) / top
     if motors.timestep * line > 2.0 * inertia:
         most = line * (top - speeds[joint] * np.sign(torque[joint]))

@@ -114,7 +114,7 @@ def test_feet_and_knees_are_where_mujoco_puts_them(file: str) -> None:
 
 def test_a_robot_of_two_legs_is_observed_rewarded_drawn_and_exported() -> None:
     env = make("go1gate", impl="c", robot=BIPED, control="position", senses=["proprioception"])
-    assert env.action_size == 9 and env.robot.num_joints == 9
+    assert env.action_size == 9 and env.robots[0].num_joints == 9
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     step = jax.jit(env.step)
     for _ in range(3):
@@ -137,7 +137,7 @@ def test_a_robot_of_two_legs_stands_beside_another() -> None:
         state = step(state, jnp.zeros((2, 9)))
     found = env.read(state.data)
     assert not bool(state.terminated) and float(jnp.abs(found.euler).max()) < 0.1
-    np.testing.assert_allclose(found.position_w[:, 2], env.robot.stand_height, atol=0.03)
+    np.testing.assert_allclose(found.position_w[:, 2], env.robots[0].stand_height, atol=0.03)
     with pytest.raises(InputError, match=r"skill: 'walk' needs four legs of three joints; biped"):
         make("go1plane", impl="c", robot=BIPED)
 
@@ -456,8 +456,8 @@ def test_names_of_robots_that_are_not_there_say_what_is_known() -> None:
 def test_sizes_of_tasks_follow_the_body_and_the_users_number_wins() -> None:
     usual = make("go1gate", impl="c", control="position").params
     env = make("go1gate", impl="c", control="position", robot=BIPED)
-    body = env.robot.proportions
-    assert body.height == pytest.approx(env.robot.stand_height / 0.3)
+    body = env.robots[0].proportions
+    assert body.height == pytest.approx(env.robots[0].stand_height / 0.3)
     assert env.params.spawn_height == pytest.approx(usual.spawn_height * body.height, abs=1e-3)
     assert env.params.gate_width == pytest.approx(usual.gate_width * body.width, abs=1e-3)
     own = make("go1gate", impl="c", control="position", robot=BIPED, gate_width=usual.gate_width)
@@ -597,7 +597,7 @@ def test_the_commands_of_the_page_lead_from_a_file_to_a_trained_team(
 
 def test_a_path_is_a_robot_too() -> None:
     env = make("go1plane", impl="c", control="position", robot=Path(BIPED))
-    assert env.params.robot == BIPED and env.robot is read(BIPED)
+    assert env.params.robot == BIPED and env.robots[0] is read(BIPED)
 
 
 def test_robots_of_the_menagerie_come_from_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -612,7 +612,7 @@ def test_robots_of_the_menagerie_come_from_its_package(monkeypatch: pytest.Monke
     package = SimpleNamespace(get=get, MenagerieError=MenagerieError)
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", package)
     env = make("go1plane", impl="c", control="position", robot="menagerie:own_dog")
-    assert env.robot.joint_names[0] == "FL_roll" and env.robot.call == "menagerie:own_dog"
+    assert env.robots[0].joint_names[0] == "FL_roll" and env.robots[0].call == "menagerie:own_dog"
     with pytest.raises(InputError, match=r"menagerie:cat: Unknown robot 'cat'"):
         robots.get("menagerie:cat")
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)

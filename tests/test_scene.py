@@ -169,7 +169,7 @@ def test_stands_on_its_default_pose(name: str) -> None:
 def test_a_variant_of_ones_own_is_a_robot_of_every_task(lifted: Robot) -> None:
     env = make("go1gate", impl="c", robot="lifted")
     model = env.compiled.model
-    assert env.robot is lifted
+    assert env.robots[0] is lifted
     assert model.body("robot1/trunk").mass[0] == pytest.approx(6.0)
     assert model.actuator("robot0/FL_hip").gainprm[0] == pytest.approx(35.0)
     np.testing.assert_allclose(env.controller.neutral[0], lifted.default_joints, rtol=1e-6)
@@ -218,11 +218,9 @@ def test_wrong_data_is_refused_by_name() -> None:
     refuses(r"unknown part 'tail'", CollisionShape, "tail", sphere(0.02))
 
 
-def test_a_scene_has_one_kind_of_robot() -> None:
+def test_a_scene_has_as_many_robots_as_numbers() -> None:
     go2 = robots.get("go2")
-    assert compiled(go2, 2).robot is go2
-    two = Scene(PLANE, num_robots=2, robots=(GO1, go2))
-    refuses(r"Scene\.robots: two kinds, go1, go2; all must be one robot", compile_scene, two)
+    assert compiled(go2, 2).robots == (go2, go2)
     refuses(r"Scene\.robots: 1 robots; expected 2, num_robots", Scene, PLANE, robots=(GO1,))
 
 
@@ -313,7 +311,7 @@ def test_a_step_that_is_interrupted_leaves_no_armature(monkeypatch: Any) -> None
     env: Any = make("go1plane", impl="c", control="torque", num_agents=1, num_envs=2)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
     data = state.data.replace(
-        qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(env.robot.joint_speed_limit)
+        qvel=state.data.qvel.at[:, env.index.joint_qvel[0]].set(env.robots[0].joint_speed_limit)
     )
     arrays = [
         np.asarray(x)
@@ -321,7 +319,7 @@ def test_a_step_that_is_interrupted_leaves_no_armature(monkeypatch: Any) -> None
             data.qpos,
             data.qvel,
             data.qacc_warmstart,
-            np.tile(env.robot.torque_limit, (2, 1)),
+            np.tile(env.robots[0].torque_limit, (2, 1)),
         )
     ]
 
@@ -359,7 +357,7 @@ def test_joints_in_the_air_start_along_their_torque_line() -> None:
     Explicit integration of a physics step exceeds the line, an implicit one stays below.
     """
     env: Any = make("go1plane", impl="c", robot="go2", num_agents=1, control="torque", num_envs=3)
-    robot = env.robot
+    robot = env.robots[0]
     data = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3)).data
     qpos = np.array(data.qpos)
     qpos[:, env.index.base_qpos[0, 2]] = 2.0
@@ -390,13 +388,13 @@ def test_engines_agree_where_motors_saturate(robot: str) -> None:
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
         speed = (
             0.9
-            * env.robot.joint_speed_limit
+            * env.robots[0].joint_speed_limit
             * jax.random.uniform(jax.random.PRNGKey(1), (4, 12), minval=-1.0)
         )
         qvel = np.array(state.data.qvel)
         qvel[:, env.index.joint_qvel[0]] = speed
         data = state.data.replace(qvel=jnp.asarray(qvel))
-        torque = jnp.where(speed > 0, 1.0, -1.0) * env.robot.torque_limit
+        torque = jnp.where(speed > 0, 1.0, -1.0) * env.robots[0].torque_limit
         step = jax.jit(jax.vmap(lambda d, t, env=env: env.physics.step(d, t)[0]))
         states[impl] = step.lower(data, torque).compile(compiler_options=QUICK)(data, torque)
     for field, atol in (("qpos", 1e-4), ("qvel", 0.02)):
@@ -411,10 +409,10 @@ def test_joint_mechanics_are_in_the_model() -> None:
     env: Any = make("go1plane", impl="c", num_agents=1, joint_mechanics=True)
     joints = env.index.joint_qvel[0]
     model = env.compiled.model
-    np.testing.assert_allclose(model.dof_armature[joints], env.robot.rotor_inertia)
-    np.testing.assert_allclose(model.dof_damping[joints], env.robot.joint_damping)
+    np.testing.assert_allclose(model.dof_armature[joints], env.robots[0].rotor_inertia)
+    np.testing.assert_allclose(model.dof_damping[joints], env.robots[0].joint_damping)
     assert not model.dof_dampingpoly.any()
-    np.testing.assert_allclose(model.dof_frictionloss[joints], env.robot.friction_loss)
+    np.testing.assert_allclose(model.dof_frictionloss[joints], env.robots[0].friction_loss)
     plain: Any = make("go1plane", impl="c", num_agents=1)
     assert (
         not plain.compiled.model.dof_armature.any()

@@ -314,6 +314,6 @@ def test_a_demonstrators_memory_starts_anew_with_its_episodes(rollout: Any) -> N
     ctrl = np.asarray(demonstrations["data"]["ctrl"])
     assert len(step) == 128 * 16 and len(set(step.tolist())) > 8
     bent = (ctrl - env.env.controller.neutral.ravel()) / np.tile(
-        env.env.robot.action_scale, env.num_agents
+        env.env.robots[0].action_scale, env.num_agents
     )
     np.testing.assert_allclose(bent, 0.01 * np.tile(step[:, None], bent.shape[1]), atol=1e-5)

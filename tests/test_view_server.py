@@ -421,7 +421,7 @@ def test_contact_forces_carry_the_robots() -> None:
     model = env.mj_model
     joints = np.asarray(env.index.joint_qpos)
     data = mujoco.MjData(model)
-    data.qpos[joints] = env.robot.default_joints
+    data.qpos[joints] = env.robots[0].default_joints
     for i, base in enumerate(env.index.base_qpos):
         data.qpos[base[:3]] = 2.0, i - 0.5, 0.29
     data.ctrl[:] = data.qpos[joints].ravel()

@@ -21,6 +21,7 @@ from mqe_jax import make, skills, walk_policy
 from mqe_jax.core.settings import override
 from mqe_jax.core.types import NetworkMemory
 from mqe_jax.physics import actuators
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.physics.robots.quadruped import JOINT_NAMES, MIRROR
@@ -377,7 +378,7 @@ def test_an_actuator_network_gets_the_newest_error_first_and_keeps_two(
         joint_qpos=joints, joint_qvel=joints, actuator=joints, num_robots=1
     )
     physics: Any = SimpleNamespace(step=slide, num_substeps=3, model=SimpleNamespace(nu=12))
-    network = actuators.NetworkActuators(physics, index, GO1, {})
+    network = actuators.NetworkActuators(physics, index, Fleet([GO1]), {})
     start = Sliding(jnp.full(12, 1e-3), jnp.ones(12), jnp.zeros(12))
     data, memory, overflow = network.step(
         start, network.init_memory(), jnp.zeros((1, 12)), {}, None

@@ -18,6 +18,7 @@ from fake_env import FakeEnv, FakeVectorEnv
 from mqe_jax import skills
 from mqe_jax.acting.seats import Seats
 from mqe_jax.names import load_policy
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.skills.control import Controller
 from mqe_jax.view.session import Session
@@ -44,7 +45,7 @@ class Driven(FakeEnv):
     params = SimpleNamespace(commands=("vx", "vy", "yaw_rate"))
     skill = skills.make("walk", GO1)
     controller = Controller(
-        skill, params.commands, np.zeros(15, np.float32), {}, "command", GO1, 2, 2, ()
+        skill, params.commands, np.zeros(15, np.float32), {}, "command", Fleet([GO1] * 2), 2, ()
     )
 
     def unmirror_action(self, action: jax.Array) -> jax.Array:

@@ -16,6 +16,7 @@ from mqe_jax.core.types import (
     Memory,
     Observations,
     is_typed_key,
+    rows_of,
     shapes_of,
     teams_of,
     where_rows,
@@ -184,17 +185,11 @@ class Seat:
         `action` (N, A, D) has the actions of all agents; see `Seats.act`.
         """
         rows = self.rows(len(action))
-        own = jax.tree.map(lambda x: x[rows, _index(self.sees)], seen)
+        own = jax.tree.map(lambda x: x[rows, rows_of(self.sees)], seen)
         shape = (self.count(len(action)), len(self.sees), action.shape[-1])
         chosen, memory = _check_act(self.policy.act(own, memory, key), shape, memory)
-        chosen = chosen[:, _index(tuple(self.sees.index(agent) for agent in self.acts))]
-        return action.at[rows, _index(self.acts)].set(chosen), memory
-
-
-def _index(agents: tuple[int, ...]) -> slice | np.ndarray:
-    """Returns agents as an index of an array, if possible a slice."""
-    whole = slice(agents[0], agents[-1] + 1)
-    return whole if agents == tuple(range(whole.start, whole.stop)) else np.array(agents)
+        chosen = chosen[:, rows_of(tuple(self.sees.index(agent) for agent in self.acts))]
+        return action.at[rows, rows_of(self.acts)].set(chosen), memory
 
 
 def _check_act(returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:

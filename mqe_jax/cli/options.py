@@ -57,6 +57,9 @@ class TaskOptions:
     robot: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Robot of the task: go1, go2, an MJCF or YAML file, or menagerie:NAME. Default: go1, or the
     run's robot."""
+    robots: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|FILE")] = ()
+    """Unlike robots instead, such as --robots go1 go2: one for each robot, or for each team of a
+    match. Default: all are alike, or those of the run."""
     senses: Annotated[str | None, tyro.conf.arg(metavar="NAME|LIST")] = None
     """Sensors: onboard, full (none), or a list such as '[proprioception, lidar]'. Short for --set
     senses=VALUE; a training then reads them. Default: full, or those of the run."""
@@ -66,9 +69,10 @@ class TaskOptions:
     """Task parameter, such as gate_width=0.7 (metre); may be repeated. Values are read as YAML."""
 
     def overrides(self) -> dict[str, Any]:
-        """Returns the task parameters given by --set, --control, --robot and --senses."""
+        """Returns the task parameters given by --set and the flags of their names."""
         senses = None if self.senses is None else parse_yaml(self.senses, "senses")
         flags = {"control": self.control, "robot": self.robot, "senses": senses}
+        flags["robots"] = self.robots or None
         given = {name: value for name, value in flags.items() if value is not None}
         return parse_overrides(self.set) | given
 

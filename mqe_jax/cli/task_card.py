@@ -35,7 +35,8 @@ def describe(env: QuadrupedEnv) -> dict[str, Any]:
             "aim": about.aim,
             "about": about.about,
             "about_of": about.about_of,
-            "robot": _robot(env.robot),
+            "robots": [_robot(kind) for kind in env.robots.kinds],
+            "robot_of": [env.robots.kinds[kind].identity for kind in env.robots.kind_of],
             "teams": [len(team) for team in env.teams],
             "any_size": env.variable_num_agents,
             "time_limit_s": env.params.episode_length,
@@ -124,9 +125,12 @@ def show(card: Mapping[str, Any], *, long: bool) -> None:
         "policies": ", ".join(card["policies"]),
     }
     _print_rows("Overview", facts.items())
-    robot = card["robot"]
-    if "@" in robot["name"]:  # of a file
+    for robot in card["robots"]:
+        if "@" not in robot["name"] and len(card["robots"]) == 1:  # not of a file
+            continue
         shown = {**robot, "joints": ", ".join(robot["joints"]), "notes": "; ".join(robot["notes"])}
+        numbers = [i + 1 for i, name in enumerate(card["robot_of"]) if name == robot["name"]]
+        shown["robots"] = ", ".join(map(str, numbers))
         _print_rows("Robot", ((name, text) for name, text in shown.items() if text))
     if card["control"] == "command":
         _print_rows(f"Action: commands of the skill {card['skill']}", card["commands"].items())

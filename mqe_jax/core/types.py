@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
@@ -183,6 +183,12 @@ def raw_keys(tree: PyTree) -> PyTree:
 def is_typed_key(x: Any) -> bool:
     """Returns whether an array is a typed random key."""
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def rows_of(numbers: Sequence[int]) -> slice | np.ndarray:
+    """Returns numbers of rows as an index of an array, if possible a slice."""
+    whole = slice(numbers[0], numbers[-1] + 1)
+    return whole if [*numbers] == [*range(whole.start, whole.stop)] else np.array(numbers)
 
 
 def teams_of(env: VectorEnv) -> Teams:

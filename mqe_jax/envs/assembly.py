@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 from mqe_jax import skills
 from mqe_jax.core.errors import InputError, warn
+from mqe_jax.core.settings import fail
 from mqe_jax.envs.task import Task
+from mqe_jax.physics import robots
+from mqe_jax.physics.robots.fleet import Fleet
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.scene import Scene
-from mqe_jax.skills.control import Controller
+from mqe_jax.skills import Skill
+from mqe_jax.skills.control import Controller, Group
 
 
 def make_scene(task: Task[Any, Any]) -> Scene:
-    """Returns the task's scene with the robot, physics and sensors of its parameters."""
+    """Returns the task's scene with the robots, physics and sensors of its parameters."""
     scene = task.scene()
     if scene.robots:
         raise InputError(
-            "scene: Scene.robots is not empty; the parameter robot says which robots a task has"
+            "scene: Scene.robots is not empty; the parameters robot and robots say which robots a "
+            "task has"
         )
     params = task.params
     by_torque = 0
@@ -27,7 +34,7 @@ def make_scene(task: Task[Any, Any]) -> Scene:
         by_torque = scene.num_robots
     return dataclasses.replace(
         scene,
-        robots=(task.robot,) * scene.num_robots,
+        robots=_robots_of(task, scene.num_robots),
         contacts=params.contacts,
         friction=params.friction,
         joint_mechanics=params.joint_mechanics,
@@ -39,6 +46,24 @@ def make_scene(task: Task[Any, Any]) -> Scene:
     )
 
 
+def _robots_of(task: Task[Any, Any], count: int) -> tuple[Robot, ...]:
+    """Returns each robot of a scene; without a name an NPC robot is as the first one."""
+    names: Sequence[str] = task.params.robots or (task.params.robot,) * count
+    teams = task.teams
+    if len(names) == len(teams):
+        sizes = map(len, teams)
+        names = [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
+    if len(names) not in (task.num_agents, count):
+        allowed = f"{task.num_agents} names, one for each robot"
+        if 1 < len(teams) < task.num_agents:
+            allowed += f", or {len(teams)}, one for each team"
+        if count > task.num_agents:
+            allowed += f", or {count} with the robots that have no policy"
+        fail("robots", task.params.robots, allowed)
+    each = [robots.get(name) for name in names]
+    return tuple(each + each[:1] * (count - len(each)))
+
+
 def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Controller:
     """Returns the controller of the scene's robots: the agents' skill, and that of NPC robots.
 
@@ -46,35 +71,57 @@ def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Co
     period is not that of an environment step of `num_substeps`.
     """
     params = task.params
-    skill = skills.make(params.skill, task.robot)
+    commander = params.commander
+    agents = task.num_agents
+    has_npcs = scene.num_robots > agents
+    shared = has_npcs and task.npc_skill == commander.skill.name  # NPC robots use the agents' skill
+    varied = params.commands
+    if shared:
+        varied = (*varied, *task.npc_varied) if task.npc_varied else ()
+
+    def groups(
+        numbers: Sequence[int],
+        usual: Skill,
+        varied: tuple[str, ...],
+        gait: str | None,
+        weights: Any,
+    ) -> list[Group]:
+        name = tuple(part.name for part in usual.parts)
+        found = []
+        for kind in dict.fromkeys(scene.robots[number] for number in numbers):
+            own = tuple(number for number in numbers if scene.robots[number] is kind)
+            skill = skills.make(name if len(name) > 1 else name[0], kind)
+            skill.check_period(scene.timestep, num_substeps)
+            shift = skill.default_commands(gait) - usual.default_commands(gait)
+            shift[skill.index(varied)] = 0.0
+            if varied:
+                skill = skill.restrict(varied, gait)
+            found.append(Group(skill, skill.load_params(weights), own, shift))
+        return found
+
+    every = []
+    if task.control == "command" or shared:
+        numbers = range(scene.num_robots if shared else agents)
+        every = groups(numbers, commander.skill, varied, params.gait, params.skill_weights)
+        for group in every:
+            beyond = ", ".join(group.skill.untrained_commands(params.command_ranges))
+            if beyond:
+                robot = group.skill.robot
+                of = "" if len(every) == 1 else f" of {robot.name}"
+                warn(f"command_ranges: the skill {params.skill!r}{of} was not trained for {beyond}")
     npc = None
-    shared = scene.num_robots > task.num_agents  # whether NPC robots use the agents' skill
-    if shared and task.npc_skill != skill.name:
-        shared = False
-        other = skills.make(task.npc_skill, task.robot)
-        if task.npc_varied:
-            other = other.restrict(task.npc_varied, None)
-        other.check_period(scene.timestep, num_substeps)
-        npc = other, other.load_params()
-    if not shared:
-        skill = skill.restrict(params.commands, params.gait)
-    elif task.npc_varied:
-        skill = skill.restrict((*params.commands, *task.npc_varied), params.gait)
-    uses_skill = task.control == "command" or shared
-    if uses_skill:
-        skill.check_period(scene.timestep, num_substeps)
-        beyond = ", ".join(skill.untrained_commands(params.command_ranges))
-        if beyond:
-            warn(f"command_ranges: the skill {params.skill!r} was not trained for {beyond}")
+    if has_npcs and not shared:
+        numbers = range(agents, scene.num_robots)
+        npc = skills.make(task.npc_skill, scene.robots[agents])
+        every += groups(numbers, npc, task.npc_varied, None, None)
     return Controller(
         mode=task.control,
-        robot=task.robot,
-        num_robots=scene.num_robots,
-        num_agents=task.num_agents,
-        skill=skill,
-        skill_params=skill.load_params(params.skill_weights) if uses_skill else None,
-        commands=(*params.commands, *skill.selector),
-        default_commands=skill.default_commands(params.gait),
+        robots=Fleet(scene.robots),
+        num_agents=agents,
+        skill=commander.skill.restrict(varied, params.gait) if varied else commander.skill,
+        groups=tuple(every),
+        commands=commander.commands,
+        default_commands=commander.default_commands,
         ranges=params.command_ranges,
         npc=npc,
         lag=params.randomization.action_lag,

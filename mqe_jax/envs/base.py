@@ -29,14 +29,14 @@ from mqe_jax.core.returned import alike, check_shape, check_signatures, results,
 from mqe_jax.core.settings import Parameters, check, checked, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.assembly import make_controller, make_scene
-from mqe_jax.envs.observation import ObservationLayout, finite
+from mqe_jax.envs.observation import ObservationLayout, finite, observe_bodies
 from mqe_jax.envs.params import P
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.sizes import Sizes, check_sizes, hide
 from mqe_jax.envs.state import ENDINGS, Moment, S, State, with_final
 from mqe_jax.envs.task import Task
-from mqe_jax.physics import engines, robots
+from mqe_jax.physics import engines
 from mqe_jax.physics.actuators import NetworkActuators, load_actuator_network
 from mqe_jax.physics.kinematics import poses
 from mqe_jax.physics.robots.index import RobotState, read_robots, scatter
@@ -97,10 +97,10 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
                 "0 with control torque, which has no joint targets",
             )
         self.num_agents = self.params.num_agents
-        self.robot = robots.get(self.params.robot)
         check_sizes(self)
         self._scene = scene = make_scene(self)
         self.compiled = compile_scene(scene)
+        self.robots = self.compiled.robots
         self.index = self.compiled.index
         self.objects = self.compiled.objects
         for name, (places, noise) in self.spreads.items():
@@ -133,14 +133,15 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         network = self.params.actuator_network
         if network and control != "torque":
             weights = load_actuator_network(network)
-            self.actuators = NetworkActuators(self.physics, self.index, self.robot, weights)
+            self.actuators = NetworkActuators(self.physics, self.index, self.robots, weights)
         self.controller = make_controller(self, scene, self.physics.num_substeps)
         reads = {"actuator_network": bool(self.actuators)}
-        reads["skill_weights"] = self.controller.skill_params is not None
+        reads["skill_weights"] = self.controller.skilled
         files = {name: getattr(self.params, name) for name, read in reads.items() if read}
         self.digests = {name: digest(file) for name, file in files.items() if file}
-        if self.robot.digest:
-            self.digests["robot"] = self.robot.digest
+        contents = [kind.digest for kind in self.robots.kinds if kind.digest]
+        if contents:
+            self.digests["robot"] = " ".join(contents)
         self.check_senses()
         self.sizes = Sizes(self)
         self.randomizer = Randomizer(
@@ -148,7 +149,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         )
         clock = jax.eval_shape(lambda: self.controller.clock(self.controller.reset()))
         self.privileged = PrivilegedObservation(
-            self.robot,
+            self.robots,
             self.compiled.model,
             self.index,
             num_anchors=len(self.compiled.layout.anchors),
@@ -430,6 +431,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
                 state = dataclasses.replace(state, senses=senses)
             else:
                 blocks = self.observe_group(name, state, robots)
+            if not self.robots.alike:
+                blocks = {**blocks, "bodies": observe_bodies(self.robots, self.teams)}
             obs = layout.pack(blocks, self.num_agents)
             if noise:
                 key = jax.random.fold_in(state.key, keys.NOISE + number)
@@ -519,8 +522,20 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         roll = jnp.abs(robot_state.euler[:, 0])
         pitch = jnp.abs(robot_state.euler[:, 1])
         out = (roll > params.max_roll) | (pitch > params.max_pitch)
-        out |= (height < params.min_height) | (height > params.max_height)
+        out |= (height < self.by_height(params.min_height)) | (height > params.max_height)
         return out & robot_state.active
+
+    def by_height(self, height: Any) -> Any:
+        """Returns each robot's height, m, from one that suits the largest robot, (R,) or ().
+
+        What is above the ground is in proportion to how high a robot stands.
+        """
+        stands = np.array([robot.proportions.height for robot in self.robots])
+        if self.robots.alike or np.ptp(stands) == 0.0:
+            return height
+        ground = self.params.ground
+        own = ground + (height - ground) * (stands / stands.max()).astype(np.float32)
+        return jnp.where(jnp.asarray(height) > ground, own, height)
 
     def _ctrl(self, targets: jax.Array) -> jax.Array:
         """Returns the engine's control (nu,) from targets of all robots (R, J)."""
@@ -533,16 +548,18 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         joint_key, velocity_key = jax.random.split(key)
         low, high = params.spawn_joint_scale
         factor = jax.random.uniform(joint_key, index.joint_qpos.shape, minval=low, maxval=high)
-        joints = self.robot.default_joints * factor
-        joints = jnp.clip(joints, self.robot.joint_lower, self.robot.joint_upper)
+        table = self.robots.table
+        joints = table("default_joints") * factor
+        joints = jnp.clip(joints, table("joint_lower"), table("joint_upper"))
         speed = params.spawn_velocity
         velocity = jax.random.uniform(
             velocity_key, index.base_qvel.shape, minval=-speed, maxval=speed
         )
         level = jnp.zeros(len(pose))
         turn = euler_to_quaternion(jnp.stack([level, level, pose[:, 3]], axis=-1))
+        height = self.by_height(pose[:, 2])
         robots = np.concatenate([index.base_qpos, index.joint_qpos], axis=-1)
-        own = jnp.concatenate([pose[:, :3], turn, joints], axis=-1)
+        own = jnp.concatenate([pose[:, :2], height[:, None], turn, joints], axis=-1)
         qpos = scatter(model.qpos0, robots, own)
         return qpos, scatter(np.zeros(model.nv), index.base_qvel, velocity)
 

@@ -184,7 +184,7 @@ class Match(QuadrupedEnv[S, P]):
         blocks = super().observe_group(name, state, robot_state)
         if not self.reflected or name != "proprioception":
             return blocks
-        reflect = self.robot.mirror.reflect
+        reflect = self.robots.reflect
         image = {
             "gravity": blocks["gravity"] * np.array([1.0, -1.0, 1.0], np.float32),
             "joint_position": reflect(blocks["joint_position"]),
@@ -199,7 +199,7 @@ class Match(QuadrupedEnv[S, P]):
         if self.control == "command":
             mirrored = action * self.controller.skill.column("mirror", self.controller.commands)
         else:
-            mirrored = self.robot.mirror.reflect(action)
+            mirrored = self.robots.reflect(action)
         return jnp.where(self.team_of[:, None] == 1, mirrored, action)
 
     def zero_sum(self, own: jax.Array) -> jax.Array:

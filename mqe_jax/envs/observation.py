@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import jax
@@ -15,6 +15,7 @@ from mqe_jax.core.blocks import entities as entities
 from mqe_jax.core.blocks import image as image
 from mqe_jax.core.returned import check_names, check_shape
 from mqe_jax.core.settings import fail
+from mqe_jax.physics.robots.fleet import Fleet
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
@@ -140,6 +141,25 @@ def proprioception_layout(joints: int) -> ObservationLayout:
             Block("joint_velocity", joints, "rad/s"),
         )
     )
+
+
+def bodies_block(robots: Fleet) -> Block:
+    """Returns the block `bodies` of unlike robots; `observe_bodies` fills it."""
+    names = ", ".join(kind.name for kind in robots.kinds)
+    meaning = f"kind of the robot itself, its teammates, and the others: one-hot of {names}"
+    return Block("bodies", len(robots) * len(robots.kinds), meaning, categorical=True)
+
+
+def observe_bodies(robots: Fleet, teams: Sequence[Sequence[int]]) -> np.ndarray:
+    """Returns the block `bodies` of each agent (A, R K), of R robots of K kinds."""
+    kinds = np.eye(len(robots.kinds), dtype=np.float32)[robots.kind_of]
+    rows = []
+    for team in teams:
+        others = np.setdiff1d(np.arange(len(robots)), team)
+        for agent in team:
+            mates = [other for other in team if other != agent]
+            rows.append(kinds[[agent, *mates, *others]].ravel())
+    return np.stack(rows)
 
 
 def team_blocks(agents: int) -> tuple[Block, ...]:

@@ -1,7 +1,6 @@
 """Parameters common to all tasks."""
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
@@ -23,10 +22,19 @@ from mqe_jax.core.limits import (
     Velocity,
     bounds,
 )
-from mqe_jax.core.settings import FileName, FrozenMapping, Range, fail, override, settings_class
+from mqe_jax.core.settings import (
+    FileName,
+    FrozenMapping,
+    Range,
+    check,
+    fail,
+    override,
+    settings_class,
+)
 from mqe_jax.envs.randomization import NamedRandomization, Randomization
 from mqe_jax.physics import robots
-from mqe_jax.physics.robots.robot import Proportions
+from mqe_jax.physics.robots.fleet import Fleet
+from mqe_jax.physics.robots.robot import Proportions, Robot
 from mqe_jax.sensors.suite import Senses
 from mqe_jax.skills import agile  # noqa: F401  (skills register themselves)
 from mqe_jax.skills.control import Commander
@@ -54,6 +62,9 @@ class TaskParams:
     robot: str = "go1"
     """Robot: go1, go2, or another registered name; an MJCF, or a YAML that names one; or
     menagerie:NAME."""
+    robots: tuple[str, ...] = ()
+    """Unlike robots: a name or file for each robot, in a match possibly one for each team; `robot`
+    is then left out. Parameters that follow a body follow the largest. Empty: all are `robot`."""
     episode_length: TimeLimit = 10.0
     """Time limit, s, rounded to environment steps (0.02 s)."""
     spawn_height: Length = 0.42
@@ -134,10 +145,12 @@ class TaskParams:
     assistance 1."""
 
     def __post_init__(self) -> None:
+        if self.robots and self.robot != type(self).robot:
+            fail("robot", self.robot, f"left out beside robots, {self.robots}")
         commander = self.commander
         commander.skill.check_commands(commander.commands)
         commander.skill.changes(self.commands, self.command_ranges, commander.default_commands)
-        least = self.ground + robots.get(self.robot).stand_height
+        least = self.ground + max(kind.stand_height for kind in self.kinds)
         if self.spawn_height < least:
             allowed = f"at least {least:.2f}, because the supporting surface is at {self.ground}"
             fail("spawn_height", self.spawn_height, allowed)
@@ -163,43 +176,51 @@ class TaskParams:
             for name, value in above.items()
         }
 
+    @property
+    def kinds(self) -> tuple[Robot, ...]:
+        """The robots that differ, in the order of their first appearance."""
+        names = dict.fromkeys(self.robots or (self.robot,))
+        return tuple(dict.fromkeys(robots.get(name) for name in names))
+
     @classmethod
-    def suited(cls, robot: str) -> Self:
-        """Returns the defaults for a robot.
+    def suited(cls, *names: str) -> Self:
+        """Returns the defaults for a robot, or for unlike ones.
 
         InputError as of `mqe_jax.physics.robots.get`.
         """
         usual = cls()
-        body = robots.get(robot).proportions
+        body = largest(robots.get(name) for name in names)
         scaled = {} if body == Proportions() else usual.scaled(body)
         plain = {name: np.round(value, 3).tolist() for name, value in scaled.items()}
-        return override(usual, {"robot": robot, **plain})
+        own = {"robot": names[0]} if len(names) == 1 else {"robots": names}
+        return override(usual, {**own, **plain})
 
     def changed(self, changes: Mapping[str, Any]) -> Self:
         """Returns the parameters with changes by name.
 
-        With another robot, values that follow its body and are the defaults become those of that
-        robot, unless they are among the changes.
+        With other robots, values that follow their bodies and are the defaults become those of
+        the new ones, unless they are among the changes.
         """
-        robot = changes.get("robot", self.robot)
-        if isinstance(robot, Path):
-            robot = str(robot)
-            changes = {**changes, "robot": robot}
-        if robot == self.robot or not isinstance(robot, str):
+        if "robot" not in changes and "robots" not in changes:
             return override(self, changes)
-        before = self.suited(self.robot)
-        after = self.suited(robot)
+        usual = {"robot": type(self).robot, "robots": ()}
+        given = {**usual, **changes}
+        names = check("robots", given["robots"], tuple[str, ...])
+        names = names or [check("robot", given["robot"], str)]
+        before = self.suited(*(self.robots or (self.robot,)))
+        after = self.suited(*names)
         follow = {
             name: getattr(after, name)
             for name in self.scaled(Proportions())
             if getattr(self, name) == getattr(before, name)
         }
-        return override(self, {**follow, **changes})
+        return override(self, {**usual, **follow, **changes})
 
     @property
     def commander(self) -> Commander:
-        """What actions mean with control `command`."""
-        skill = skills.make(self.skill, robots.get(self.robot))
+        """What actions mean with control `command`; the smallest robot sets the ranges."""
+        smallest = min(self.kinds, key=lambda kind: kind.proportions.height)
+        skill = skills.make(self.skill, smallest)
         commands = (*self.commands, *skill.selector)
         return Commander(skill, commands, skill.default_commands(self.gait), self.command_ranges)
 
@@ -212,7 +233,9 @@ class TaskParams:
 
     def actions(self, control: str) -> dict[str, Any]:
         """Returns what an agent's actions mean in a control mode, by names of parameters."""
-        meaning: dict[str, Any] = {"robot": robots.get(self.robot).identity, "control": control}
+        names = self.robots or (self.robot,)
+        robot = Fleet(robots.get(name) for name in names).identity
+        meaning: dict[str, Any] = {"robot": robot, "control": control}
         if control == "command":
             gait = self.gait or next(iter(self.commander.skill.gaits), None)
             ranges = self.action_ranges()
@@ -228,6 +251,12 @@ class TaskParams:
         texts = [f"{name} {low:g} to {high:g}" for name, (low, high) in ranges]
         skill = self.skill if isinstance(self.skill, str) else " or ".join(self.skill)
         return f"{skill}: {', '.join(texts)}"
+
+
+def largest(kinds: Iterable[Robot]) -> Proportions:
+    """Returns the greatest height, width, length and mass of robots."""
+    sizes = np.array([kind.proportions for kind in kinds])
+    return Proportions(*sizes.max(axis=0).tolist())
 
 
 P = TypeVar("P", bound=TaskParams)

@@ -13,18 +13,18 @@ import numpy as np
 
 from mqe_jax.envs.observation import Block, ObservationLayout
 from mqe_jax.envs.state import State
-from mqe_jax.physics.robots.index import RobotIndex, RobotState
-from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.physics.robots.fleet import Fleet
+from mqe_jax.physics.robots.index import RobotIndex, RobotState, gather
 
 
-def _robot_blocks(robot: Robot, number: int) -> list[Block]:
+def _robot_blocks(joints: int, number: int) -> list[Block]:
     parts = (
         Block("position", 3, "m"),
         Block("quaternion", 4, "wxyz"),
         Block("linear_velocity", 3, "m/s, world"),
         Block("angular_velocity", 3, "rad/s, body"),
-        Block("joint_position", robot.num_joints, "rad, minus default"),
-        Block("joint_velocity", robot.num_joints, "rad/s"),
+        Block("joint_position", joints, "rad, minus default"),
+        Block("joint_velocity", joints, "rad/s"),
     )
     return [dataclasses.replace(part, name=f"robot{number}/{part.name}") for part in parts]
 
@@ -39,7 +39,7 @@ class PrivilegedObservation:
 
     def __init__(
         self,
-        robot: Robot,
+        robots: Fleet,
         model: mujoco.MjModel,
         index: RobotIndex,
         *,
@@ -48,7 +48,7 @@ class PrivilegedObservation:
         contact_forces: bool,
     ) -> None:
         count = index.num_robots
-        self._default_joints = robot.default_joints
+        self._default_joints = robots.table("default_joints")
         self._foot_force = index.foot_force if contact_forces else None
         own_qpos = np.concatenate([index.base_qpos, index.joint_qpos], axis=1)
         own_qvel = np.concatenate([index.base_qvel, index.joint_qvel], axis=1)
@@ -59,7 +59,7 @@ class PrivilegedObservation:
         forces = "on each robot's trunk and feet, N"
         blocks: list[Block] = []
         for number in range(count):
-            blocks += _robot_blocks(robot, number)
+            blocks += _robot_blocks(robots.num_joints, number)
         blocks += [
             Block("objects/qpos", len(self._qpos), "positions of all non-robot bodies"),
             Block("objects/qvel", len(self._qvel), "velocities of all non-robot bodies"),
@@ -106,6 +106,6 @@ class PrivilegedObservation:
             count(clock),
         ]
         if self._foot_force is not None:
-            feet = jnp.linalg.norm(data.sensordata[self._foot_force], axis=-1)
+            feet = jnp.linalg.norm(gather(data.sensordata, self._foot_force), axis=-1)
             parts.append(count(jnp.concatenate([robot_state.trunk_force[:, None], feet], axis=-1)))
         return jnp.concatenate([part.ravel() for part in parts])

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 import pydantic
 
 from mqe_jax.core.limits import Angle, Deviation, Lag, TimeLimit, Velocity
 from mqe_jax.core.settings import Factors, Frictions, Offsets, Payloads, Range, fail, settings_class
 from mqe_jax.envs.readings import Readings
 from mqe_jax.envs.sets import randomization_of
-from mqe_jax.physics.robots.index import RobotIndex
+from mqe_jax.physics.robots.index import RobotIndex, scatter
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -153,10 +154,14 @@ class Randomizer:
         def as_float(x):
             return jnp.asarray(x, jnp.float32)
 
+        def spread(base: np.ndarray, addresses: np.ndarray, values: jax.Array) -> jax.Array:
+            return scatter(base, addresses, jnp.broadcast_to(values[:, None], addresses.shape))
+
         trunk = index.trunk_body
         if random.friction is not None:
             friction = as_float(model.geom_friction)
-            fields["geom_friction"] = friction.at[index.geoms, 0].set(params.friction[:, None])
+            sliding = spread(model.geom_friction[:, 0], index.geoms, params.friction)
+            fields["geom_friction"] = friction.at[:, 0].set(sliding)
         if random.payload is not None:
             # The payload is distributed like the trunk's own mass, so the inertia grows likewise.
             mass = as_float(model.body_mass)
@@ -168,12 +173,11 @@ class Randomizer:
             center = as_float(model.body_ipos)
             fields["body_ipos"] = center.at[trunk].add(params.center_of_mass)
         if random.motor_strength is not None:
-            strength = jnp.ones(model.nu)
-            strength = strength.at[index.actuator].set(params.motor_strength[:, None])[:, None]
+            strength = spread(np.ones(model.nu), index.actuator, params.motor_strength)[:, None]
             fields["actuator_gainprm"] = as_float(model.actuator_gainprm) * strength
             fields["actuator_biasprm"] = as_float(model.actuator_biasprm) * strength
         if random.joint_mechanics is not None:
-            factor = jnp.ones(model.nv).at[index.joint_qvel].set(params.joint_mechanics[:, None])
+            factor = spread(np.ones(model.nv), index.joint_qvel, params.joint_mechanics)
             for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
                 fields[name] = as_float(getattr(model, name)) * factor
         return fields

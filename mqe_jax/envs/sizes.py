@@ -110,13 +110,13 @@ class Sizes:
         # The agent of each coordinate; -1: no agent's.
         self._of_qpos = np.full(env.compiled.model.nq, -1)
         self._of_qvel = np.full(env.compiled.model.nv, -1)
-        self._of_qpos[qpos] = agents
-        self._of_qvel[qvel] = agents
+        self._of_qpos[qpos[qpos >= 0]] = np.broadcast_to(agents, qpos.shape)[qpos >= 0]
+        self._of_qvel[qvel[qvel >= 0]] = np.broadcast_to(agents, qvel.shape)[qvel >= 0]
         self._parked = np.zeros(env.compiled.model.nq, np.float32)
-        pose = [middle, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *env.robot.default_joints]
-        upright = np.tile(pose, (env.num_agents, 1))
-        upright[:, 2] = _HEIGHT + _ABOVE * agents[:, 0]
-        self._parked[qpos] = upright
+        pose = np.tile([middle, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (env.num_agents, 1))
+        pose[:, 2] = _HEIGHT + _ABOVE * agents[:, 0]
+        joints = env.robots.table("default_joints")[: env.num_agents]
+        self._parked[qpos[qpos >= 0]] = np.concatenate([pose, joints], axis=1)[qpos >= 0]
 
     def draw(self, key: jax.Array, level: jax.Array) -> jax.Array:
         """Returns which agents take part (A,) bool, the first ones of each team."""

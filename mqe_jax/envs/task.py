@@ -16,15 +16,20 @@ import numpy as np
 
 from mqe_jax.core.returned import weights_of
 from mqe_jax.core.settings import to_mapping
-from mqe_jax.envs.observation import ObservationLayout, box, proprioception_layout
+from mqe_jax.envs.observation import (
+    ObservationLayout,
+    bodies_block,
+    box,
+    proprioception_layout,
+)
 from mqe_jax.envs.params import P, TaskParams
 from mqe_jax.envs.readings import ReadingErrors, Readings
 from mqe_jax.envs.reward import fade, weigh
 from mqe_jax.envs.sensing import Sensing
 from mqe_jax.envs.sizes import ENTITIES, entity_layout, observe_entities, robots_there
 from mqe_jax.envs.state import Moment, S, State
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.index import RobotIndex, RobotState
-from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.physics.scene import CompiledScene, ObjectIndex, Scene
 from mqe_jax.sensors.suite import ONBOARD
 
@@ -71,8 +76,8 @@ class Task(Sensing, Generic[S, P]):
     """Action mode: 'command', 'position' or 'torque'."""
     num_agents: int
     """Number of controlled robots A."""
-    robot: Robot
-    """Robot type of all robots of the task."""
+    robots: Fleet
+    """All R robots, the agents first."""
     dt: float
     """Environment step, s: the physics step times the substeps."""
     compiled: CompiledScene
@@ -169,7 +174,7 @@ class Task(Sensing, Generic[S, P]):
     @property
     def observation_size(self) -> int:
         """Length of an agent's observation O."""
-        return self.observation_layout.size
+        return self.layouts["policy"].size
 
     @property
     def varies(self) -> bool:
@@ -221,17 +226,21 @@ class Task(Sensing, Generic[S, P]):
     def layouts(self) -> Mapping[str, ObservationLayout]:
         """Layouts of all groups of observations by name.
 
-        The group `policy` is always observed, the others if a policy or a critic names them.
+        The group `policy` is always observed, the others if a policy or a critic names them. Each
+        has the block `bodies` if robots are unlike.
         """
         layouts = {
             "policy": self.observation_layout,
-            "proprioception": proprioception_layout(self.robot.num_joints),
+            "proprioception": proprioception_layout(self.robots.num_joints),
         }
         if self.params.senses:
             layouts[ONBOARD] = ObservationLayout(self.suite.blocks)
         if self.variable_num_agents:
             layouts[ENTITIES] = entity_layout(self.sized_layout)
-        return layouts
+        if self.robots.alike:
+            return layouts
+        bodies = bodies_block(self.robots)
+        return {name: ObservationLayout((*x.blocks, bodies)) for name, x in layouts.items()}
 
     @functools.cached_property
     def reading_errors(self) -> dict[str, ReadingErrors]:
@@ -258,6 +267,7 @@ class Task(Sensing, Generic[S, P]):
         return {
             "version": self.version,
             **self.params.actions(self.control),
+            "robot": self.robots.identity,
             "skill_weights": weights,
             "senses": tuple(to_mapping(sensor) for sensor in sensors),
             "layout": str(layout),
@@ -267,7 +277,10 @@ class Task(Sensing, Generic[S, P]):
     def observe_group(
         self, name: str, state: State[S], robot_state: RobotState
     ) -> dict[str, jax.Array]:
-        """Returns the blocks of a group by name (A, width), but for `onboard`, which has memory."""
+        """Returns the blocks of a group by name (A, width), but for `onboard`, which has memory.
+
+        The block `bodies` is left out.
+        """
         if name == "policy":
             return self.observe(state, robot_state)
         if name == ENTITIES:
@@ -277,7 +290,7 @@ class Task(Sensing, Generic[S, P]):
                 self.sized_layout, blocks, there, self.teams, self.observed(state)
             )
         sensed = jax.tree.map(lambda x: x[: self.num_agents], robot_state.proprioception)
-        joints = sensed.joint_position - self.robot.default_joints
+        joints = sensed.joint_position - self.robots.table("default_joints")[: self.num_agents]
         return {
             "gravity": sensed.gravity_b,
             "joint_position": joints,

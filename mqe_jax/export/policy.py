@@ -32,8 +32,8 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import digest
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.export.translate import OPSET, translate
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Skill
 from mqe_jax.train.policy import TrainedPolicy
 
@@ -71,15 +71,15 @@ def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[in
     if env.control == "command":
         skill, _ = skill_of(env)
         memory = name_arrays(skill.name, skill.init_memory())
-        robots |= sensed_shapes(env.robot) | {name: x.shape for name, x in memory.items()}
+        robots |= sensed_shapes(env.robots) | {name: x.shape for name, x in memory.items()}
     shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
     memory = name_arrays("memory", policy.initial_memory())
     return shapes | {name: x.shape for name, x in memory.items()}
 
 
-def sensed_shapes(robot: Robot) -> dict[str, tuple[int, ...]]:
+def sensed_shapes(robots: Fleet) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs `SENSED` by name."""
-    joints = (robot.num_joints,)
+    joints = (robots.num_joints,)
     return dict(zip(SENSED, ((3,), joints, joints), strict=True))
 
 
@@ -95,9 +95,10 @@ def policy_step(
     outputs = {"action": action} | name_arrays("next_memory", memory)
     moving = env.moving(action)
     if env.control == "torque":
-        return outputs | {"torque": moving * env.robot.torque_limit}
+        limit = env.robots.table("torque_limit")[: policy.agents]
+        return outputs | {"torque": moving * limit}
     if env.control == "position":
-        target = env.robot.joint_targets(moving, env.params.position_scale)
+        target = env.robots.joint_targets(moving, env.params.position_scale)
         return outputs | {"joint_target": target}
     skill, params = skill_of(env)
     commands = env.controller.skill_commands(moving)
@@ -113,7 +114,7 @@ def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
 
     InputError if the file has changed since the environment read it.
     """
-    skill = skills.make(env.params.skill, env.robot)
+    skill = skills.make(env.params.skill, env.robots[0])
     file = env.params.skill_weights
     if file and digest(file) != env.digests["skill_weights"]:
         raise InputError(f"skill_weights: {file} has changed since the environment read it")
@@ -155,11 +156,13 @@ def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
         "opset": str(OPSET),
         "task": env.name,
         "control": env.control,
-        "robot": env.robot.identity,
+        "robot": env.robots.identity,
         "period_s": f"{env.dt:g}",
         "group": policy.needs.group,
         "observation": json.dumps(layout),
         "joints": json.dumps("FL FR RL RR; hip, thigh, calf"),
-        "default_joints_rad": json.dumps([round(float(x), 6) for x in env.robot.default_joints]),
+        "default_joints_rad": json.dumps(
+            [round(float(x), 6) for x in env.robots[0].default_joints]
+        ),
         "env_steps": str(policy.metadata.get("env_steps", "")),
     }

@@ -51,7 +51,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
         "task": env.name,
         "title": env.heading,
         "aim": env.aim,
-        "robot": env.robot.identity,
+        "robot": env.robots.identity,
         "mujoco": mujoco.__version__,
         "dt": env.dt,
         "substeps": env.physics.num_substeps,
@@ -71,9 +71,10 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
 def _motors(env: QuadrupedEnv) -> dict[str, Any]:
     model = env.compiled.model
     table = env.compiled.motors
-    arrays = ("speed", "torque", "stall", "response")
+    arrays = ("speed", "torque", "stall")
     return {
         **{name: getattr(table, name).tolist() for name in arrays},
+        "response": table.runs[0].response.tolist(),
         "actuator_gain": model.actuator_gainprm[:, 0].tolist(),
         "bias": model.actuator_biasprm[:, :3].tolist(),
         "armature": model.dof_armature[table.joint_qvel].tolist(),

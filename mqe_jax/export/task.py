@@ -189,7 +189,7 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     memory = name_arrays(skill.name, skill.init_memory())
     shapes = {
         "command": (len(skill.commands),),
-        **sensed_shapes(env.robot),
+        **sensed_shapes(env.robots),
         **{name: x.shape for name, x in memory.items()},
     }
 

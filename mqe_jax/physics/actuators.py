@@ -13,8 +13,8 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.files import linear_layers, read_tensors
 from mqe_jax.physics.engines import Engine
-from mqe_jax.physics.robots.index import RobotIndex, scatter
-from mqe_jax.physics.robots.robot import Robot
+from mqe_jax.physics.robots.fleet import Fleet
+from mqe_jax.physics.robots.index import RobotIndex, gather, scatter
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -64,7 +64,7 @@ class NetworkActuators:
 
     physics: Engine
     index: RobotIndex
-    robot: Robot
+    robots: Fleet
     params: ActuatorParams
 
     def init_memory(self) -> tuple[jax.Array, jax.Array]:
@@ -87,11 +87,11 @@ class NetworkActuators:
 
         def substep(carry: Any, _: None) -> Any:
             data, (errors, velocities) = carry
-            error = data.qpos[self.index.joint_qpos] - target
-            velocity = data.qvel[self.index.joint_qvel]
+            error = gather(data.qpos, self.index.joint_qpos) - target
+            velocity = gather(data.qvel, self.index.joint_qvel)
             errors = jnp.concatenate([error[None], errors])
             velocities = jnp.concatenate([velocity[None], velocities])
-            limit = self.robot.torque_limit
+            limit = self.robots.table("torque_limit")
             torque = jnp.clip(actuator_torque(self.params, errors, velocities), -limit, limit)
             ctrl = scatter(np.zeros(self.physics.model.nu), self.index.actuator, torque)
             data, overflow = self.physics.step(

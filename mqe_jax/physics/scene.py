@@ -14,6 +14,7 @@ from mqe_jax.physics.appearance.grounds import add_light
 from mqe_jax.physics.collision import MAX_ROBOTS
 from mqe_jax.physics.objects import Object
 from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import RobotIndex, add_sensors, index_robots, prefix
 from mqe_jax.physics.robots.motors import Motors
@@ -30,7 +31,7 @@ class Scene:
     num_robots: int = 2
     """Number of robots R."""
     robots: tuple[Robot, ...] = ()
-    """Robot of each; all are Go1 if empty. A task leaves it empty for its parameter `robot`."""
+    """Robot of each; all are Go1 if empty. A task leaves it empty for its parameters."""
     contacts: str = "full"
     """Set of the robots' collision geoms, one of `mqe_jax.physics.robots.robot.CONTACTS`."""
     objects: Mapping[str, Object] = dataclasses.field(default_factory=dict)
@@ -93,7 +94,7 @@ class CompiledScene:
     """A compiled scene."""
 
     scene: Scene
-    robot: Robot  # of all R robots
+    robots: Fleet
     model: mujoco.MjModel  # of the physics, without visual geoms
     index: RobotIndex
     objects: Mapping[str, ObjectIndex]
@@ -199,8 +200,6 @@ def _add_object(spec: mujoco.MjSpec, name: str, item: Object, visual: bool) -> N
 def compile_scene(scene: Scene) -> CompiledScene:
     """Compiles a scene for the physics and indexes it by name.
 
-    InputError for robots of two kinds: all tables have a row for each robot, of equal widths.
-
     Example:
         ```python
         from mqe_jax.physics.scene import Scene, compile_scene
@@ -210,22 +209,16 @@ def compile_scene(scene: Scene) -> CompiledScene:
         print(compiled.model.nq)  # 38: two robots of 19
         ```
     """
-    kinds = set(_robots_of(scene))
-    if len(kinds) > 1:
-        names = ", ".join(sorted(kind.name for kind in kinds))
-        raise InputError(f"Scene.robots: two kinds, {names}; all must be one robot")
-    robot = kinds.pop()
+    robots = Fleet(_robots_of(scene))
     model, layout = build_model(scene, visual=False)
     moving = [wall for wall in layout.walls if wall.anchor is not None]
-    index = index_robots(
-        model, robot, scene.num_robots, contacts=scene.contacts, feet=scene.foot_sensors
-    )
+    index = index_robots(model, robots, contacts=scene.contacts, feet=scene.foot_sensors)
     return CompiledScene(
         scene=scene,
-        robot=robot,
+        robots=robots,
         model=model,
         index=index,
-        motors=Motors.of(robot, index, scene.timestep),
+        motors=Motors.of(robots, index, scene.timestep),
         objects={name: _index_object(model, f"object/{name}") for name in scene.objects},
         layout=layout,
         mocap_offset=np.array([wall.center for wall in moving], np.float32).reshape(-1, 3),

@@ -40,7 +40,7 @@ class Proprioception(Sensor):
     """Standard deviation of its yaw after 1 s, degrees; it grows with the square root of time."""
 
     def layout(self, scene: SensedScene) -> tuple[Block, ...]:
-        joints = scene.compiled.robot.num_joints
+        joints = scene.compiled.robots.num_joints
         meaning = "estimate of x, y, m, and cosine and sine of yaw, own frame of the task"
         return (
             Block("gravity", 3, "unit vector in the trunk's frame"),
@@ -63,10 +63,11 @@ class Proprioception(Sensor):
         mirror = scene.mirror[:, None].astype(np.float32)
         side = np.where(np.arange(3) == 1, mirror, 1.0)  # of y; of a rotation, x and z change sign
 
-        robot = scene.compiled.robot
+        fleet = scene.compiled.robots
+        rest = fleet.table("default_joints")[: scene.num_agents]
 
         def joints(x):
-            return jnp.where(mirror < 0, robot.mirror.reflect(x), x)
+            return jnp.where(mirror < 0, fleet.reflect(x), x)
 
         estimate, last, started = memory
         chance = jax.random.normal(key, (scene.num_agents, 3))  # of position and yaw
@@ -82,7 +83,7 @@ class Proprioception(Sensor):
         blocks = {
             "gravity": robots.projected_gravity * side,
             "angular_velocity": robots.angular_velocity_b * side * mirror,
-            "joint_position": joints(robots.joint_position - robot.default_joints),
+            "joint_position": joints(robots.joint_position - rest),
             "joint_velocity": joints(robots.joint_velocity),
             "action": snapshot.action,
             "odometry": jnp.concatenate([estimate[:, :2], jnp.cos(yaw), jnp.sin(yaw)], axis=-1),

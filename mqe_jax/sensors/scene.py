@@ -182,8 +182,7 @@ class SensedScene:
         """
         own = _planar(robots.position_w, robots.quaternion)
         every = jnp.concatenate([own, *self._entities(data, anchors)])
-        hips = self.compiled.robot.radius
-        circles = dict.fromkeys(range(self.num_robots), hips)
+        circles = {row: robot.radius for row, robot in enumerate(self.compiled.robots)}
         circles |= {row: shape.radius for row, shape in self._circles.items()}
         radii = np.array([*circles.values()], np.float32)[:, None]
         rectangles = self._rectangles

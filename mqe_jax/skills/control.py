@@ -6,9 +6,11 @@
 | `position` | J | joint target = default + scale x action, then PD at every physics step |
 | `torque` | J | joint torque = action x torque limit |
 
-J is the number of a robot's joints. Actions lie in [-1, 1]. In `command`, a positive action is
-scaled by the highest change of the command, a negative one by the lowest, both times the skill's
-gain / limit. PD control runs inside the physics engine, at every physics step.
+J is the number of a robot's joints, of unlike robots the largest one. Actions lie in [-1, 1]. In
+`command`, a positive action is scaled by the highest change of the command, a negative one by the
+lowest, both times the skill's gain / limit. Unlike robots get the same commands, except for those
+that no action sets and that depend on the robot, such as the width of the stance. PD control runs
+inside the physics engine, at every physics step.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +27,9 @@ from jax.core import Tracer
 
 from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.settings import fail
+from mqe_jax.core.types import rows_of
+from mqe_jax.physics.robots.fleet import Fleet, pad
 from mqe_jax.physics.robots.index import Proprioception, scatter
-from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills import Skill
 
 MODES = ("command", "position", "torque")
@@ -43,8 +46,8 @@ class ControlState:
     """Controller state of one environment (R robots)."""
 
     skill: Any
-    """Recurrent states of the skill, leading axis R; () if no robot uses it; a pair, of agents and
-    NPC robots, if these have another skill."""
+    """Recurrent states of the skill, leading axis R; () if no robot uses it; a tuple, of those of
+    each group, if there are several."""
     delayed: jax.Array  # past actuator targets, newest first (lag + 1, R, J)
 
 
@@ -129,29 +132,47 @@ class Commander:
         return np.abs(self.changes.T) * (gain / limit)
 
 
+class Group(NamedTuple):
+    """Robots of one kind that use a skill."""
+
+    skill: Skill
+    params: Any
+    """Parameters of the skill."""
+    robots: tuple[int, ...]
+    """Their numbers among all robots."""
+    shift: np.ndarray
+    """What is added to the commands, since the robots' defaults differ from others' (C,)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Controller(Commander):
     """Computes actuator targets from actions."""
 
     mode: str  # action mode: one of `MODES`
-    robot: Robot  # robot type shared by all R robots
-    num_robots: int  # number of robots R
+    robots: Fleet  # all R robots
     num_agents: int  # number of agents A: the first A robots
-    skill_params: Any  # parameters of the skill, or None if no robot uses it
-    npc: tuple[Skill, Any] | None = None
-    """Skill of the NPC robots and its parameters, if it is another one."""
+    groups: tuple[Group, ...]  # the robots that use a skill
+    npc: Skill | None = None
+    """Skill of the NPC robots, if it is another one than the agents'."""
     lag: int = 0  # maximum action lag, environment steps
     position_scale: float = 1.0  # factor on the range of the joint targets in the mode `position`
 
     @property
     def action_size(self) -> int:
         """Length of one agent's action."""
-        return len(self.commands) if self.mode == "command" else self.robot.num_joints
+        if self.mode == "command":
+            return len(self.commands)
+        return Fleet(self.robots[: self.num_agents]).num_joints
+
+    @property
+    def skilled(self) -> bool:
+        """Whether the agents' skill acts."""
+        return any(group.robots[0] < self.num_agents for group in self.groups)
 
     @property
     def neutral(self) -> np.ndarray:
         """Neutral actuator targets (R, J), used without an action."""
-        rest = np.tile(self.robot.default_joints, (self.num_robots, 1)).astype(np.float32)
+        rest = self.robots.table("default_joints").astype(np.float32)
         if self.mode == "torque":
             rest[: self.num_agents] = 0.0
         return rest
@@ -180,23 +201,34 @@ class Controller(Commander):
 
     def reset(self) -> ControlState:
         """Returns the controller state after a reset."""
-        memories = [
-            jax.tree.map(lambda x, n=n: jnp.broadcast_to(x, (n, *x.shape)), skill.init_memory())
-            for skill, _, n in self._groups
-        ]
+
+        def start(group: Group) -> Any:
+            count = len(group.robots)
+            return jax.tree.map(
+                lambda x: jnp.broadcast_to(x, (count, *x.shape)), group.skill.init_memory()
+            )
+
         delayed = jnp.tile(jnp.asarray(self.neutral), (self.lag + 1, 1, 1))
-        return ControlState(_one_or_all(memories), delayed)
+        return ControlState(_one_or_all([start(group) for group in self.groups]), delayed)
 
     def clock(self, state: ControlState) -> jax.Array:
         """Returns the clocks of the robots' skills (R, n); n is 0 if no robot uses the skill."""
-        groups = zip(self._groups, self._memories(state), strict=True)
-        clocks = [jax.vmap(skill.clock, axis_size=n)(memory) for (skill, _, n), memory in groups]
+        clocks = []
+        for group, memory in zip(self.groups, self._memories(state), strict=True):
+            clocks.append(jax.vmap(group.skill.clock, axis_size=len(group.robots))(memory))
         width = max((clock.shape[1] for clock in clocks), default=0)
-        clocks = [jnp.pad(clock, ((0, 0), (0, width - clock.shape[1]))) for clock in clocks]
-        rest = self.num_robots - sum(len(clock) for clock in clocks)
-        if len(clocks) == 1 and not rest:
-            return clocks[0]
-        return jnp.concatenate([jnp.zeros((rest, width)), *clocks])
+        rest = jnp.zeros((len(self.robots), width))
+        return self._merge(rest, [pad(clock, width) for clock in clocks])
+
+    def _merge(self, rest: jax.Array, of_groups: Sequence[jax.Array], first: int = 0) -> jax.Array:
+        """Returns rows `rest` (R, n), with those of the groups for robots from `first` on."""
+        rows = np.arange(len(rest))
+        at = len(rest)
+        for group in self.groups:
+            own = np.array(group.robots)
+            rows[own] = np.where(own < first, own, at + np.arange(len(own)))
+            at += len(own)
+        return jnp.concatenate([rest, *of_groups])[rows_of(rows.tolist())]
 
     @jax.named_scope("control")
     def targets(
@@ -219,64 +251,58 @@ class Controller(Commander):
         agents = self.num_agents
         target = jnp.asarray(self.neutral)
         commands = jnp.tile(jnp.asarray(self.default_commands), (agents, 1))
-        memories = []
         if self.mode == "command":
             commands = self.skill_commands(action)
         elif self.mode == "position":
-            target = target.at[:agents].set(self.robot.joint_targets(action, self.position_scale))
+            moved = self.robots.joint_targets(action, self.position_scale)
+            target = target.at[:agents].set(pad(moved, target.shape[1]))
         else:
-            target = target.at[:agents].set(action * self.robot.torque_limit)
-        asked = [commands] if npc_commands is None else [commands, npc_commands]
-        asked = asked[-len(self._groups) :] if self.npc else [jnp.concatenate(asked)]
-        unskilled = self.num_robots - sum(n for *_, n in self._groups)
-        first = unskilled
+            moved = action * self.robots.table("torque_limit")[:agents, : action.shape[1]]
+            target = target.at[:agents].set(pad(moved, target.shape[1]))
         skilled = []
-        groups = zip(self._groups, self._memories(state), asked, strict=False)
-        for (skill, params, n), memory, commands in groups:
-            sensed = jax.tree.map(lambda x, first=first, n=n: x[first : first + n], proprioception)
-            act = jax.vmap(functools.partial(skill.targets, params))
-            targets, memory = act(memory, commands, sensed)
-            skilled.append(targets)
+        memories = []
+        for group, memory in zip(self.groups, self._memories(state), strict=True):
+            sensed = proprioception.of(rows_of(group.robots), group.skill.robot.num_joints)
+            act = jax.vmap(functools.partial(group.skill.targets, group.params))
+            targets, memory = act(memory, self._asked(group, commands, npc_commands), sensed)
+            skilled.append(pad(targets, target.shape[1]))
             memories.append(memory)
-            first += n
-        if skilled:
-            unmoved = 0 if self.mode == "command" else agents
-            uses = np.arange(self.num_robots)[:, None] >= unmoved
-            target = jnp.where(uses, jnp.concatenate([target[:unskilled], *skilled]), target)
+        target = self._merge(target, skilled, 0 if self.mode == "command" else agents)
         delayed = jnp.concatenate([target[None], state.delayed[:-1]])
         control = ControlState(_one_or_all(memories), delayed)
         if self.lag:
             target = delayed[lag]
         return target, control
 
+    def _asked(
+        self, group: Group, commands: jax.Array, npc_commands: jax.Array | None
+    ) -> jax.Array:
+        """Returns the commands of a group's robots, from those of the agents and the NPC robots."""
+        numbers = np.array(group.robots)
+        if self.npc and numbers[0] >= self.num_agents:
+            numbers -= self.num_agents
+            assert npc_commands is not None
+            commands = npc_commands
+        elif npc_commands is not None and not self.npc:
+            commands = jnp.concatenate([commands, npc_commands])
+        own = commands[rows_of(numbers.tolist())]
+        return own + group.shift if np.any(group.shift) else own
+
     @property
     def npc_skill(self) -> Skill:
         """Skill of the NPC robots."""
-        return self.npc[0] if self.npc else self.skill
+        return self.npc or self.skill
 
     @property
     def npc_default_commands(self) -> np.ndarray:
         """Default commands of the NPC robots' skill (C,)."""
-        return self.npc[0].default_commands() if self.npc else self.default_commands
-
-    @property
-    def _groups(self) -> list[tuple[Skill, Any, int]]:
-        """The robots that use a skill, the last ones, in groups: skill, parameters and number."""
-        if self.npc is None and self.skill_params is None:
-            return []
-        if self.npc is None:
-            return [(self.skill, self.skill_params, self.num_robots)]
-        npc, npc_params = self.npc
-        npcs = (npc, npc_params, self.num_robots - self.num_agents)
-        if self.mode != "command":
-            return [npcs]
-        return [(self.skill, self.skill_params, self.num_agents), npcs]
+        return self.npc.default_commands() if self.npc else self.default_commands
 
     def _memories(self, state: ControlState) -> Sequence[Any]:
         """Returns the recurrent states of the groups."""
-        if len(self._groups) > 1:
+        if len(self.groups) > 1:
             return state.skill
-        return [state.skill] if self._groups else []
+        return [state.skill] if self.groups else []
 
 
 def _one_or_all(memories: Sequence[Any]) -> Any:

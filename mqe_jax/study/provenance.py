@@ -37,7 +37,7 @@ def digests(values: Any) -> dict[str, str]:
 
 
 def _digest_of(name: str, text: str) -> str | None:
-    if name == "robot" and robots.is_file(text):
+    if name in ("robot", "robots") and robots.is_file(text):
         return robots.get(text).digest
     return digest(zoo.file_of(text) if text in TASKS else text)
 

@@ -131,8 +131,8 @@ class Panel:
         head = paragraph(f"at {shown:.2f} s, {pace}", session.env.name) + self._score(reward)
         self._state.content = head + table(("robot", "x", "y", "z", "vx", "vy", "turn"), rows)
         obs = session.moment(self.back).obs[self.env, session.drive.robot or 0]
-        layout = getattr(session.env, "observation_layout", None)
-        self._observation.content = observation_table(layout, obs)
+        layouts = getattr(session.env, "layouts", {})
+        self._observation.content = observation_table(layouts.get("policy"), obs)
 
     def _score(self, reward: float) -> str:
         session = self._session

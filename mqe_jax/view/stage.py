@@ -190,9 +190,11 @@ def start_frame(env: QuadrupedEnv, num_envs: int) -> Episode:
     index = env.index
     data = mujoco.MjData(env.compiled.model)
     qpos = data.qpos.copy()
-    qpos[index.joint_qpos] = env.robot.default_joints
-    for row, (x, y, yaw) in zip(index.base_qpos, env.spawn_poses(), strict=True):
-        qpos[row] = (x, y, env.params.spawn_height, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+    has = env.robots.has_joint
+    qpos[index.joint_qpos[has]] = env.robots.table("default_joints")[has]
+    heights = np.asarray(env.by_height(np.full(len(has), env.params.spawn_height)))
+    for row, (x, y, yaw), z in zip(index.base_qpos, env.spawn_poses(), heights, strict=True):
+        qpos[row] = (x, y, z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
     poses = [np.stack([x] * num_envs) for x in (qpos, data.mocap_pos, data.mocap_quat)]
     return Episode(*poses, dt=env.dt)
 

@@ -89,6 +89,11 @@ class WalkEnv(QuadrupedEnv[WalkState, WalkParams]):
         super().__init__(params, impl=impl, control="position", num_envs=num_envs)
         self.skill.check_period(self.compiled.scene.timestep, self.physics.num_substeps)
 
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.robots[0]
+
     def scene(self) -> Scene:
         return Scene(Track(blocks=(Plane(4.0),), walled=False, num_robots=1), num_robots=1)
 

@@ -93,7 +93,7 @@ class CEngine(Engine):
         It depends on their content, not on this process.
         """
         motors = () if self.motors is None else dataclasses.astuple(self.motors)
-        numbers = [np.asarray(value).tolist() for value in motors]
+        numbers = [np.asarray(value).tolist() for value in jax.tree.leaves(motors)]
         content = hashlib.sha256(self._content)
         content.update(repr((*options, numbers)).encode())
         return int.from_bytes(content.digest()[:8], "little", signed=True)

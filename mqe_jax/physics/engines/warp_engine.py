@@ -244,20 +244,20 @@ class _Arrays:
         self._armature: dict[int, Any] = {}
         self._solvers: dict[int, Any] = {}
         self._motors: list[Any] = []
+        self._runs: list[tuple[slice, int, Any]] = []
         self._kernels: Any = importlib.import_module(_KERNELS)
         with wp.ScopedDevice(self.device):
             self.model = private.warp_model(model, sparse=sparse)
             if motors is not None:
-                self._limb = len(motors.response)
                 self._motors = [
                     wp.array(motors.constants, dtype=float),
                     wp.array(motors.joint_qpos, dtype=int),
                     wp.array(motors.joint_qvel, dtype=int),
                     float(motors.timestep),
-                    wp.types.matrix(motors.response.shape, float)(
-                        motors.timestep * motors.response
-                    ),
                 ]
+                for joints, response in motors.runs:
+                    kick = wp.array(motors.timestep * response, dtype=float)
+                    self._runs.append((joints, len(response), kick))
             self._ends = wp.array(warp_model.subtree_ends(model), dtype=int)
 
     def allocate(self, count: int, limits: tuple[int, int]) -> None:
@@ -297,20 +297,22 @@ class _Arrays:
             inputs=given[2:3],
             outputs=[model.dof_armature],
         )
-        joints = data.ctrl.shape[1]
         state = [data.qpos, data.qvel]
-        drive = functools.partial(
-            wp.launch,
-            self._kernels.driver(self._limb),
-            dim=(count, joints // self._limb),
-            inputs=[*self._motors, *given],
-            outputs=[*state, data.ctrl, data.qfrc_actuator, model.dof_armature],
-        )
+
+        def drive() -> None:
+            for joints, limb, kick in self._runs:
+                wp.launch(
+                    self._kernels.driver(limb),
+                    dim=(count, (joints.stop - joints.start) // limb),
+                    inputs=[*self._motors, joints.start, kick, *given],
+                    outputs=[*state, data.ctrl, data.qfrc_actuator, model.dof_armature],
+                )
+
         clamp = functools.partial(
             wp.launch,
             self._kernels.clamp,
-            dim=(count, joints),
-            inputs=self._motors[:-1],
+            dim=data.ctrl.shape,
+            inputs=self._motors,
             outputs=state,
         )
         return drive, clamp

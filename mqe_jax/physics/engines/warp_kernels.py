@@ -84,10 +84,10 @@ def clamp(
 def driver(joints: int):
     """Returns the kernel `drive` for limbs of a number of joints.
 
-    Its `kick` are the speeds that unit torques of a limb add in a physics step.
+    Its `first` is the first joint of the first limb. Its `kick` are the speeds that unit torques
+    of a limb add in a physics step.
     """
     Row = wp.types.vector(length=joints, dtype=float)
-    Square = wp.types.matrix(shape=(joints, joints), dtype=float)
 
     @wp.kernel(enable_backward=False, module="unique")
     def drive(
@@ -95,7 +95,8 @@ def driver(joints: int):
         angles: wp.array[int],
         speeds: wp.array[int],
         timestep: float,
-        kick: Square,  # pyright: ignore[reportInvalidTypeForm]
+        first: int,
+        kick: wp.array2d[float],
         gainprm: wp.array2d[Ten],
         biasprm: wp.array2d[Ten],
         base: wp.array2d[float],
@@ -112,7 +113,7 @@ def driver(joints: int):
         given = Row()
         pace = Row()
         for i in range(joints):
-            joint = limb * joints + i
+            joint = first + limb * joints + i
             _clamp(joint, env, constants, angles, speeds, timestep, qpos, qvel)
             position = qpos[env, angles[joint]]
             velocity = qvel[env, speeds[joint]]
@@ -134,15 +135,17 @@ def driver(joints: int):
             effort[i] = wp.abs(found)
             given[i] = found * sign
 
-        added = effort @ kick
         fastest = wp.max(pace)
-        near = (fastest / constants[limb * joints, LEG_SPEED] - SLOW) / (FAST - SLOW)
+        near = (fastest / constants[first + limb * joints, LEG_SPEED] - SLOW) / (FAST - SLOW)
         near = wp.clamp(near, 0.0, 1.0)
         for i in range(joints):
-            joint = limb * joints + i
+            joint = first + limb * joints + i
             speed = constants[joint, SPEED]
             full = constants[joint, FULL]
-            reach = (pace[i] + added[i]) / speed
+            added = 0.0
+            for other in range(joints):
+                added += effort[other] * kick[other, i]
+            reach = (pace[i] + added) / speed
             beyond = wp.min(constants[joint, NEEDED] * (reach - 1.0), full)
             needed = wp.where(reach > REACH, beyond, 0.0)
             if constants[joint, STEEP] > 0.0:

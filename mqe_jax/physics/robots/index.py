@@ -9,13 +9,17 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.robot import BASE, FOOT, TRUNK, Robot, parts_of
 from mqe_jax.physics.rotation import quaternion_to_euler, rotate_inverse
 
 
 @dataclasses.dataclass(frozen=True)
 class RobotIndex:
-    """Index tables of the R robots of a compiled model, as host integers."""
+    """Index tables of the R robots of a compiled model, as host integers.
+
+    J, B, G, T and F are the largest numbers of a robot. -1 fills the rows of those with fewer.
+    """
 
     base_qpos: np.ndarray  # addresses of (position 3, quaternion wxyz 4) in qpos (R, 7)
     base_qvel: np.ndarray  # addresses of (linear 3 world, angular 3 body) in qvel (R, 6)
@@ -41,13 +45,22 @@ class RobotIndex:
 def scatter(base: Any, addresses: np.ndarray, values: jax.Array) -> jax.Array:
     """Returns the array `base` (n,) with `values` at `addresses`, host integers of the same shape.
 
-    A GPU computes this together with what precedes and follows it; a scatter takes kernels of its
-    own.
+    Values at -1 are left out. A GPU computes this together with what precedes and follows it; a
+    scatter takes kernels of its own.
     """
     source = np.full(len(base), -1)
-    source[addresses] = np.arange(addresses.size).reshape(addresses.shape)
+    known = addresses >= 0
+    source[addresses[known]] = np.flatnonzero(known)
     placed = jnp.ravel(values)[np.maximum(source, 0)]
     return jnp.where(source < 0, jnp.asarray(base, values.dtype), placed)
+
+
+def gather(values: jax.Array, addresses: np.ndarray) -> jax.Array:
+    """Returns the `values` (n,) at `addresses`, host integers; 0 at those of -1."""
+    found = values[addresses]
+    if np.all(addresses >= 0):
+        return found
+    return jnp.where(addresses < 0, jnp.zeros_like(found), found)
 
 
 def prefix(number: int) -> str:
@@ -83,36 +96,46 @@ def add_sensors(spec: mujoco.MjSpec, robots: Sequence[Robot], *, feet: bool = Fa
 
 
 def index_robots(
-    model: mujoco.MjModel,
-    robot: Robot,
-    num_robots: int,
-    *,
-    contacts: str = "full",
-    feet: bool = False,
+    model: mujoco.MjModel, robots: Fleet, *, contacts: str = "full", feet: bool = False
 ) -> RobotIndex:
     """Builds the index tables of a compiled model's robots by looking up names."""
-    numbers = range(num_robots)
-    soles = robot.geom_names(FOOT)
-    bases = [model.joint(prefix(i) + BASE) for i in numbers]
+    bases = [model.joint(prefix(i) + BASE) for i in range(len(robots))]
 
-    def table(lookup: Callable[[str], Any], names: Sequence[str]) -> np.ndarray:
-        return np.array([[lookup(prefix(i) + name) for name in names] for i in numbers], np.int32)
+    def table(lookup: Callable[[str], Any], names: Callable[[Robot], Sequence[str]]) -> np.ndarray:
+        return _fill(
+            [[lookup(prefix(i) + name) for name in names(robot)] for i, robot in enumerate(robots)]
+        )
 
-    def force(names: Sequence[str]) -> np.ndarray:
-        return table(lambda name: model.sensor(name + "_force").adr[0] + np.arange(3), names)
+    def force(part: str) -> np.ndarray:
+        def lookup(name: str) -> np.ndarray:
+            return model.sensor(name + "_force").adr[0] + np.arange(3)
 
+        return table(lookup, lambda robot: robot.geom_names(part))
+
+    most = max(len(robot.geom_names(FOOT)) for robot in robots)
     return RobotIndex(
         base_qpos=np.array([base.qposadr[0] + np.arange(7) for base in bases], np.int32),
         base_qvel=np.array([base.dofadr[0] + np.arange(6) for base in bases], np.int32),
-        joint_qpos=table(lambda name: model.joint(name).qposadr[0], robot.joint_names),
-        joint_qvel=table(lambda name: model.joint(name).dofadr[0], robot.joint_names),
-        actuator=table(lambda name: model.actuator(name).id, robot.joint_names),
-        trunk_body=table(lambda name: model.body(name).id, [TRUNK])[:, 0],
-        bodies=table(lambda name: model.body(name).id, robot.body_names),
-        geoms=table(lambda name: model.geom(name).id, robot.geom_names(*parts_of(contacts))),
-        trunk_force=force(robot.geom_names(TRUNK)),
-        foot_force=force(soles) if feet else np.zeros((0, len(soles), 3), np.int32),
+        joint_qpos=table(lambda name: model.joint(name).qposadr[0], lambda x: x.joint_names),
+        joint_qvel=table(lambda name: model.joint(name).dofadr[0], lambda x: x.joint_names),
+        actuator=table(lambda name: model.actuator(name).id, lambda x: x.joint_names),
+        trunk_body=table(lambda name: model.body(name).id, lambda x: [TRUNK])[:, 0],
+        bodies=table(lambda name: model.body(name).id, lambda x: x.body_names),
+        geoms=table(lambda name: model.geom(name).id, lambda x: x.geom_names(*parts_of(contacts))),
+        trunk_force=force(TRUNK),
+        foot_force=force(FOOT) if feet else np.zeros((0, most, 3), np.int32),
     )
+
+
+def _fill(rows: Sequence[Sequence[Any]]) -> np.ndarray:
+    """Returns rows of any lengths as a table, which -1 fills."""
+    most = max(map(len, rows))
+    full = []
+    for row in rows:
+        own = np.array(row, np.int32)
+        missing = [(0, most - len(own)), *[(0, 0)] * (own.ndim - 1)]
+        full.append(np.pad(own, missing, constant_values=-1))
+    return np.stack(full)
 
 
 class Proprioception(NamedTuple):
@@ -122,11 +145,19 @@ class Proprioception(NamedTuple):
     joint_position: jax.Array  # joint angles (J,), rad
     joint_velocity: jax.Array  # joint velocities (J,), rad/s
 
+    def of(self, rows: slice | np.ndarray, joints: int) -> "Proprioception":
+        """Returns that of some rows of many robots, with their first joints."""
+        position = self.joint_position[rows, :joints]
+        return Proprioception(self.gravity_b[rows], position, self.joint_velocity[rows, :joints])
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RobotState:
-    """Backend-independent robot state after a step (R robots, NPC robots included)."""
+    """Backend-independent robot state after a step (R robots, NPC robots included).
+
+    J is the largest number of joints; entries beyond a robot's own are 0.
+    """
 
     position_w: jax.Array  # trunk origin in the environment frame (R, 3), m
     quaternion: jax.Array  # trunk orientation, wxyz (R, 4)
@@ -179,14 +210,14 @@ def read_robots(
         takes_part = jnp.concatenate([active, takes_part[len(active) :]])
     base = qpos[index.base_qpos]
     base_velocity = qvel[index.base_qvel]
-    trunk_forces = jnp.linalg.norm(sensordata[index.trunk_force], axis=-1)
+    trunk_forces = jnp.linalg.norm(gather(sensordata, index.trunk_force), axis=-1)
     return RobotState(
         position_w=base[:, :3],
         quaternion=base[:, 3:],
         linear_velocity_w=base_velocity[:, :3],
         angular_velocity_b=base_velocity[:, 3:],
-        joint_position=qpos[index.joint_qpos],
-        joint_velocity=qvel[index.joint_qvel],
+        joint_position=gather(qpos, index.joint_qpos),
+        joint_velocity=gather(qvel, index.joint_qvel),
         trunk_force=jnp.max(trunk_forces, axis=-1),
         active=takes_part,
     )

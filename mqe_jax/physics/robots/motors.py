@@ -17,12 +17,15 @@ The functions take numpy or JAX arrays; `xp` is the module, numpy or jax.numpy.
 
 import dataclasses
 import functools
-from typing import Any
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from mqe_jax.physics.robots.build import build_robot
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.index import RobotIndex
 from mqe_jax.physics.robots.robot import Robot
 
@@ -56,36 +59,52 @@ def leg_response(robot: Robot) -> np.ndarray:
     return np.abs(np.linalg.inv(matrix)[np.ix_(limb, limb)])
 
 
+class Run(NamedTuple):
+    """The joints of consecutive robots of one kind, limb after limb."""
+
+    joints: slice
+    """Which of all joints."""
+    response: np.ndarray
+    """Accelerations of a limb's joints per torque (L, L), 1/(kg m^2)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Motors:
-    """The motors of R robots of one type in a compiled scene, all J joints."""
+    """The motors of the robots in a compiled scene, all J joints."""
 
     joint_qpos: np.ndarray  # joint angles in qpos (J,)
     joint_qvel: np.ndarray  # joint velocities in qvel (J,)
     speed: np.ndarray  # speed limits V (J,), rad/s
     torque: np.ndarray  # torque limits of the controller L (J,), N m
     stall: np.ndarray  # stall torques S (J,), N m
-    response: np.ndarray  # accelerations of a limb's joints per torque (L, L), 1/(kg m^2)
+    runs: tuple[Run, ...]  # of all joints, in order
     timestep: float  # physics step, s
 
     @classmethod
-    def of(cls, robot: Robot, index: RobotIndex, timestep: float) -> "Motors":
+    def of(cls, robots: Fleet, index: RobotIndex, timestep: float) -> "Motors":
         """Returns the motors of all robots of a scene.
 
         Its actuators must be in the order of the robots' joints.
         """
-        assert np.array_equal(index.actuator.ravel(), np.arange(index.actuator.size))
+        actuator = index.actuator[robots.has_joint]
+        assert np.array_equal(actuator, np.arange(actuator.size))
 
-        def per_joint(values):
-            return np.tile(values, index.num_robots).astype(np.float32)
+        def per_joint(name: str) -> np.ndarray:
+            return robots.table(name)[robots.has_joint].astype(np.float32)
 
+        runs = []
+        first = 0
+        for robot, alike in itertools.groupby(robots):
+            last = first + robot.num_joints * len(list(alike))
+            runs.append(Run(slice(first, last), leg_response(robot).astype(np.float32)))
+            first = last
         return cls(
-            joint_qpos=index.joint_qpos.ravel(),
-            joint_qvel=index.joint_qvel.ravel(),
-            speed=per_joint(np.minimum(robot.joint_speed_limit, UNLIMITED)),
-            torque=per_joint(robot.torque_limit),
-            stall=per_joint(robot.stall_torque),
-            response=leg_response(robot).astype(np.float32),
+            joint_qpos=index.joint_qpos[robots.has_joint],
+            joint_qvel=index.joint_qvel[robots.has_joint],
+            speed=np.minimum(per_joint("joint_speed_limit"), np.float32(UNLIMITED)),
+            torque=per_joint("torque_limit"),
+            stall=per_joint("stall_torque"),
+            runs=tuple(runs),
             timestep=timestep,
         )
 
@@ -136,9 +155,12 @@ class Motors:
 
         `effort` are the torques' magnitudes (..., J), N m.
         """
-        size = len(self.response)
+        return _join(xp, [self._kick_of(xp, effort[..., run.joints], run) for run in self.runs])
+
+    def _kick_of(self, xp: Any, effort: Any, run: Run) -> Any:
+        size = len(run.response)
         legs = effort.reshape(-1, size)
-        added = self.timestep * self.response
+        added = self.timestep * run.response
         if xp is np:
             return (legs @ added).reshape(effort.shape)
         # A GPU computes sums of products together with what precedes and follows them, a matrix
@@ -148,16 +170,29 @@ class Motors:
             total += legs[:, i : i + 1] * added[i]
         return total.reshape(effort.shape)
 
+    def _haste(self, xp: Any, pace: Any) -> Any:
+        """Returns the share (..., J) of the complete armature that the speed of a limb calls for.
+
+        `pace` are magnitudes of speeds.
+        """
+        parts = []
+        for run in self.runs:
+            size = len(run.response)
+            own = pace[..., run.joints]
+            fastest = functools.reduce(xp.maximum, [own[..., i::size] for i in range(size)])
+            lowest = self._leg_speed[..., run.joints][..., ::size]
+            near = (fastest / lowest - SLOW) / (FAST - SLOW)
+            parts.append(xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1))
+        return _join(xp, parts)
+
     def _armature(self, xp: Any, pace: Any, effort: Any, against: Any) -> Any:
         """Returns the armature (..., J), kg m^2.
 
         `pace` and `effort` are magnitudes of speeds and torques, `against` says which are opposed.
         """
-        size = len(self.response)
-        fastest = functools.reduce(xp.maximum, [pace[..., i::size] for i in range(size)])
-        near = (fastest / self._leg_speed - SLOW) / (FAST - SLOW)
+        haste = self._haste(xp, pace)
         reach = (pace + self._kick(xp, effort)) / self.speed
-        if xp is np and near.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
+        if xp is np and haste.max() <= 0.0 and reach.max() <= REACH and not self._steep.any():
             return np.zeros_like(pace)
         beyond = (reach > REACH).astype(np.float32)
         needed = xp.minimum(self._needed * (reach - 1.0), self._full) * beyond
@@ -166,8 +201,7 @@ class Motors:
             share = xp.minimum(effort / xp.maximum(line, ROUNDING), 1.0)  # of the line's torque
             implicit = share * (self._inertia + self.timestep * self._line) - self._inertia
             needed = xp.where(self._steep, xp.maximum(implicit, 0.0), needed)
-        of_legs = xp.repeat(xp.clip(near, 0.0, 1.0), size, axis=-1)
-        return xp.maximum(of_legs * self._full, needed)
+        return xp.maximum(haste * self._full, needed)
 
     @functools.cached_property
     def constants(self) -> np.ndarray:
@@ -186,7 +220,7 @@ class Motors:
             self._full,
             self._needed,
             self._inertia,
-            np.repeat(self._leg_speed, len(self.response)),
+            self._leg_speed,
             self._steep,
         )
         return np.stack(columns, axis=-1).astype(np.float32)
@@ -204,7 +238,12 @@ class Motors:
     @functools.cached_property
     def _inertia(self) -> np.ndarray:
         """Inertia of each joint in a free leg (..., J), kg m^2."""
-        return np.tile(1.0 / np.diag(self.response), self._leg_speed.shape)
+        limbs = []
+        for run in self.runs:
+            own = self.speed[..., run.joints].shape
+            count = own[-1] // len(run.response)
+            limbs.append(np.tile(1.0 / np.diag(run.response), (*own[:-1], count)))
+        return _join(np, limbs)
 
     @functools.cached_property
     def _steep(self) -> np.ndarray:
@@ -238,14 +277,18 @@ class Motors:
 
     @functools.cached_property
     def _leg_speed(self) -> np.ndarray:
-        """Lowest speed limit of each leg (..., J / L), rad/s."""
-        return self.speed.reshape(*self.speed.shape[:-1], -1, len(self.response)).min(axis=-1)
+        """Lowest speed limit of each joint's limb (..., J), rad/s."""
+        limbs = []
+        for run in self.runs:
+            own = self.speed[..., run.joints]
+            rows = own.reshape(*own.shape[:-1], -1, len(run.response))
+            limbs.append(np.repeat(rows.min(axis=-1), len(run.response), axis=-1))
+        return _join(np, limbs)
 
     @functools.cached_property
     def _slow(self) -> np.ndarray:
         """Speeds (..., J), rad/s, below which a leg has no armature for its speed."""
-        of_legs = np.repeat(self._leg_speed, len(self.response), axis=-1)
-        return np.float32((1.0 - ROUNDING) * SLOW) * of_legs
+        return np.float32((1.0 - ROUNDING) * SLOW) * self._leg_speed
 
     @functools.cached_property
     def _near(self) -> np.ndarray:
@@ -280,3 +323,8 @@ class Motors:
 def _force(ctrl: Any, position: Any, velocity: Any, gain: Any, bias: Any) -> Any:
     """Returns the forces (..., J), N m, of actuators without limits; arguments as of `limit`."""
     return gain * ctrl + bias[..., 0] + bias[..., 1] * position + bias[..., 2] * velocity
+
+
+def _join(xp: Any, parts: Sequence[Any]) -> Any:
+    """Returns the parts of all runs (..., n) in one array (..., J)."""
+    return parts[0] if len(parts) == 1 else xp.concatenate(parts, axis=-1)

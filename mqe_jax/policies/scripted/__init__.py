@@ -52,7 +52,7 @@ def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.
         InputError: if the task has none of this name.
     """
     plan = find_scripted(env.name, name)
-    layout = env.observation_layout
+    layout = env.layouts["policy"]
     if env.varies:
         return functools.partial(_plan_with_absent, plan, layout)
     return lambda obs: plan(layout.split(obs))
