@@ -74,7 +74,7 @@ def uniform(columns: np.ndarray, names: list[str]) -> None:
 
 def test_everything_drawn_at_a_reset_is_uniform_and_independent(box: Any, resets: Any) -> None:
     index = box.index
-    robot = box.robot
+    robot = box.robots[0]
     params = box.params
     qpos = resets.data.qpos
     qvel = resets.data.qvel

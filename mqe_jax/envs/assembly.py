@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from mqe_jax import skills
 from mqe_jax.core.errors import InputError, warn
 from mqe_jax.core.settings import fail
@@ -86,14 +88,14 @@ def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Co
         gait: str | None,
         weights: Any,
     ) -> list[Group]:
-        name = tuple(part.name for part in usual.parts)
+        names = [part.name for part in usual.parts]
         found = []
         for kind in dict.fromkeys(scene.robots[number] for number in numbers):
             own = tuple(number for number in numbers if scene.robots[number] is kind)
-            skill = skills.make(name if len(name) > 1 else name[0], kind)
+            skill = skills.make(names if len(names) > 1 else names[0], kind)
             skill.check_period(scene.timestep, num_substeps)
-            shift = skill.default_commands(gait) - usual.default_commands(gait)
-            shift[skill.index(varied)] = 0.0
+            free = [command.name not in varied for command in skill.commands]
+            shift = np.where(free, skill.default_commands(gait) - usual.default_commands(gait), 0)
             if varied:
                 skill = skill.restrict(varied, gait)
             found.append(Group(skill, skill.load_params(weights), own, shift))

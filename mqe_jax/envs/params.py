@@ -205,8 +205,9 @@ class TaskParams:
             return override(self, changes)
         usual = {"robot": type(self).robot, "robots": ()}
         given = {**usual, **changes}
-        names = check("robots", given["robots"], tuple[str, ...])
-        names = names or [check("robot", given["robot"], str)]
+        check("robot", given["robot"], str)
+        check("robots", given["robots"], tuple[str, ...])
+        names = map(str, given["robots"] or [given["robot"]])
         before = self.suited(*(self.robots or (self.robot,)))
         after = self.suited(*names)
         follow = {
