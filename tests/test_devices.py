@@ -21,10 +21,7 @@ from jax.extend.random import threefry_2x32
 import mqe_jax.adapters.gymnasium  # noqa: F401  (registers the tasks)
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.seats import Seats
-from mqe_jax.core import (
-    devices,
-    threefry,  # noqa: F401
-)
+from mqe_jax.core import devices, threefry
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import build
 from mqe_jax.core.types import Cast, Observations
@@ -41,7 +38,7 @@ from mqe_jax.train.learner import make_learner
 from mqe_jax.train.policy import read_policy
 from mqe_jax.train.rollout import minibatches
 from mqe_jax.train.runner import train, train_seeds
-from tests import fake_env
+from tests import fake_env, random_bits
 from tests.inputs import refuses
 from tests.states import made, needed
 from tests.test_opponents import matches
@@ -475,17 +472,26 @@ VECTORS = [
 
 @pytest.mark.parametrize("vector", VECTORS)
 def test_the_bits_are_those_of_the_reference(vector: tuple[int, ...]) -> None:
+    """Those of programs, of the library, and of the tests' shorter programs."""
     key, counter, bits = np.split(np.array(vector, np.uint32), 3)
     np.testing.assert_array_equal(threefry_2x32(jnp.asarray(key), jnp.asarray(counter)), bits)
+    words = jnp.asarray([*key, *counter])
+    for function in (threefry.threefry, random_bits.threefry):
+        np.testing.assert_array_equal(jax.jit(function)(*words), bits)
 
 
-def test_random_numbers_are_compiled_without_loops() -> None:
-    draw = jax.jit(jax.vmap(lambda key: jax.random.normal(jax.random.split(key, 3)[1], (5,))))
-    text = draw.lower(jax.random.split(jax.random.PRNGKey(0), 4)).compile().as_text()
-    assert text and " while(" not in text
+@pytest.mark.parametrize("shape", [(), (0,), (3, 5), (300,)])
+def test_short_programs_draw_the_same_bits(shape: tuple[int, ...]) -> None:
+    random = np.random.default_rng(0)
+    sizes = (), (), shape, shape
+    words = [jnp.asarray(random.integers(0, 2**32, size, np.uint32)) for size in sizes]
+    for one, other in zip(
+        jax.jit(threefry.threefry)(*words), jax.jit(random_bits.threefry)(*words), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
 
 
-def test_numbers_of_a_key_after_several_splits_are_compiled() -> None:
+def test_numbers_of_a_key_after_several_splits_are_compiled_without_loops() -> None:
     """jaxlib 0.11 did not finish in 25 minutes, so that no training began on a CPU."""
     code = """
 import jax
@@ -497,7 +503,8 @@ def draw(key):
     third, _ = jax.random.split(second, 2)
     return jax.random.normal(third, (64, 64))
 
-jax.jit(draw).lower(jax.random.PRNGKey(0)).compile()
+text = jax.jit(draw).lower(jax.random.PRNGKey(0)).compile().as_text()
+assert text and " while(" not in text
 """
     # tests optimise less
     usual = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
