@@ -19,6 +19,7 @@ from mqe_jax.acting.seats import Seats
 from mqe_jax.core.blocks import Block, entities, image
 from mqe_jax.core.settings import build, override
 from mqe_jax.core.types import Cast, NetworkMemory, Params
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.presets import preset
 from mqe_jax.sensors.pipeline import Pipeline
@@ -206,7 +207,8 @@ def probe(network: str) -> Any:
     )
     blocks = (Block("one_hot", 2), entities("pair", "robot", 2, 1, masked=True), Block("rest", 1))
     described = {"describe": lambda group: {"blocks": blocks}} if network == "blocks" else {}
-    for name, value in {"dt": 0.02, "control": "torque", "robot": GO1, **described}.items():
+    given = {"dt": 0.02, "control": "torque", "robots": Fleet([GO1] * agents)}
+    for name, value in {**given, **described}.items():
         object.__setattr__(env, name, value)
     return env
 

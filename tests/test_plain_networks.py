@@ -114,7 +114,8 @@ def test_the_transformer_is_that_of_a_plain_implementation() -> None:
         expected = -0.5 * z**2 - np.log(deviation * math.sqrt(2 * math.pi))
         np.testing.assert_allclose(found.log_prob[n], expected, rtol=1e-3, atol=1e-3)
         entropy = np.sum(0.5 * np.log(2 * math.pi * math.e * deviation**2))
-        np.testing.assert_allclose(found.entropy[n], np.full(agents, entropy), rtol=1e-4)
+        together = found.entropy[n].sum(axis=-1)
+        np.testing.assert_allclose(together, np.full(agents, entropy), rtol=1e-4)
 
 
 def gain(matrix: Any) -> float:

@@ -125,7 +125,7 @@ def test_a_robot_of_two_legs_is_observed_rewarded_drawn_and_exported() -> None:
     assert env.mj_model.nbody == env.compiled.model.nbody
     assert env.mj_model.ngeom > env.compiled.model.ngeom
     assert mujoco.MjModel.from_xml_string(scene_xml(env)).nu == 18
-    assert len(scene_settings(env)["motors"]["response"]) == 9
+    assert len(scene_settings(env)["motors"]["runs"][0][2]) == 9
 
 
 def test_a_robot_of_two_legs_stands_beside_another() -> None:

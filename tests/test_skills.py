@@ -13,7 +13,7 @@ import pytest
 from mqe_jax import VectorEnv, learn, make, names
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.core.types import observations
-from mqe_jax.export.policy import skill_of
+from mqe_jax.export.policy import skills_of
 from mqe_jax.export.task import TaskFunctions, readings_function
 from mqe_jax.names import load_policy, table, versus
 from mqe_jax.physics.robots.go1 import GO1
@@ -267,7 +267,7 @@ def test_a_policy_needs_the_contents_of_its_skill_weights(weights: str, tmp_path
     assert policy_in(stored).needs == needs
     agile.NETWORKS.save(agile.NETWORKS.init(jax.random.PRNGKey(1)), file)
     refuses("policy: .* needs skill_weights", table, path, impl="c")
-    refuses("skill_weights: .* has changed", skill_of, env)
+    refuses("skill_weights: .* has changed", skills_of, env, 1)
 
 
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:

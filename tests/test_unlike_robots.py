@@ -5,17 +5,25 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import mqe_jax
+from mqe_jax import cli
 from mqe_jax.core.errors import InputError
-from mqe_jax.envs import make
+from mqe_jax.envs import VectorEnv, make
+from mqe_jax.export.policy import input_shapes
+from mqe_jax.export.scene import scene_settings, scene_xml
+from mqe_jax.export.task import TaskFunctions
 from mqe_jax.physics import robots
 from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.go2 import GO2
+from mqe_jax.skills import agile
+from mqe_jax.train.config import TrainConfig
 from tests.inputs import refuses
+from tests.training import export_error, untrained
 
 KEY = jax.random.PRNGKey(0)
 BIPED = str(Path(__file__).parents[1] / "examples" / "robots" / "biped.xml")
@@ -133,6 +141,85 @@ def test_parameters_follow_the_largest_robot_and_return() -> None:
     assert unlike.digests["robot"] == robots.get(BIPED).digest
     heights = unlike.by_height(unlike.params.spawn_height)
     np.testing.assert_allclose(heights, [usual.spawn_height, alone.params.spawn_height], atol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def uneven() -> Any:
+    """A Go1 and a robot of two legs with nine joints."""
+    return make("go1gate", impl="c", num_envs=8, control="position", robots=("go1", BIPED),
+                senses=["proprioception"], spawn_velocity=0.0)  # fmt: skip
+
+
+def test_robots_of_other_joint_counts_act_together(uneven: Any, tmp_path: Path) -> None:
+    assert (uneven.action_size, uneven.num_agents) == (12, 2)
+    np.testing.assert_array_equal(uneven.used.sum(axis=1), [12, 9])
+    state = stepped(uneven, 3)
+    assert bool(jnp.all(jnp.isfinite(state.obs))) and bool(jnp.all(jnp.isfinite(state.reward)))
+    found = uneven.read(state.data)
+    np.testing.assert_array_equal(found.joint_position[1, 9:], 0.0)
+    assert not jnp.any(found.joint_position[1, :9] == 0.0)
+    step = jax.jit(uneven.step)
+    one, other = (step(state, jnp.zeros((2, 12)).at[1, 9:].set(x)) for x in (0.0, 1.0))
+    np.testing.assert_array_equal(one.data.qpos, other.data.qpos)
+    np.testing.assert_array_equal(one.groups["policy"], other.groups["policy"])
+    xml = mujoco.MjModel.from_xml_string(scene_xml(uneven))
+    assert xml.nu == 21 and uneven.mj_model.nbody == uneven.compiled.model.nbody
+    runs = scene_settings(uneven)["motors"]["runs"]
+    assert [(first, last, len(of)) for first, last, of in runs] == [(0, 12, 3), (12, 21, 9)]
+    clip = mqe_jax.render(uneven, "idle", seconds=0.1, width=160)
+    clip.save(tmp_path / "two.png")
+    assert (tmp_path / "two.png").stat().st_size > 1000
+
+
+def test_entries_of_joints_that_a_robot_lacks_teach_nothing(uneven: Any) -> None:
+    own = {"network.share_policy": False, "network.chunk_length": 2, "ppo.entropy_coef": 0.1}
+    policy = mqe_jax.learn(uneven, {**SMALL, "num_envs": 8, **own}).policy
+    moved = np.asarray(policy.params["log_std"]) != 0.0  # where it begins
+    np.testing.assert_array_equal(moved, uneven.used)
+    weights = np.asarray(policy.params["actor"]["head"]["bias"])
+    np.testing.assert_array_equal(weights != 0.0, uneven.used)
+
+
+def test_a_policy_of_unlike_robots_is_exported(uneven: Any) -> None:
+    walkers = make("go1gate", impl="c", robots=("go2", "go1"))
+    for env in (uneven, walkers):
+        policy = untrained(VectorEnv(env, 2), TrainConfig())
+        assert export_error(policy, env) < 1e-4
+    shapes = input_shapes(policy, walkers)
+    assert shapes["walk_0_action"] == shapes["walk_1_action"] == (1, 12)
+    refuses("robots: go2, go1 are not allowed; graphs of tasks", TaskFunctions, walkers)
+
+
+def test_agents_of_pettingzoo_have_the_actions_of_their_robots(uneven: Any) -> None:
+    pettingzoo = pytest.importorskip("mqe_jax.adapters.pettingzoo")
+    env = pettingzoo.parallel_env(uneven)
+    shapes = [env.action_space(agent).shape for agent in env.possible_agents]
+    assert shapes == [(12,), (9,)]
+    env.reset(seed=0)
+    env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    wrong = {agent: np.zeros(12) for agent in env.agents}
+    refuses(r"actions.robot_1: .* it must be 9 numbers", env.step, wrong)
+
+
+def test_each_kind_has_its_own_weights_of_the_skill(tmp_path: Path) -> None:
+    file = str(tmp_path / "own.safetensors")
+    agile.NETWORKS.save(agile.NETWORKS.init(KEY), file)
+    given = {"skill": "agile", "robots": ("go1", "go2"), "impl": "c"}
+    env = make("go1gate", skill_weights=(None, file), **given)
+    shipped, own = env.controller.groups
+    usual = agile.AgileSkill(GO1).load_params()["body"]["0"]["weight"]
+    np.testing.assert_array_equal(shipped.params["body"]["0"]["weight"], usual)
+    assert not np.array_equal(own.params["body"]["0"]["weight"], usual)
+    assert env.digests["skill_weights"].startswith("shipped ")
+    for files in (file, (file,), (None, None, file)):
+        refuses(r"skill_weights: .* is not allowed", make, "go1gate", skill_weights=files, **given)
+
+
+def test_the_card_of_a_task_shows_each_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tasks", "go1gate", "--robots", "go1", "go2", "--impl", "c"]) == 0
+    shown = capsys.readouterr().out
+    for text in ("Unitree Go1", "Unitree Go2", "bodies (4)", "one-hot of go1, go2"):
+        assert text in shown, text
 
 
 def test_tables_of_unlike_robots_end_with_zeros() -> None:

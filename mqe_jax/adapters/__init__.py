@@ -92,6 +92,12 @@ def team_reward(env: TaskEnv, reward: Any, active: Any) -> Any:
     return reward[..., team].mean(-1, where=active[..., team])
 
 
+def used_entries(env: TaskEnv) -> np.ndarray:
+    """Returns which entries of each agent's action count (A, action_size) bool."""
+    used = env.used
+    return np.ones(env.action_space.shape, bool) if used is None else used[: env.num_agents]
+
+
 def seen_group(env: TaskEnv) -> str:
     """Returns the group of observations that agents see: `onboard` with sensors, else `policy`."""
     return ONBOARD if env.params.senses else "policy"

@@ -23,6 +23,7 @@ from mqe_jax.adapters import (
     seen_group,
     select,
     task_env,
+    used_entries,
 )
 from mqe_jax.adapters.host import info_of
 from mqe_jax.adapters.opponent import TaskEnv
@@ -171,9 +172,14 @@ class Env(MultiAgentEnv):
     def get_avail_actions(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, state: State
     ) -> Arrays:
-        """Returns all true, (action_size,) bool or one per discrete action."""
-        size = self.env.action_size if self.action_table is None else len(self.action_table)
-        return {agent: jnp.ones(size, bool) for agent in self.agents}
+        """Returns (action_size,) bool or one per discrete action.
+
+        All are true but those of joints that the agent's robot lacks.
+        """
+        used = used_entries(self.env)
+        if self.action_table is not None:
+            used = np.stack([np.all((self.action_table != 0) <= own, axis=-1) for own in used])
+        return {agent: jnp.asarray(own) for agent, own in zip(self.agents, used, strict=True)}
 
     def get_world_state(self, state: State) -> jax.Array:
         """Returns the privileged observation (P,), for centralised critics."""

@@ -13,11 +13,11 @@ import numpy as np
 from gymnasium.utils import EzPickle
 
 from mqe_jax import envs
-from mqe_jax.adapters import agent_names, missing, seen_space, task_env
+from mqe_jax.adapters import agent_names, missing, seen_space, task_env, used_entries
 from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
 from mqe_jax.core.errors import InputError, short_repr
 from mqe_jax.core.limits import Pixels, PositiveInt
-from mqe_jax.core.settings import check, checked
+from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.envs import QuadrupedEnv
 
 try:
@@ -104,8 +104,13 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         self.possible_agents = agent_names(self.task)
         self.agents: list[str] = []
         self.teams = tuple(tuple(self.possible_agents[i] for i in team) for team in self.task.teams)
-        spaces = (_rows(seen_space(self.task)), _rows(self.task.action_space))
-        self._observation_spaces, self._action_spaces = map(self._by_name, spaces)
+        self._used = self._by_name(used_entries(self.task))
+        self._observation_spaces = self._by_name(_rows(seen_space(self.task)))
+        actions = zip(_rows(self.task.action_space), self._used.values(), strict=True)
+        self._action_spaces = self._by_name(
+            gymnasium.spaces.Box(space.low[own], space.high[own], dtype=np.float32)
+            for space, own in actions
+        )
         size = (self.task.privileged_observation_size,)
         self.state_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)
         self._generator = np.random.default_rng()
@@ -117,7 +122,10 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
         return self._observation_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
     def action_space(self, agent: str) -> gymnasium.spaces.Box:
-        """Returns the space of an agent's action (action_size,), in [-1, 1]."""
+        """Returns the space of an agent's action, in [-1, 1].
+
+        Its entries are those that count for the agent's robot.
+        """
         return self._action_spaces[check("agent", agent, Literal[tuple(self.possible_agents)])]
 
     def reset(
@@ -139,9 +147,7 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
                 f"actions: for {short_repr(list(actions))}; expected one for each of "
                 f"{', '.join(self.agents)}"
             )
-        parked = np.zeros(self.task.action_size)
-        every = [actions.get(agent, parked) for agent in self.possible_agents]
-        out = self._host.step([every])
+        out = self._host.step([[self._whole(agent, actions) for agent in self.possible_agents]])
         terminated = bool(out.terminated[0])
         truncated = bool(out.truncated[0])
         metrics = {name: float(value[0]) for name, value in out.info.items()}
@@ -168,6 +174,18 @@ class QuadrupedParallelEnv(ParallelEnv[str, np.ndarray, Any], EzPickle):
 
     def close(self) -> None:
         """No-op: no resources are held."""
+
+    def _whole(self, agent: str, actions: Mapping[str, np.ndarray]) -> Any:
+        """Returns an agent's action with zeros for joints that its robot lacks, or if parked."""
+        used = self._used[agent]
+        action = actions.get(agent, np.zeros(used.sum()))
+        if used.all():
+            return action
+        if np.shape(action) != (used.sum(),):
+            fail(f"actions.{agent}", action, f"{used.sum()} numbers")
+        whole = np.zeros(used.shape)
+        whole[used] = action
+        return whole
 
     def _by_name(self, values: Iterable[Any]) -> dict[str, Any]:
         """Returns the values of all possible agents by name."""

@@ -104,6 +104,7 @@ class VectorEnv(Protocol):
     | `step` | (N,) | steps in the episode; set by `stagger_episodes` |
     | `assistance` | (N,) | set by `curriculum.assistance` (`replace_fields`) |
     | `active` | (N, A) bool | agents that take part; others enter no statistics, loss or result |
+    | `used` | (N, A, D) bool | entries of actions that count; others enter no loss |
     | `groups`, `final_groups` | (N, A, O_g) by name | further observations |
     """
 
@@ -361,6 +362,8 @@ class Transition(NamedTuple):
     """Whether the episode was terminated or truncated (N,) bool."""
     teacher_action: Any = ()
     """The teacher's actions, as the environment would get them (N, A, D); empty without one."""
+    used: jax.Array | None = None
+    """Which entries of the actions count (N, A, D) bool; None: all."""
 
 
 class Batch(NamedTuple):
@@ -384,3 +387,5 @@ class Batch(NamedTuple):
     """Active agents from whose samples the loss learns (L, C, A) bool."""
     teacher_action: Any = ()
     """The first D' entries of the teacher's actions, unscaled (L, C, A, D'); empty without one."""
+    used: jax.Array | None = None
+    """Which entries of the actions count (L, C, A, D) bool; None: all."""

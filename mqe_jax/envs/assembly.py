@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -86,7 +86,7 @@ def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Co
         usual: Skill,
         varied: tuple[str, ...],
         gait: str | None,
-        weights: Any,
+        weights: Callable[[Robot], str | None],
     ) -> list[Group]:
         names = [part.name for part in usual.parts]
         found = []
@@ -98,13 +98,13 @@ def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Co
             shift = np.where(free, skill.default_commands(gait) - usual.default_commands(gait), 0)
             if varied:
                 skill = skill.restrict(varied, gait)
-            found.append(Group(skill, skill.load_params(weights), own, shift))
+            found.append(Group(skill, skill.load_params(weights(kind)), own, shift))
         return found
 
     every = []
     if task.control == "command" or shared:
         numbers = range(scene.num_robots if shared else agents)
-        every = groups(numbers, commander.skill, varied, params.gait, params.skill_weights)
+        every = groups(numbers, commander.skill, varied, params.gait, params.weights_of)
         for group in every:
             beyond = ", ".join(group.skill.untrained_commands(params.command_ranges))
             if beyond:
@@ -115,7 +115,7 @@ def make_controller(task: Task[Any, Any], scene: Scene, num_substeps: int) -> Co
     if has_npcs and not shared:
         numbers = range(agents, scene.num_robots)
         npc = skills.make(task.npc_skill, scene.robots[agents])
-        every += groups(numbers, npc, task.npc_varied, None, None)
+        every += groups(numbers, npc, task.npc_varied, None, lambda kind: None)
     return Controller(
         mode=task.control,
         robots=Fleet(scene.robots),

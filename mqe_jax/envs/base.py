@@ -22,7 +22,6 @@ import numpy as np
 
 from mqe_jax.core import keys
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import digest
 from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, check_signatures, results, weights_of
@@ -30,7 +29,7 @@ from mqe_jax.core.settings import Parameters, check, checked, differences, fail
 from mqe_jax.core.types import Level, Outcome, RandomKey
 from mqe_jax.envs.assembly import make_controller, make_scene
 from mqe_jax.envs.observation import ObservationLayout, finite, observe_bodies
-from mqe_jax.envs.params import P
+from mqe_jax.envs.params import P, weights_digest
 from mqe_jax.envs.privileged import PrivilegedObservation
 from mqe_jax.envs.randomization import Randomizer
 from mqe_jax.envs.sizes import Sizes, check_sizes, hide
@@ -135,10 +134,12 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             weights = load_actuator_network(network)
             self.actuators = NetworkActuators(self.physics, self.index, self.robots, weights)
         self.controller = make_controller(self, scene, self.physics.num_substeps)
-        reads = {"actuator_network": bool(self.actuators)}
-        reads["skill_weights"] = self.controller.skilled
-        files = {name: getattr(self.params, name) for name, read in reads.items() if read}
-        self.digests = {name: digest(file) for name, file in files.items() if file}
+        reads = {
+            "actuator_network": network if self.actuators else None,
+            "skill_weights": self.params.skill_weights if self.controller.skilled else None,
+        }
+        found = {name: weights_digest(files) for name, files in reads.items()}
+        self.digests = {name: value for name, value in found.items() if value}
         contents = [kind.digest for kind in self.robots.kinds if kind.digest]
         if contents:
             self.digests["robot"] = " ".join(contents)
@@ -335,6 +336,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             frozen_steps=self._sample_frozen_steps(freeze_key, assistance, active),
             key=next_key,
             active=active,
+            used=None if self.used is None else jnp.asarray(self.used),
             readings=self._reset_readings(key),
             senses=self.suite.reset() if self.params.senses else (),
         )
@@ -376,6 +378,8 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         action = jnp.clip(action, -self.action_limit, self.action_limit)
         still = (state.step < state.frozen_steps) | ~self.acting(state)
         own_action = jnp.where(still[:, None], 0.0, action)
+        if self.used is not None:
+            own_action = jnp.where(self.used, own_action, 0.0)
         action = self.unmirror_action(self.moving(own_action))
         key, push_key, _, npc_key = jax.random.split(state.key, 4)
 

@@ -28,7 +28,7 @@ from mqe_jax.envs.params import P
 from mqe_jax.envs.state import S, State
 from mqe_jax.physics.robots.index import RobotState
 
-OF_AGENTS = ("groups", "final_groups", "reward", "active")
+OF_AGENTS = ("groups", "final_groups", "reward", "active", "used")
 """Fields of a match's state that belong to its agents."""
 
 

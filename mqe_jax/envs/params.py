@@ -1,11 +1,12 @@
 """Parameters common to all tasks."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 
 from mqe_jax import skills, walk_policy  # noqa: F401  (skills register themselves)
+from mqe_jax.core.files import digest
 from mqe_jax.core.limits import (
     Buffer,
     Coordinate,
@@ -93,8 +94,8 @@ class TaskParams:
     skill: str | tuple[str, ...] = "walk"
     """Skill of the agents with control `command` (`mqe_jax.skills`). With several, a further action
     entry chooses one (`mqe_jax.skills.choice`)."""
-    skill_weights: FileName | None = None
-    """Weights file of the skill; the shipped one if None."""
+    skill_weights: FileName | tuple[FileName | None, ...] | None = None
+    """Weights file of the skill; the shipped one if None. With `robots`, one for each of them."""
     gait: str | None = None
     """Name of default commands of the skill. The walk policy has trot, pronk, bound and pace; None:
     trot."""
@@ -147,6 +148,7 @@ class TaskParams:
     def __post_init__(self) -> None:
         if self.robots and self.robot != type(self).robot:
             fail("robot", self.robot, f"left out beside robots, {self.robots}")
+        self._check_weights()
         commander = self.commander
         commander.skill.check_commands(commander.commands)
         commander.skill.changes(self.commands, self.command_ranges, commander.default_commands)
@@ -181,6 +183,22 @@ class TaskParams:
         """The robots that differ, in the order of their first appearance."""
         names = dict.fromkeys(self.robots or (self.robot,))
         return tuple(dict.fromkeys(robots.get(name) for name in names))
+
+    def _check_weights(self) -> None:
+        """Raises an InputError unless each kind of robots has its own weights of the skill."""
+        files = self.skill_weights
+        if isinstance(files, tuple) != bool(files and self.robots):
+            fail("skill_weights", files, "a file, or with robots a list, one for each of them")
+        if isinstance(files, tuple):
+            given = dict.fromkeys(zip(map(robots.get, self.robots), files, strict=False))
+            if len(files) != len(self.robots) or len(given) != len(self.kinds):
+                fail("skill_weights", files, "one for each of robots, equal for equal ones")
+
+    def weights_of(self, robot: Robot) -> str | None:
+        """Returns the weights file of the skill of a robot, None for the shipped one."""
+        if not isinstance(self.skill_weights, tuple):
+            return self.skill_weights
+        return self.skill_weights[[robots.get(name) for name in self.robots].index(robot)]
 
     @classmethod
     def suited(cls, *names: str) -> Self:
@@ -252,6 +270,13 @@ class TaskParams:
         texts = [f"{name} {low:g} to {high:g}" for name, (low, high) in ranges]
         skill = self.skill if isinstance(self.skill, str) else " or ".join(self.skill)
         return f"{skill}: {', '.join(texts)}"
+
+
+def weights_digest(files: str | Sequence[str | None] | None) -> str | None:
+    """Returns the SHA-256 of a weights file, or of several; None for the shipped ones."""
+    if files is None or isinstance(files, str):
+        return files and digest(files)
+    return " ".join(digest(file) if file else "shipped" for file in files)
 
 
 def largest(kinds: Iterable[Robot]) -> Proportions:

@@ -7,9 +7,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.envs.state import State
+from mqe_jax.physics.robots.fleet import Fleet
 from mqe_jax.physics.robots.index import RobotState
 from mqe_jax.physics.scene import CompiledScene
 from mqe_jax.sensors.marks import Marks
@@ -25,6 +27,7 @@ class Sensing:
     compiled: CompiledScene
     num_agents: int
     controller: Controller
+    robots: Fleet
     impl: str
     dt: float
     teams: Any
@@ -39,6 +42,18 @@ class Sensing:
         """
         added = sum(sensor.action_size for sensor in self.params.senses)
         return self.controller.action_size + added
+
+    @functools.cached_property
+    def used(self) -> np.ndarray | None:
+        """Which entries of each agent's action count (A, action_size) bool; None: all.
+
+        An action has an entry for each joint of the robot with the most.
+        """
+        moving = self.robots.has_joint[: self.num_agents, : self.controller.action_size]
+        if self.controller.mode == "command" or moving.all():
+            return None
+        others = np.ones((self.num_agents, self.action_size - moving.shape[1]), bool)
+        return np.concatenate([moving, others], axis=1)
 
     def moving(self, action: jax.Array) -> jax.Array:
         """Returns the part of actions (..., action_size) that moves the robots."""

@@ -58,6 +58,8 @@ class EnvironmentState:
     """Random key."""
     active: Any = dataclasses.field(default=None, kw_only=True)
     """Which agents take part (A,) bool; the others count nowhere. None: all."""
+    used: Any = dataclasses.field(default=None, kw_only=True)
+    """Which entries of each agent's action count (A, D) bool; None: all."""
 
     if not TYPE_CHECKING:
 

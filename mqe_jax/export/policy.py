@@ -14,7 +14,9 @@ Further inputs in `command` control: `gravity` (N, A, 3), the unit gravity vecto
 frame, `joint_position` and `joint_velocity` (N, A, J), rad and rad/s. Recurrent states: those of
 the skill, of the walk policy `walk_history` (N, A, 30, 70), `walk_action`, `walk_previous_action`
 (N, A, J) and `walk_gait` (N, A), and those of the network: `memory` if it is one array, else
-`memory_NAME`.
+`memory_NAME`. Unlike robots have a skill for each kind, whose states have the rows of its robots:
+`walk_0_history` that of robot 0, `walk_1_history` that of robot 1. J is the largest number of
+joints; entries beyond a robot's own mean nothing.
 """
 
 import functools
@@ -23,18 +25,21 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import onnx
 
 import mqe_jax
 from mqe_jax import skills
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import digest
+from mqe_jax.core.types import rows_of
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs.params import weights_digest
 from mqe_jax.export.translate import OPSET, translate
-from mqe_jax.physics.robots.fleet import Fleet
+from mqe_jax.physics.robots.fleet import Fleet, pad
 from mqe_jax.physics.robots.index import Proprioception
-from mqe_jax.skills import Skill
+from mqe_jax.skills.control import Group
 from mqe_jax.train.policy import TrainedPolicy
 
 SENSED = ("gravity", "joint_position", "joint_velocity")
@@ -67,12 +72,14 @@ def to_onnx(policy: TrainedPolicy, env: QuadrupedEnv) -> onnx.ModelProto:
 
 def input_shapes(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of the inputs of `policy_step` by name, without the batch axis."""
-    robots: dict[str, tuple[int, ...]] = {"obs": (policy.needs.dims.observation,)}
+    agents = policy.agents
+    shapes: dict[str, tuple[int, ...]] = {"obs": (agents, policy.needs.dims.observation)}
     if env.control == "command":
-        skill, _ = skill_of(env)
-        memory = name_arrays(skill.name, skill.init_memory())
-        robots |= sensed_shapes(env.robots) | {name: x.shape for name, x in memory.items()}
-    shapes = {name: (policy.agents, *shape) for name, shape in robots.items()}
+        sensed = sensed_shapes(env.robots)
+        shapes |= {name: (agents, *shape) for name, shape in sensed.items()}
+        for prefix, group in skills_of(env, agents).items():
+            memory = name_arrays(prefix, group.skill.init_memory())
+            shapes |= {name: (len(group.robots), *x.shape) for name, x in memory.items()}
     memory = name_arrays("memory", policy.initial_memory())
     return shapes | {name: x.shape for name, x in memory.items()}
 
@@ -100,25 +107,47 @@ def policy_step(
     if env.control == "position":
         target = env.robots.joint_targets(moving, env.params.position_scale)
         return outputs | {"joint_target": target}
-    skill, params = skill_of(env)
     commands = env.controller.skill_commands(moving)
     sensed = Proprioception(*(inputs[name] for name in SENSED))
-    act = jax.vmap(functools.partial(skill.targets, params))
-    target, memory = act(fill_arrays(skill.name, skill.init_memory(), inputs), commands, sensed)
-    outputs |= {"commands": commands, "joint_target": target}
-    return outputs | name_arrays(f"next_{skill.name}", memory)
+    targets = []
+    numbers = []
+    for prefix, group in skills_of(env, policy.agents).items():
+        skill = group.skill
+        rows = rows_of(group.robots)
+        act = jax.vmap(functools.partial(skill.targets, group.params))
+        memory = fill_arrays(prefix, skill.init_memory(), inputs)
+        own = sensed.of(rows, skill.robot.num_joints)
+        target, memory = act(memory, commands[rows] + group.shift, own)
+        targets.append(pad(target, sensed.joint_position.shape[-1]))
+        outputs |= name_arrays(f"next_{prefix}", memory)
+        numbers += group.robots
+    order = rows_of(np.argsort(numbers).tolist())
+    return outputs | {"commands": commands, "joint_target": jnp.concatenate(targets)[order]}
 
 
-def skill_of(env: QuadrupedEnv) -> tuple[Skill, Any]:
-    """Returns the skill of a task's robots for any commands, and its parameters as in the file.
+def skills_of(env: QuadrupedEnv, agents: int) -> dict[str, Group]:
+    """Returns who of the first agents uses which skill, for any commands.
 
-    InputError if the file has changed since the environment read it.
+    They are by the prefix of the skill's recurrent states: its name, with the number of its first
+    robot if robots are unlike. Parameters are as in the files. InputError if a file has changed
+    since the environment read it.
     """
-    skill = skills.make(env.params.skill, env.robots[0])
-    file = env.params.skill_weights
-    if file and digest(file) != env.digests["skill_weights"]:
-        raise InputError(f"skill_weights: {file} has changed since the environment read it")
-    return skill, skill.load_params(env.params.skill_weights)
+    params = env.params
+    if weights_digest(params.skill_weights) != env.digests.get("skill_weights"):
+        raise InputError(
+            f"skill_weights: {params.skill_weights} has changed since the environment read it"
+        )
+    unlike = len({*env.robots[:agents]}) > 1
+    found = {}
+    for group in env.controller.groups:
+        own = tuple(number for number in group.robots if number < agents)
+        if own:
+            robot = group.skill.robot
+            skill = skills.make(params.skill, robot)
+            weights = skill.load_params(params.weights_of(robot))
+            prefix = f"{skill.name}_{own[0]}" if unlike else skill.name
+            found[prefix] = Group(skill, weights, own, group.shift)
+    return found
 
 
 def name_arrays(prefix: str, memory: Any) -> dict[str, Any]:
@@ -150,6 +179,7 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
 def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
     """Returns the metadata of a policy's graph."""
     blocks = env.layouts[policy.needs.group].blocks
+    team = env.robots.kinds if env.robots.alike else env.robots[: policy.agents]
     layout = [[block.name, block.width, block.meaning] for block in blocks]
     return {
         "mqe_jax": mqe_jax.__version__,
@@ -160,9 +190,9 @@ def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
         "period_s": f"{env.dt:g}",
         "group": policy.needs.group,
         "observation": json.dumps(layout),
-        "joints": json.dumps("FL FR RL RR; hip, thigh, calf"),
+        "joints": json.dumps([list(robot.joint_names) for robot in team]),
         "default_joints_rad": json.dumps(
-            [round(float(x), 6) for x in env.robots[0].default_joints]
+            [np.round(robot.default_joints, 6).tolist() for robot in team]
         ),
         "env_steps": str(policy.metadata.get("env_steps", "")),
     }

@@ -37,7 +37,8 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     | `teams`, `commands` | agents of each team; names of the action's commands, in order |
     | `robots` | of each of the R robots, colour and addresses as in `RobotIndex` |
     | `track` | x of its `start`, `length` and `width`, m |
-    | `motors` | of all joints, what `mqe_jax.physics.robots.motors` needs and MJCF lacks |
+    | `motors` | of all joints, what `mqe_jax.physics.robots.motors` needs and MJCF lacks; `runs`
+    have first joint, last joint + 1 and response of consecutive robots of one kind |
     """
     index = env.index
     scene = env.compiled.scene
@@ -45,7 +46,8 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     colors = scene.colors or range(index.num_robots)
     robots = []
     for i, color in zip(range(index.num_robots), colors, strict=True):
-        addresses = {name: getattr(index, name)[i].tolist() for name in tables}
+        rows = {name: getattr(index, name)[i] for name in tables}
+        addresses = {name: row[row >= 0].tolist() for name, row in rows.items()}
         robots.append({**addresses, "color": list(ROBOT_COLORS[color % len(ROBOT_COLORS)][:3])})
     return {
         "task": env.name,
@@ -74,7 +76,7 @@ def _motors(env: QuadrupedEnv) -> dict[str, Any]:
     arrays = ("speed", "torque", "stall")
     return {
         **{name: getattr(table, name).tolist() for name in arrays},
-        "response": table.runs[0].response.tolist(),
+        "runs": [[x.joints.start, x.joints.stop, x.response.tolist()] for x in table.runs],
         "actuator_gain": model.actuator_gainprm[:, 0].tolist(),
         "bias": model.actuator_biasprm[:, :3].tolist(),
         "armature": model.dof_armature[table.joint_qvel].tolist(),

@@ -32,7 +32,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.observation import finite
 from mqe_jax.envs.state import Moment, State
-from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, sensed_shapes, skill_of
+from mqe_jax.export.policy import SENSED, fill_arrays, name_arrays, sensed_shapes, skills_of
 from mqe_jax.export.translate import Function
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.sensors.suite import ONBOARD
@@ -71,6 +71,10 @@ class TaskFunctions:
         if env.varies:
             raise InputError(
                 "fewest_agents, fewest_sheep: not allowed; graphs of tasks need one size"
+            )
+        if not env.robots.alike:
+            raise InputError(
+                f"robots: {env.robots.identity} are not allowed; graphs of tasks need one kind"
             )
         parts = [part.name for part in env.controller.skill.parts]
         if env.controller.npc and env.npc_skill not in parts:
@@ -185,7 +189,8 @@ def state_arrays(state: State) -> dict[str, jax.Array]:
 
 def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     """Returns the skill of a task's robots as a function of one robot, and its inputs' shapes."""
-    skill, params = skill_of(env)
+    ((_, group),) = skills_of(env, env.num_agents).items()
+    skill = group.skill
     memory = name_arrays(skill.name, skill.init_memory())
     shapes = {
         "command": (len(skill.commands),),
@@ -196,7 +201,7 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         sensed = Proprioception(*(inputs[name] for name in SENSED))
         state = fill_arrays(skill.name, skill.init_memory(), inputs)
-        target, state = skill.targets(params, state, inputs["command"], sensed)
+        target, state = skill.targets(group.params, state, inputs["command"], sensed)
         return {"joint_target": target} | name_arrays(f"next_{skill.name}", state)
 
     return act, shapes

@@ -296,5 +296,6 @@ def _prepare(
         old_value=chunks(pair[0], steps),
         active=chunks(active, steps),
         learners=chunks(transitions.active, steps),
+        used=None if transitions.used is None else chunks(transitions.used, steps),
     )
     return batch, value_normalizer, metrics

@@ -22,8 +22,13 @@ def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Arra
 
 
 def entropy(log_std: jax.Array) -> jax.Array:
-    """Returns the entropy of a diagonal Gaussian, nats: (..., D) -> (...)."""
-    return jnp.sum(log_std + 0.5 + _LOG_SQRT_2PI, axis=-1)
+    """Returns the entropy of a diagonal Gaussian in each dimension (..., D), nats."""
+    return log_std + 0.5 + _LOG_SQRT_2PI
+
+
+def where_used(values: jax.Array, used: jax.Array | None) -> jax.Array:
+    """Returns values of the entries of actions (..., D), 0 at those that do not count."""
+    return values if used is None else jnp.where(used, values, 0.0)
 
 
 def clipped_surrogate(

@@ -63,7 +63,7 @@ class ChunkResult(NamedTuple):
     log_prob: jax.Array
     """Log-probabilities of the actions (L, C, A, D)."""
     entropy: jax.Array
-    """Entropies of the policy (L, C, A)."""
+    """Entropies of the actions' entries (L, C, A, D)."""
     value: jax.Array
     """Normalised values (L, C, V)."""
     losses: Mapping[str, jax.Array] = {}

@@ -21,6 +21,7 @@ from mqe_jax.core.types import (
     reset_memory,
 )
 from mqe_jax.train.config import PPO
+from mqe_jax.train.loss import where_used
 from mqe_jax.train.networks import Network
 from mqe_jax.train.normalize import Features, RunningStatistics, running_normalize
 
@@ -90,6 +91,7 @@ def rollout(
         before = state.env_state
         memory = reset_memory(state.memory, state.is_first)
         active = active_of(before)
+        used = getattr(before, "used", None)
         seen = observations(before).group(group)
         with jax.named_scope("policy"):
             obs, privileged = normalize_obs(
@@ -120,12 +122,13 @@ def rollout(
             final_obs=final_observations(after).get(group),
             final_privileged_obs=after.final_privileged_obs,
             action=action,
-            log_prob=log_prob,
+            log_prob=where_used(log_prob, used),
             reward=after.reward,
             active=active,
             terminated=after.terminated,
             done=done,
             teacher_action=label,
+            used=used,
         )
         episode_steps = state.episode_steps + 1
         episode_return = state.episode_return + mean_of_team(after.reward, active)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mqe_jax.core import devices
 from mqe_jax.core.types import Batch, Params, Transition
 from mqe_jax.train.config import TrainConfig
-from mqe_jax.train.loss import RATIOS, clipped_surrogate, gae, value_loss
+from mqe_jax.train.loss import RATIOS, clipped_surrogate, gae, value_loss, where_used
 from mqe_jax.train.networks import Network
 from mqe_jax.train.optim import AdamState, adam
 from mqe_jax.train.rollout import mean_of_team, minibatches, take
@@ -106,9 +106,11 @@ class Stages:
             label = batch.action.at[..., :size].set(batch.teacher_action)
             both = jax.vmap(evaluate)(jnp.stack([batch.action, label]))
             new = jax.tree.map(lambda x: x[0], both)
-            teacher_log_prob = both.log_prob[1, ..., :size]
+            teacher_log_prob = where_used(both.log_prob[1], batch.used)[..., :size]
+        new_log_prob = where_used(new.log_prob, batch.used)
+        entropies = jnp.sum(where_used(new.entropy, batch.used), axis=-1)
         old = jnp.where(learners[..., None], batch.log_prob, 0.0)
-        now_taken = jnp.where(learners[..., None], new.log_prob, 0.0)
+        now_taken = jnp.where(learners[..., None], new_log_prob, 0.0)
         log_ratio = RATIOS[ppo.ratio](now_taken, old)
         surrogate = clipped_surrogate(
             log_ratio, batch.advantage[..., None], ppo.clip, ppo.dual_clip
@@ -118,7 +120,7 @@ class Stages:
             new.value, batch.old_value, batch.target, ppo.value_clip, ppo.huber_delta
         )
         critic_loss = _mean(error, learners)
-        mean_entropy = _mean(new.entropy, learners)
+        mean_entropy = _mean(entropies, learners)
         per_agent = RATIOS["agent"](now_taken, old)[..., 0]
         metrics = {
             "loss/policy": policy_loss,

@@ -65,13 +65,15 @@ class Motors {
       given[i] = result;
     }
     const armature = model.dof_armature;
-    const size = this.response.length;
-    for (let leg = 0; leg < velocity.length; leg += size) this.setArmature(armature, leg, size);
+    for (const [first, last, response] of this.runs) {
+      for (let leg = first; leg < last; leg += response.length) this.setArmature(armature, leg, response);
+    }
   }
 
   /** Sets the armature of the joints of one leg, which begin at `leg`. */
-  setArmature(armature, leg, size) {
-    const { velocity, given, speed, torque, stall, response, timestep, band, slow, fast, reach, gain, steep } = this;
+  setArmature(armature, leg, response) {
+    const size = response.length;
+    const { velocity, given, speed, torque, stall, timestep, band, slow, fast, reach, gain, steep } = this;
     let [fastest, lowest] = [0, Infinity];
     for (let i = leg; i < leg + size; i++) {
       fastest = Math.max(fastest, Math.abs(velocity[i]));

@@ -43,6 +43,7 @@ class BothSides(Wrapper):
             "final_privileged_obs": jax.tree.map(add_side, inner.final_privileged_obs),
             "reward": self._swap(inner.reward),
             "active": jax.tree.map(self._swap, inner.active),
+            "used": jax.tree.map(self._swap, inner.used),
             "groups": jax.tree.map(self._swap, inner.groups),
             "final_groups": jax.tree.map(self._swap, inner.final_groups),
             "outcome": inner.outcome.by_team(lambda x: jnp.where(changed[:, None], x[:, ::-1], x)),
