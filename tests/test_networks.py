@@ -476,7 +476,7 @@ def test_entities_and_images_are_exported(recurrent: bool) -> None:
     statistics = statistics._replace(mean=statistics.mean + 0.3, variance=2.0 * statistics.variance)
     policy = TrainedPolicy(built.policy_params(random_params(built)), statistics, needs, config, {})
     env: Any = SimpleNamespace(
-        name="probe", control="torque", robot=SimpleNamespace(torque_limit=1.0)
+        name="probe", control="torque", robots=SimpleNamespace(table=lambda name: np.ones((2, 1)))
     )
     env.moving = lambda action: action
     assert export_error(policy, env) < 1e-5

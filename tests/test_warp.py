@@ -40,6 +40,11 @@ SCENES: dict[str, tuple[str, str, Mapping[str, Any]]] = {
     "randomized": ("go1gate", "position", {"randomization": RANDOM, "joint_mechanics": True}),
     "torques": ("go1tug", "torque", {"robot": "go2"}),
     "two legs": ("go1plane", "position", {"robot": str(EXAMPLES / "robots" / "biped.xml")}),
+    "unlike robots": (
+        "go1gate",
+        "position",
+        {"robots": ("go1", str(EXAMPLES / "robots" / "biped.xml"))},
+    ),
     "sparse solver": ("go1football-2vs2", "position", {"sparse_solver": True}),
 }
 
