@@ -38,24 +38,29 @@ def _row(row: int, quadratic: int, linear: int, x: float, stiffness: float, loss
 
 
 @wp.func
-def _factor(env: int, thread: int, size: int, h: wp.array3d[float], inverse: wp.array2d[float]):
-    """Factors H, the columns of its lower triangle, in place, and solves L y = g.
+def _column(size: int, j: int):
+    """Returns where column j of a packed lower triangle has its row 0, which is not stored.
 
-    The last row of the columns is g, then y. The diagonal stays; `inverse` is that of the factor's.
-    Threads have consecutive rows, so that a GPU reads them together.
+    Column j stores its rows from j to `size`, the last of which is a vector's entry.
+    """
+    return (j * (2 * size + 1 - j)) // 2
+
+
+@wp.func
+def _factor(env: int, thread: int, size: int, pairs: wp.array[wp.vec2i], h: wp.array2d[float]):
+    """Factors H = L D L^T in place, and solves L z = g.
+
+    The columns' diagonal is D's. Their rows below it are L's times D's entry. The last row is g,
+    then z. Threads have consecutive entries: a GPU reads them together.
     """
     for j in range(size):
-        for i in range(j + thread, size + 1, wp.block_dim()):
-            total = h[env, j, i]
-            for k in range(j):
-                total -= h[env, k, i] * h[env, k, j]
-            h[env, j, i] = total
-        _wait()
-        pivot = 1.0 / wp.sqrt(h[env, j, j])
-        for i in range(j + 1 + thread, size + 1, wp.block_dim()):
-            h[env, j, i] = h[env, j, i] * pivot
-        if thread == 0:
-            inverse[env, j] = pivot
+        own = _column(size, j)
+        scale = 1.0 / h[env, own + j]
+        first = _column(size, j + 1) + j + 1
+        for entry in range(first + thread, pairs.shape[0], wp.block_dim()):
+            pair = pairs[entry]
+            product = h[env, own + pair[0]] * h[env, own + pair[1]]
+            h[env, entry] = h[env, entry] - product * scale
         _wait()
 
 
@@ -72,6 +77,7 @@ def newton(
     counts_linear: wp.array[int],
     counts: wp.array[int],
     capacity: int,
+    pairs: wp.array[wp.vec2i],
     inertia: wp.array2d[float],
     smooth: wp.array2d[float],
     start: wp.array2d[float],
@@ -79,15 +85,17 @@ def newton(
     stiffness: wp.array2d[float],
     target: wp.array2d[float],
     loss: wp.array2d[float],
-    m: wp.array3d[float],
-    h: wp.array3d[float],
-    inverse: wp.array2d[float],
+    m: wp.array2d[float],
+    hessian: wp.array2d[float],
+    h: wp.array2d[float],
     step: wp.array2d[float],
     momentum: wp.array2d[float],
     momentum_step: wp.array2d[float],
     residual: wp.array2d[float],
     residual_step: wp.array2d[float],
     slope: wp.array2d[float],
+    change: wp.array2d[float],
+    picked: wp.array2d[int],
     qacc: wp.array2d[float],
     force: wp.array2d[float],
 ):
@@ -97,23 +105,27 @@ def newton(
     rows = wp.min(counts[env], capacity)
     quadratic = counts_quadratic[env]
     linear = quadratic + counts_linear[env]
+    for entry in range(thread, size * size, threads):
+        m[env, entry] = 0.0
     for i in range(thread, size, threads):
-        for j in range(size):
-            m[env, i, j] = 0.0
         qacc[env, i] = start[env, i]
     _wait()
     for i in range(thread, size, threads):
         for k in range(row_start[i], row_start[i] + row_size[i]):
-            m[env, i, columns[k]] = inertia[env, k]
-            m[env, columns[k], i] = inertia[env, k]
+            m[env, i * size + columns[k]] = inertia[env, k]
+            m[env, columns[k] * size + i] = inertia[env, k]
     _wait()
     trace = wp.float32(0.0)
     for i in range(size):
-        trace += m[env, i, i]
+        trace += m[env, i * size + i]
+    for entry in range(thread, pairs.shape[0], threads):
+        pair = pairs[entry]
+        if pair[1] < size:
+            hessian[env, entry] = m[env, pair[0] * size + pair[1]]
     for i in range(thread, size, threads):
         total = wp.float32(0.0)
         for j in range(size):
-            total += m[env, j, i] * qacc[env, j]
+            total += m[env, j * size + i] * qacc[env, j]
         momentum[env, i] = total
     for row in range(thread, rows, threads):
         total = -target[env, row]
@@ -123,45 +135,59 @@ def newton(
         found = _row(row, quadratic, linear, total, stiffness[env, row], loss[env, row])
         force[env, row] = found[0]
         slope[env, row] = found[1]
+        change[env, row] = found[1]
     _wait()
     tolerance = tolerances[env % tolerances.shape[0]] * trace
     for _ in range(iterations):
+        count = wp.int32(0)
+        for row in range(rows):
+            count += wp.where(change[env, row] != 0.0, 1, 0)
+        for row in range(thread, rows, threads):
+            if change[env, row] != 0.0:
+                place = wp.int32(0)
+                for before in range(row):
+                    place += wp.where(change[env, before] != 0.0, 1, 0)
+                picked[env, place] = row
         for i in range(thread, size, threads):
             total = momentum[env, i] - smooth[env, i]
             for row in range(rows):
                 total -= jacobian[env, row, i] * force[env, row]
-            h[env, i, size] = total
-        for entry in range(thread, size * size, threads):
-            j = entry // size
-            i = entry % size
-            if j <= i:
-                total = m[env, j, i]
-                for row in range(rows):
-                    weight = slope[env, row] * jacobian[env, row, j]
-                    if weight != 0.0:
-                        total += weight * jacobian[env, row, i]
-                h[env, j, i] = total
+            h[env, _column(size, i) + size] = total
         _wait()
-        _factor(env, thread, size, h, inverse)
+        for entry in range(thread, pairs.shape[0], threads):
+            pair = pairs[entry]
+            if pair[1] < size:
+                total = hessian[env, entry]
+                for number in range(count):
+                    row = picked[env, number]
+                    weight = change[env, row] * jacobian[env, row, pair[0]]
+                    total += weight * jacobian[env, row, pair[1]]
+                hessian[env, entry] = total
+                h[env, entry] = total
+        _wait()
+        _factor(env, thread, size, pairs, h)
         decrement = wp.float32(0.0)
         for i in range(size):
-            decrement += h[env, i, size] * h[env, i, size]
+            own = _column(size, i)
+            decrement += h[env, own + size] * h[env, own + size] / h[env, own + i]
         if 0.5 * decrement < tolerance:
             break
         _wait()
         for back in range(size):
             j = size - 1 - back
-            x = h[env, j, size] * inverse[env, j]
+            last = _column(size, j)
+            x = h[env, last + size] / h[env, last + j]
             if thread == 0:
                 step[env, j] = -x
             for i in range(thread, j, threads):
-                h[env, i, size] = h[env, i, size] - h[env, i, j] * x
+                own = _column(size, i)
+                h[env, own + size] = h[env, own + size] - h[env, own + j] * x
             _wait()
         sums = wp.vec2(0.0, 0.0)
         for i in range(thread, size, threads):
             total = wp.float32(0.0)
             for j in range(size):
-                total += m[env, j, i] * step[env, j]
+                total += m[env, j * size + i] * step[env, j]
             momentum_step[env, i] = total
             difference = momentum[env, i] - smooth[env, i]
             sums += step[env, i] * wp.vec2(difference, total)
@@ -170,7 +196,7 @@ def newton(
             for j in range(size):
                 total += jacobian[env, row, j] * step[env, j]
             residual_step[env, row] = total
-        own = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
+        own_slope = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
         length = wp.float32(1.0)
         low = wp.float32(0.0)
         high = wp.float32(-1.0)
@@ -182,7 +208,7 @@ def newton(
                 found = _row(row, quadratic, linear, x, stiffness[env, row], loss[env, row])
                 sums += along * wp.vec2(-found[0], found[1] * along)
             both = wp.tile_reduce(wp.add, wp.tile(sums, preserve_type=True))[0]
-            both += wp.vec2(own[0] + length * own[1], own[1])
+            both += wp.vec2(own_slope[0] + length * own_slope[1], own_slope[1])
             if wp.abs(both[0]) < SLOPE * decrement:
                 break
             if both[0] < 0.0:
@@ -205,6 +231,7 @@ def newton(
             if found[1] == 0.0 and found[0] != force[env, row]:
                 changed += 1.0
             force[env, row] = found[0]
+            change[env, row] = found[1] - slope[env, row]
             slope[env, row] = found[1]
         changes = wp.tile_reduce(wp.add, wp.tile(changed))[0]
         if changes == 0.0:  # the cost was quadratic along the step
@@ -215,9 +242,12 @@ class Solver:
     """The solver's arrays for N environments of `size` degrees of freedom."""
 
     def __init__(self, count: int, size: int, capacity: int) -> None:
-        shapes = scratch(size, capacity)
+        *shapes, picked = scratch(size, capacity)
         self._threads = next((threads for most, threads in THREADS.items() if count <= most), 32)
         self._scratch = [wp.zeros((count, *shape), dtype=float) for shape in shapes]
+        self._scratch.append(wp.zeros((count, *picked), dtype=int))
+        pairs = [(j, i) for j in range(size) for i in range(j, size + 1)]
+        self._pairs = wp.array(pairs, dtype=wp.vec2i)
 
     def launch(self, m: Any, d: Any) -> None:
         """Launches the kernel: accelerations from `qfrc_smooth`, beginning with the last ones."""
@@ -228,6 +258,7 @@ class Solver:
             inputs=[
                 *(m.nv, m.opt.iterations, m.opt.ls_iterations, m.opt.tolerance),
                 *(m.M_rownnz, m.M_rowadr, m.M_colind, d.ne, d.nf, d.nefc, d.njmax),
+                self._pairs,
                 *(d.M, d.qfrc_smooth, d.qacc_warmstart, efc.J, efc.D, efc.aref, efc.frictionloss),
             ],
             outputs=[*self._scratch, d.qacc, efc.force],
@@ -237,5 +268,5 @@ class Solver:
 
 def scratch(size: int, capacity: int) -> list[tuple[int, ...]]:
     """Returns the shapes of the arrays of an environment with up to `capacity` constraints."""
-    vectors = [(size,)] * 4 + [(capacity,)] * 3
-    return [(size, size), (size, size + 1), *vectors]
+    triangle = (size * (size + 3) // 2,)
+    return [(size * size,), *[triangle] * 2, *[(size,)] * 3, *[(capacity,)] * 5]
