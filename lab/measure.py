@@ -7,7 +7,6 @@ arguments, files or another version is made again. Parts without `measure` are t
 """
 
 import argparse
-import dataclasses
 import glob
 import inspect
 import json
@@ -23,11 +22,9 @@ from mqe_jax.core.files import lock, parsing, read_json, write_atomically
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import FrozenMapping, build, fail, settings_class
 from mqe_jax.envs.registry import task_id
-from mqe_jax.names import find
 from mqe_jax.study.provenance import provenance
 from mqe_jax.study.runs import PLAIN, table
 from mqe_jax.study.sweep import check_variants, for_task, match_names, read_part
-from mqe_jax.train.policy import TrainedPolicy
 
 MEASURES = {
     "evaluate": "mqe_jax.runs.playing:evaluate",
@@ -162,9 +159,7 @@ def measure(
             continue
         try:
             with lock(item.file.parent):
-                result = pkgutil.resolve_name(MEASURES[part.measure])(
-                    item.task, **_for_robot(item.task, item.arguments)
-                )
+                result = pkgutil.resolve_name(MEASURES[part.measure])(item.task, **item.arguments)
                 plain = result if isinstance(result, dict) else result.to_dict()
                 content = {**item.provenance, "result": plain}
                 write_atomically(item.file, json.dumps(content, indent=1).encode())
@@ -176,23 +171,6 @@ def measure(
     if rows:
         write_atomically(folder / RATES, table(rows).encode())
     return [item for item in chosen if item.result() is None]
-
-
-def _for_robot(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Returns arguments whose policies act on the robot that `env` names, whichever they were
-    trained on.
-    """
-    robot = arguments.get("env", {}).get("robot")
-    if robot is None:
-        return arguments
-    changed = dict(arguments)
-    for name in {"policy", "opponent"} & arguments.keys():
-        policy = find(arguments[name], task)
-        if isinstance(policy, TrainedPolicy):  # others fit every robot
-            changed[name] = dataclasses.replace(
-                policy, needs=dataclasses.replace(policy.needs, robot=robot)
-            )
-    return changed
 
 
 def _rates(item: Item) -> list[dict[str, Any]]:

@@ -233,10 +233,10 @@ def table(
 
     With `sensors`, robots that have none get the sensors of the set `onboard`.
 
-    A run brings its own task, parameters and policy. Without a policy and parameters, a task has
-    its shipped policy, on both sides of a match. Otherwise it has its scripted one, or `forward`,
-    or `random` if actions are not commands. A task by its id has the parameters that trained
-    policies need, such as their skill.
+    A run brings its own task, parameters and policy. Without a policy and parameters other than
+    sensors and a robot, a task has its shipped policy, on both sides of a match. Otherwise it has
+    its scripted one, or `forward`, or `random` if actions are not commands. A task by its id has
+    the parameters that trained policies need, such as their skill.
     """
     read = {} if read is None else read
     name, own, run = target(task, read)
@@ -333,7 +333,7 @@ def imports_of(policy: TrainedPolicy | None, run: str) -> Iterator[None]:
 
 def _usual_policy(name: str, params: Params) -> str:
     """Returns the policy that a task has by default."""
-    if name in zoo.names() and not {*params} - {"senses"}:
+    if name in zoo.names() and not {*params} - {"senses", "robot", "skill_weights"}:
         return name
     if params.get("control", "command") != "command":
         return "random"

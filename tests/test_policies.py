@@ -109,7 +109,8 @@ def acting(target: str, **options: Any) -> list[Any]:
 def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() -> None:
     assert isinstance(acting("go1gate")[0], Actor)
     assert isinstance(acting("go1gate", policy="scripted")[0], SimplePolicy)
-    assert isinstance(acting("go1gate", robot="go2")[0], SimplePolicy)  # trained on the Go1
+    with pytest.warns(UserWarning, match="trained in go1gate on the robot go1, it acts on go2"):
+        assert isinstance(acting("go1gate", robot="go2")[0], Actor)
     assert isinstance(acting("go1gate", set=["gate_width=0.8"])[0], SimplePolicy)
     assert isinstance(acting("go1plane")[0], SimplePolicy)  # none is shipped
     (joints,) = acting("go1gate", control="position")

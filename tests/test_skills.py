@@ -210,10 +210,10 @@ def test_ranges_beyond_training_warn(skill: Any, ranges: Any, said: str) -> None
             {"commands": ("yaw_rate", "vy", "vx")},
             r"commands \('vx', 'vy', .* has \('yaw_rate', 'vy', 'vx'\)",
         ),
-        ({"robot": "go2"}, "robot 'go1'; .* has 'go2'"),
         ({"control": "position"}, "control 'command'; .* has 'position'"),
         ({"skill": "agile"}, "skill 'walk'; .* has 'agile'"),
-        ({"skill": ("walk", "agile"), "robot": "go2"}, "robot 'go1'"),
+        ({"robot": "go2", "gait": "pace"}, "gait 'trot'; .* has 'pace'"),
+        ({"robot": "go2", "control": "position"}, "robot 'go1'; .* has 'go2'"),
         (
             {"skill": ("walk", "agile"), "command_ranges": {"vx": (-0.5, 0.5)}},
             r"skill 'walk'; .* has \('walk', 'agile'\)",
@@ -244,6 +244,15 @@ def test_policies_of_other_needs_are_refused(
     policy = dataclasses.replace(policy, needs=dataclasses.replace(policy.needs, **own))
     for source in (policy, *([] if own else ["population/1/late", str(WALKING)])):
         refuses(rf"{field}: .* needs {said}", names.seat, source, env, field)
+
+
+@pytest.mark.parametrize("skill", ["walk", ("walk", "agile")])
+def test_a_team_that_commands_a_skill_acts_on_another_robot_with_a_line(skill: Any) -> None:
+    env = make("go1football-1vs1", impl="c", num_envs=1, robot="go2", skill=skill)
+    policy = load_policy(WALKING)
+    assert policy.needs.robot == "go1"
+    with pytest.warns(UserWarning, match="on the robot go1, it acts on go2"):
+        names.seat(policy, env, "policy")
 
 
 def test_a_policy_needs_the_contents_of_its_skill_weights(weights: str, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mqe_jax.core.blocks import Block, entities
+from mqe_jax.core.errors import warn
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.settings import (
     FrozenMapping,
@@ -133,8 +134,17 @@ def needs_of(env: Any, config: TrainConfig) -> Needs:
 
 
 def unmet(needs: Needs, env: Any, config: TrainConfig) -> dict[str, tuple[Any, Any]]:
-    """Returns which needs of a policy an environment does not meet: both values, by name."""
+    """Returns which needs of a policy an environment does not meet: both values, by name.
+
+    A policy that commands a skill also acts on other robots with this skill, with a warning.
+    """
     groups = group_sizes(env)
     if needs.group not in groups:
         return {"group": (needs.group, ", ".join(sorted(groups)))}
-    return needs.mismatches(needs_of(env, config))
+    differing = needs.mismatches(needs_of(env, config))
+    if "robot" in differing and needs.control == "command" and "control" not in differing:
+        trained, found = differing.pop("robot")
+        differing.pop("skill_weights", None)
+        if not differing:
+            warn(f"policy: trained in {needs.task} on the robot {trained}, it acts on {found}")
+    return differing
