@@ -289,6 +289,10 @@ BAD = {
         ["skill", "evl"],
         ["'skill evl' (did you mean 'skill eval'?); allowed: skill train"],
     ),
+    "weights of some robots": (
+        ["skill", "eval", "walk", "--robot", "go1", "--robot", "go2", "--weights", "own"],
+        ["weights: ['own']", "one for each of the 2 robots"],
+    ),
     "task": (["eval", "go1gat"], ["'go1gat'", "did you mean 'go1gate'"]),
     "engine": (["bench", "go1gate", "--impl", "wrap"], ["'wrap'", "'warp'"]),
     "no GPU": (["bench", "go1gate", "--impl", "warp"], ["'warp'", "NVIDIA GPU", "cpu"]),

@@ -566,6 +566,25 @@ def test_the_training_of_a_skill_knows_how_the_robots_joints_mirror(
 
 PAGE = Path(__file__).parents[1] / "docs" / "robot_files.md"
 SMALL = "--impl c --num-envs 4 --total-steps 96 --ppo.minibatches 1 --ppo.epochs 1".split()
+
+
+def test_a_skill_of_several_robots_is_one_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fake(skill: str, weights: str | None, *, robot: str, **_: Any) -> dict[str, Any]:
+        errors = {"rms_vx": 0.2 if weights else 0.1, "rms_vy": 0.05, "rms_yaw": 0.25}
+        half = {"vx": 2.0, "vy": 1.0, "yaw": 2.5}
+        scenarios = {"flat": {**errors, "fall_rate": 0.01}}
+        return {"robot": robot, "half_range": half, "scenarios": scenarios}
+
+    monkeypatch.setattr("mqe_jax.walk.evaluation.evaluate_skill", fake)
+    arguments = ["skill", "eval", "agile", "--robot", "go1", "--robot", DOG]
+    assert cli.main([*arguments, "--weights", "shipped", "--weights", "own.safetensors"]) == 0
+    _, go1, own = capsys.readouterr().out.splitlines()
+    assert go1.split() == "go1 flat 0.100 (5%) 0.050 (5%) 0.250 (10%) 1.0%".split()
+    assert own.split()[1:4] == ["flat", "0.200", "(10%)"]
+
+
 FEW: dict[str, list[str]] = {
     "tasks": ["--impl", "c"],
     "skill train": [*SMALL, "--rollout-steps", "12", "--network.chunk-length", "6"],

@@ -296,11 +296,12 @@ def evaluate_skill(
         report: receives the name and the metrics of each scenario.
 
     Returns:
-        rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, and all metrics of each scenario under
-        `scenarios`.
+        rms_vx, rms_vy, rms_yaw and fall_rate of `flat`, all metrics of each scenario under
+        `scenarios`, and half of the range of each command of the velocity under `half_range`.
     """
     body = robots.get(robot)
-    params = trainees.make(skill, body).skill.load_params(weights)
+    trainee = trainees.make(skill, body)
+    params = trainee.skill.load_params(weights)
     known = [name for name, scenario in SCENARIOS.items() if skill in scenario.skills]
     names = known if scenarios is None else list(scenarios)
     for name in names:
@@ -311,6 +312,7 @@ def evaluate_skill(
         results[name] = measure(env, params, SCENARIOS[name], episodes, seed)
         if report is not None:
             report(name, results[name])
+    half = np.ptp(trainee.evaluation_range, axis=1) / 2
     flat = results.get("flat", {})
     keys = ("rms_vx", "rms_vy", "rms_yaw", "fall_rate")
     return {
@@ -319,5 +321,6 @@ def evaluate_skill(
         "impl": env.impl,
         "episodes": episodes,
         **{key: flat[key] for key in keys if key in flat},
+        "half_range": dict(zip(_AXES, half.tolist(), strict=True)),
         "scenarios": results,
     }

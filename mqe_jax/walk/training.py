@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from mqe_jax.core.errors import warn
 from mqe_jax.core.settings import checked, fail, override, to_mapping
 from mqe_jax.envs.autoreset import VectorEnv
 from mqe_jax.physics import robots
@@ -131,7 +132,8 @@ def train_skill(
     if weights is not None:
         network.form.networks.load(body, weights)
         config = override(config, {"network.weights": str(Path(weights).resolve())})
-    if not np.array_equal(body.mirror.source, MIRROR.source):  # left and right differ
+    if not np.array_equal(body.mirror.source, MIRROR.source):
+        warn("network.symmetry_coef: it is 0, since left and right legs of the robot differ")
         config = override(config, {"network.symmetry_coef": 0.0})
     elif not np.array_equal(body.mirror.sign, MIRROR.sign):
         signs = [int(sign) for sign in body.mirror.sign]
