@@ -23,14 +23,16 @@ from mqe_jax.cli.skill_train import parse_skill_train
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.errors import InputError, NonFiniteError
 from mqe_jax.core.settings import override
-from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.envs.replay import load_recording
 from mqe_jax.runs import learning
+from mqe_jax.runs.divergence import Guard
 from mqe_jax.train.checkpoint import checkpoint_step
 from mqe_jax.viz import recording, render
 from mqe_jax.walk.training import SETTINGS
 from tests import fake_env
 from tests.fake_env import SMALL, FakeEnv
+from tests.states import made
 
 pytestmark = pytest.mark.usefixtures("fake_tasks", "shared_programs")
 
@@ -109,6 +111,15 @@ def test_a_divergence_in_training_is_recorded(mqe: Any, monkeypatch: Any) -> Non
         recording = load_recording(Path("dump", file))
         assert recording.task == "go1revolvingdoor" and recording.states["step"].tolist() == [0, 1]
         assert recording.actions.shape == (2, 2, 12)
+
+
+def test_a_task_without_objects_is_recorded_until_it_diverges(tmp_path: Path) -> None:
+    """Its arrays of objects are empty."""
+    guard = Guard(VectorEnv(made("go1plane"), 4), tmp_path)
+    fine = np.zeros(4)
+    before = {"data": {"qpos": np.zeros((4, 7)), "mocap": np.zeros((4, 0, 3))}}
+    assert np.all(guard._see(fine, before, np.zeros((4, 2, 12)), fine) == 0)
+    assert guard.written == []
 
 
 def test_bench_prints_its_figures(monkeypatch: pytest.MonkeyPatch, mqe: Any) -> None:

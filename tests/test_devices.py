@@ -312,7 +312,13 @@ def kinds(tree: Any) -> list[tuple[Any, ...]]:
     return [(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(tree)]
 
 
-@pytest.mark.parametrize("task", TASKS)
+LOOPED = ("go1plane", "go1sheep-hard", "go1football-defender")  # the others are like these
+
+
+@pytest.mark.parametrize(
+    "task",
+    [pytest.param(task, marks=() if task in LOOPED else pytest.mark.soak) for task in TASKS],
+)
 def test_the_loops_of_jax_step_every_task(task: str) -> None:
     with jax.enable_x64(False):
         env = make(
@@ -440,6 +446,7 @@ def test_typed_keys_are_saved(tmp_path: Path) -> None:
         assert loaded[name].dtype == key.dtype and (jnp.asarray(loaded[name] == key)).all()
 
 
+@pytest.mark.soak
 def test_a_training_resumes_with_its_own_generator(tmp_path: Path) -> None:
     config = settings(network__recurrent=False)
     states = []

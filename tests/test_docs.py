@@ -182,7 +182,15 @@ def small(shared_programs: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("page", [name for name in NAMES if blocks(read(name), "python")])
+@pytest.mark.parametrize(
+    "page",
+    [
+        # whose task is an example that other tests train and play
+        pytest.param(name, marks=pytest.mark.soak if name == "docs/new_match.md" else ())
+        for name in NAMES
+        if blocks(read(name), "python")
+    ],
+)
 def test_python_blocks_run(page: str, monkeypatch: pytest.MonkeyPatch) -> None:
     namespace: dict[str, Any] = {"__name__": "__main__"}
     tasks = {*TASKS}
@@ -229,6 +237,9 @@ LONG: dict[str, dict[str, Any]] = {
 }
 SLOW = (
     "runs/exploiting",
+    "runs/playing",
+    "runs/stress",
+    "runs/throughput",
     "walk/training",
     "walk/evaluation",
     "export/robot_team",
@@ -346,6 +357,7 @@ def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
         check_commands(text)
 
 
+@pytest.mark.soak  # as `make docs` does
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs")
     pytest.importorskip("mkdocstrings")
@@ -399,7 +411,11 @@ def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: A
 
 
 @pytest.mark.parametrize(
-    "network", [{}, {"network": {"name": "mean_field", "width": 32}}], ids=["shipped", "own"]
+    "network",
+    [
+        pytest.param({}, id="shipped", marks=pytest.mark.soak),
+        pytest.param({"network": {"name": "mean_field", "width": 32}}, id="own"),
+    ],
 )
 def test_an_environment_of_ones_own_is_trained(network: dict[str, Any]) -> None:
     runpy.run_path(str(EXAMPLES / "custom_network.py"))
@@ -410,6 +426,7 @@ def test_an_environment_of_ones_own_is_trained(network: dict[str, Any]) -> None:
     assert len(history) == 25 and history[-1] < 0.6 * history[0]
 
 
+@pytest.mark.soak
 def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:
     example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "own_loop.py"))
     few = {
@@ -431,6 +448,7 @@ def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:
     )
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("small")
 def test_a_policy_is_cloned_from_a_data_set(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("minari")
@@ -496,15 +514,9 @@ def check(outputs: list[dict[str, Any]], name: str) -> None:
         assert any("image/png" in data for data in outputs)
 
 
-# The others do what the quickstart, the README and the example task do, at length.
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, marks=() if path.stem == "quickstart" else pytest.mark.soak)
-        for path in NOTEBOOKS
-    ],
-    ids=lambda path: path.stem,
-)
+# They do what the README and the example task do.
+@pytest.mark.soak
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run_at_small_size(
     path: Path, tmp_path: Path, monkeypatch: Any, request: Any
 ) -> None:

@@ -135,8 +135,10 @@ def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() 
             "torque",
             {"recurrent": True, "activation": "tanh", "gru_size": 24, "openrl_layers": True},
         ),
-        # agents act one after another
-        ("go1gate", "torque", {"name": "mat", "heads": 2, "blocks": 2}),
+        # agents act one after another, also below
+        pytest.param(
+            *("go1gate", "torque", {"name": "mat", "heads": 2, "blocks": 2}), marks=pytest.mark.soak
+        ),
     ],
 )
 def test_networks_memories_and_controls_agree(
@@ -362,6 +364,7 @@ def test_a_team_of_processes_acts_as_the_policy(
     assert len(compared.differences) == 3 and max(compared.differences) < 1e-5
 
 
+@pytest.mark.soak
 def test_an_evaluation_with_processes_gives_what_the_policy_reaches(files: Any, mqe: Any) -> None:
     words = f"eval {files['run']} --episodes 4 --num-envs 2 --impl c --json"
     expected = json.loads(mqe(f"{words} --deterministic").out)

@@ -109,12 +109,13 @@ def recorder() -> Iterator[Recorder]:
 
 def two_steps(batch: Any, agents: int, *leading: int) -> Callable[[jax.Array], Any]:
     action = jnp.zeros((*leading, agents, batch.action_size))
+    step = jax.jit(batch.step)  # traced once
 
     def program(key: jax.Array) -> Any:
         state = batch.reset(key)
         if leading:
             state = replace_fields(state, assistance=jnp.ones(2))
-        return batch.step(batch.step(state, action), action)
+        return step(step(state, action), action)
 
     return program
 

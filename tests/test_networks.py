@@ -73,6 +73,7 @@ def test_only_the_joint_ratio_cooperates_for_a_public_good(
     assert reward >= 0.45 if cooperates else reward <= -0.45
 
 
+@pytest.mark.soak
 def test_acting_one_after_the_other_halves_the_loss_of_a_meeting() -> None:
     log_std = -1.2
     fixed = {"network": {"log_std_init": log_std, "log_std_min": log_std, "log_std_max": log_std}}

@@ -91,7 +91,13 @@ CALLS: dict[str, Callable[[Own], float]] = {
 }
 
 
-@pytest.mark.parametrize("call", CALLS)
+# whose learner is that of `learn`
+LONG = "make_learner"
+
+
+@pytest.mark.parametrize(
+    "call", [pytest.param(call, marks=pytest.mark.soak if call == LONG else ()) for call in CALLS]
+)
 def test_it_plays_and_learns_as_it_is(call: str, own: Own) -> None:
     assert CALLS[call](own) == pytest.approx(REWARD, abs=1.0)
 
@@ -128,8 +134,19 @@ def jaxmarl(its: Any, *task: Any, **settings: Any) -> float:
     return float(rewards["robot_0"])
 
 
-@pytest.mark.parametrize("opponent", [None, "idle"])
-@pytest.mark.parametrize("step", [gymnasium, vector, pettingzoo, brax, jaxmarl])
+STEPS = (gymnasium, vector, pettingzoo, brax, jaxmarl)
+
+
+@pytest.mark.parametrize(
+    ("step", "opponent"),
+    [
+        *((step, "idle") for step in STEPS),
+        *(
+            pytest.param(step, None, marks=() if step is gymnasium else pytest.mark.soak)
+            for step in STEPS
+        ),
+    ],
+)
 def test_it_is_what_adapters_step(step: Any, opponent: str | None, own: Own) -> None:
     """After another one of its class, which differs in the attribute."""
     library = str({vector: "gymnasium"}.get(step, step.__name__))
@@ -141,6 +158,7 @@ def test_it_is_what_adapters_step(step: Any, opponent: str | None, own: Own) -> 
     assert step(its, own, opponent=opponent) == pytest.approx(REWARD, abs=1.0)
 
 
+@pytest.mark.soak
 def test_it_is_exploited(own: Own, tmp_path: Path) -> None:
     settings = "\n".join(f"{name}: {value}" for name, value in TINY.items() if name != "config")
     config = tmp_path / "tiny.yaml"

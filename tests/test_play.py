@@ -278,6 +278,7 @@ def page(built: SimpleNamespace) -> Path:
     return built.folder
 
 
+@pytest.mark.soak
 def test_the_page_in_webassembly_agrees_with_the_environment(
     page: Path, built: SimpleNamespace
 ) -> None:

@@ -142,6 +142,7 @@ def test_a_robot_of_two_legs_stands_beside_another() -> None:
         make("go1plane", impl="c", robot=BIPED)
 
 
+@pytest.mark.soak
 def test_engines_agree_on_a_robot_of_two_legs() -> None:
     states = []
     for impl in ("c", "jax"):

@@ -99,10 +99,10 @@ class Guard(Outer):
 
         It writes a recording of each environment that diverged in the step.
         """
-        lead = np.shape(diverged)
+        diverged = np.asarray(diverged)
 
         def join(x):
-            return np.array(x).reshape(-1, *np.shape(x)[len(lead) :])
+            return np.array(x).reshape(diverged.size, *np.shape(x)[diverged.ndim :])
 
         self._steps.append((jax.tree.map(join, before), join(action)))
         for index in np.flatnonzero(np.ravel(diverged))[: self._limit - len(self.written)]:
