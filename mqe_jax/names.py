@@ -116,10 +116,11 @@ def _find(name: str, task: str, field: str) -> Found:
     )
 
 
-def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
+def parameters_of(task: str, found: Iterable[Found], *, scaled: bool = False) -> dict[str, Any]:
     """Returns the parameters that policies need and that differ from a task's defaults.
 
-    They include the control mode. Only trained policies of the task and the scripted member of a
+    They include the control mode, and command ranges if `scaled`: a robot's size may change the
+    defaults. Only trained policies of the task and the scripted member of a
     population need any. Trained policies need their sensors as well; the scripted member acts with
     the task's default skill. Policies of different skills get parameters with which they can meet.
     """
@@ -131,7 +132,11 @@ def parameters_of(task: str, found: Iterable[Found]) -> dict[str, Any]:
         needs = policy.needs
         usual = TASKS[task].Params().actions(needs.control or "") | {"control": "command"}
         own = {name: getattr(needs, name) for name in usual}
-        own = {name: value for name, value in own.items() if value != usual[name]}
+        own = {
+            name: value
+            for name, value in own.items()
+            if value != usual[name] or (scaled and name == "command_ranges")
+        }
         if needs.senses:
             own["senses"] = needs.senses
         if "robot" in own:
@@ -252,7 +257,8 @@ def table(
         policies.append(find(opponent, name, field="opponent", read=read))
     place = task if isinstance(task, QuadrupedEnv) else name
     if isinstance(place, str):
-        given = merge(merge(params, parameters_of(name, policies)), given)
+        needed = parameters_of(name, policies, scaled="robot" in given)
+        given = merge(merge(params, needed), given)
     if sensors and not sensors_of({**params, **given}.get("senses", ())):
         given["senses"] = ONBOARD
     with imports_of(read.get(run or ""), run or ""):

@@ -21,6 +21,7 @@ from mqe_jax.core.errors import InputError
 from mqe_jax.core.settings import override
 from mqe_jax.envs import make
 from mqe_jax.export.scene import scene_settings, scene_xml
+from mqe_jax.names import load_policy, table
 from mqe_jax.physics import robots
 from mqe_jax.physics.robots.build import build_robot
 from mqe_jax.physics.robots.index import Proprioception, RobotState
@@ -35,6 +36,7 @@ from mqe_jax.walk_policy import WalkPolicy
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "robots"
 DOG = str(EXAMPLES / "dog.xml")
+ASSETS = Path(mqe_jax.__file__).parent / "assets"
 BIPED = str(EXAMPLES / "biped.xml")
 
 
@@ -567,6 +569,17 @@ def test_the_training_of_a_skill_knows_how_the_robots_joints_mirror(
 
 PAGE = Path(__file__).parents[1] / "docs" / "robot_files.md"
 SMALL = "--impl c --num-envs 4 --total-steps 96 --ppo.minibatches 1 --ppo.epochs 1".split()
+
+
+def test_a_team_keeps_its_command_ranges_on_a_smaller_robot(tmp_path: Path) -> None:
+    small = written(tmp_path, dog(), "speed: 20\nstand_height: 0.2")
+    params = {"robot": small.source, "skill_weights": ASSETS / "agile_go1.safetensors"}
+    with pytest.warns(UserWarning, match="on the robot go1, it acts on own"):
+        env = table("go1seesaw", env={**params}, impl="c").env
+    own = env.params.actions("command")["command_ranges"]
+    assert own == load_policy("go1seesaw").needs.command_ranges
+    usual = make("go1seesaw", skill="agile", gait=None, **params, impl="c").params
+    assert usual.actions("command")["command_ranges"]["vx"][1] < own["vx"][1]
 
 
 def test_a_skill_of_several_robots_is_one_table(
