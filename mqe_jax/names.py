@@ -152,10 +152,15 @@ def parameters_of(task: str, found: Iterable[Found], *, scaled: bool = False) ->
 
 
 def _robots_of(policy: TrainedPolicy, needed: str) -> dict[str, Any]:
-    """Returns the parameter that names a policy's robots; the training's settings name files."""
+    """Returns the parameter that names a policy's robots.
+
+    The training's settings name files; without them the parameter is left out.
+    """
     unlike = needed.split(", ")
     name, value = ("robots", unlike) if len(unlike) > 1 else ("robot", needed)
-    return {name: policy.config.env.get(name, value) if "@" in needed else value}
+    if "@" not in needed:
+        return {name: value}
+    return {name: policy.config.env[name]} if name in policy.config.env else {}
 
 
 def environment(

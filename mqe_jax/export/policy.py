@@ -179,7 +179,11 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
 def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
     """Returns the metadata of a policy's graph."""
     blocks = env.layouts[policy.needs.group].blocks
-    team = env.robots.kinds if env.robots.alike else env.robots[: policy.agents]
+    team = env.robots[: policy.agents]
+
+    def of_robots(rows: list[Any]) -> str:
+        return json.dumps(rows if len({*team}) > 1 else rows[0])
+
     layout = [[block.name, block.width, block.meaning] for block in blocks]
     return {
         "mqe_jax": mqe_jax.__version__,
@@ -190,8 +194,8 @@ def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
         "period_s": f"{env.dt:g}",
         "group": policy.needs.group,
         "observation": json.dumps(layout),
-        "joints": json.dumps([list(robot.joint_names) for robot in team]),
-        "default_joints_rad": json.dumps(
+        "joints": of_robots([list(robot.joint_names) for robot in team]),
+        "default_joints_rad": of_robots(
             [np.round(robot.default_joints, 6).tolist() for robot in team]
         ),
         "env_steps": str(policy.metadata.get("env_steps", "")),
