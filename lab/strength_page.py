@@ -161,8 +161,8 @@ def population(found: Rates) -> str:
 
 
 def exploitability() -> str:
-    """Returns the table of the largest lead of the best responses to each shipped team, and to a
-    mixture if any.
+    """Returns the table of the largest lead of the best responses to each team of version 0.3.0,
+    and to a mixture if any.
     """
     body = []
     oracles = published("oracle")
@@ -175,7 +175,8 @@ def exploitability() -> str:
         if len(last["weights"]) > 1:
             leads[1] = Rate(**last["exploitability_lower_bound"]).percent
         body.append([f"`{task}`", *leads])
-    return table(("match", "lead over the shipped team, points", "over the mixture, points"), body)
+    head = ("match", "lead over the team of 0.3.0, points", "over the mixture, points")
+    return table(head, body)
 
 
 def robustness(found: Rates, former: Rates) -> str:
