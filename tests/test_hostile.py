@@ -116,7 +116,8 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
         for name in ("impl", "control", "robot")
     ),
     ("num_envs: ", lambda x, v: make("go1gate", num_envs=v), (NAN, 1.5, 0, True, 10**9, None, [])),
-    ("skill_weights: ", lambda x, v: make("go1gate", skill_weights=v), ("a\0b", "", "x" * 300)),
+    ("robots: ", lambda x, v: make("go1gate", robots=v), (3, "go1", None, ["go1"] * 3)),
+    ("skill_weights: ", lambda x, v: make("go1gate", skill_weights=v), ("a\0b", "", "x" * 300, 5)),
     ("num_envs: ", lambda x, v: VectorEnv(x["task"], v), (0, NAN, 1.5, 10**9, "x")),
     ("copies: ", lambda x, v: VectorEnv(x["task"], 2, v), (0, NAN, -1)),
     ("num_envs: ", lambda x, v: VectorEnv(x["task"], 2**17, 2), (None,)),

@@ -535,7 +535,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         What is above the ground is in proportion to how high a robot stands.
         """
         stands = np.array([robot.proportions.height for robot in self.robots])
-        if self.robots.alike or np.ptp(stands) == 0.0:
+        if np.ptp(stands) == 0.0:
             return height
         ground = self.params.ground
         own = ground + (height - ground) * (stands / stands.max()).astype(np.float32)

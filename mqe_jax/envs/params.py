@@ -1,9 +1,10 @@
 """Parameters common to all tasks."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
+import pydantic
 
 from mqe_jax import skills, walk_policy  # noqa: F401  (skills register themselves)
 from mqe_jax.core.files import digest
@@ -39,6 +40,16 @@ from mqe_jax.physics.robots.robot import Proportions, Robot
 from mqe_jax.sensors.suite import Senses
 from mqe_jax.skills import agile  # noqa: F401  (skills register themselves)
 from mqe_jax.skills.control import Commander
+
+
+def _check_files(value: Any) -> Any:
+    several = isinstance(value, list | tuple)
+    return check("skill_weights", value, tuple[_File, ...] if several else _File)
+
+
+_File = FileName | None
+Weights = Annotated[_File | tuple[_File, ...], pydantic.PlainValidator(_check_files)]
+"""A weights file or none, or several."""
 
 
 @settings_class
@@ -94,7 +105,7 @@ class TaskParams:
     skill: str | tuple[str, ...] = "walk"
     """Skill of the agents with control `command` (`mqe_jax.skills`). With several, a further action
     entry chooses one (`mqe_jax.skills.choice`)."""
-    skill_weights: FileName | tuple[FileName | None, ...] | None = None
+    skill_weights: Weights = None
     """Weights file of the skill; the shipped one if None. With `robots`, one for each of them."""
     gait: str | None = None
     """Name of default commands of the skill. The walk policy has trot, pronk, bound and pace; None:
