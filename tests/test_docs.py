@@ -236,6 +236,10 @@ LONG: dict[str, dict[str, Any]] = {
     "evaluate_skill": {"episodes": 4},
 }
 SLOW = (
+    "acting/evaluate",
+    "acting/seats",
+    "sensors/scene",
+    "viz/recording",
     "runs/exploiting",
     "runs/playing",
     "runs/stress",

@@ -543,7 +543,8 @@ def test_a_tournament_meets_every_pair_on_both_sides(
         "random",
     ]
     monkeypatch.setattr(playing, "reference_opponents", lambda env: ["scripted", "idle"])
-    words = "tournament go1revolvingdoor forward --impl c --set line_x=0.8 --episodes 4 -o"
+    few = "--set line_x=0.8 --set episode_length=6 --episodes 4"
+    words = f"tournament go1revolvingdoor forward --impl c {few} -o"
     result = json.loads(mqe(words, tmp_path, "--json").out)
     assert result["policies"] == ["forward", "scripted", "idle"]
     won = np.array(result["results"])[..., 0]

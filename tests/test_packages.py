@@ -54,7 +54,7 @@ def forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
 
 
 def test_a_run_asks_for_the_import_of_its_task(forget: Any, mqe: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(train, "_EPISODES", 4)
+    monkeypatch.setattr(train, "_reached", lambda *_: "nothing")
     said = mqe(f"--import race.py train race {FEW}").err
     assert "evaluate it with: mqe eval runs/race --import race.py\n" in said
     onnx = "export runs/race --onnx a.onnx"
