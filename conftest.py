@@ -40,7 +40,7 @@ def pytest_configure(config: pytest.Config) -> None:
     precedence.
     """
     # tracing makes objects that stay: looking for garbage takes a third of its time
-    gc.set_threshold(50_000, 20, 50)
+    gc.set_threshold(200_000, 20, 50)
     given = os.environ.get("XLA_FLAGS", "")
     if (
         os.environ["JAX_PLATFORMS"] == "cpu"
