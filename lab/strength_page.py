@@ -33,7 +33,7 @@ SECTIONS = {
     "population.md": ("population",),
     "exploitability.md": ("exploitability",),
     "robustness.md": ("robustness",),
-    "mates.md": ("mates",),
+    "../comparing.md": ("mates",),
     "skills.md": ("walk",),
 }
 """Filled sections of each page."""
@@ -239,12 +239,6 @@ def mates(task: str) -> dict[str, Rate]:
     return {name: Rate(*map(float, mean)) for name, mean in found.items()}
 
 
-def drawn_mates(task: str) -> dict[str, tuple[Rate]]:
-    """Returns the means over mixed teams that are drawn, by label."""
-    labels = {"same": "own mate", "cross": "other seed", "scripted": "scripted", "idle": "idle"}
-    return {label: (mates(task)[name],) for name, label in labels.items()}
-
-
 def mixed() -> str:
     """Returns the table of mixed teams."""
     body = []
@@ -268,9 +262,9 @@ def draw_rates(groups: Mapping[str, Mapping[str, Sequence[Rate]]], label: str) -
         lowest.tick_params(axis="x", labelbottom=True)
     for each, (title, values) in zip(axes.ravel(), groups.items(), strict=False):
         for i, pair in enumerate(values.values()):
-            each.barh(i, 100 * (len(pair) > 1), height=0.62, color=GREY)
+            each.barh(i, 100, height=0.62, color=GREY)
             for value, start, way, color in zip(
-                pair, (0, 100), (100, -100), (BLUE, RED), strict=False
+                pair, (0, 100), (100, -100), (BLUE, RED), strict=True
             ):
                 each.barh(i, way * value.value, left=start, height=0.62, color=color)
                 ends = [start + way * bound for bound in (value.low, value.high)]
@@ -360,7 +354,6 @@ def pictures() -> dict[str, bytes]:
     return {
         "strength.png": draw_rates(teams, label),
         "population.png": draw_rates({task: members(fixed, task) for task in MATCHES}, label),
-        "mates.png": draw_rates({task: drawn_mates(task) for task in COOPERATIVE}, "success, %"),
         "robustness.png": draw_heat(robust_rates()),
         "exploitability.png": draw_leads(rows("exploitability")),
     }

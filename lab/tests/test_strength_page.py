@@ -1,6 +1,4 @@
-"""lab/strength_page.py: the tables of docs/results/strength.md, mates.md and skills.md and the
-data behind them.
-"""
+"""lab/strength_page.py: the tables of docs/results and docs/comparing.md, and their data."""
 
 import csv
 import io
