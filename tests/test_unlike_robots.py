@@ -66,6 +66,7 @@ def test_each_robot_has_its_own_mass_motors_and_gains() -> None:
     assert two.shift[width] == pytest.approx(GO2.walk.stance_width - GO1.walk.stance_width)
 
 
+@pytest.mark.soak
 def test_engines_agree_on_unlike_robots() -> None:
     states = []
     for impl in ("c", "jax"):
@@ -78,7 +79,8 @@ def test_engines_agree_on_unlike_robots() -> None:
 def test_a_name_for_each_of_like_robots_is_the_robot_to_the_last_bit() -> None:
     runs = []
     for given in ({"robot": "go1"}, {"robots": ("go1", "go1")}):
-        runs.append(mqe_jax.learn("go1gate", SMALL, env=given, impl="c"))
+        few = {**SMALL, "network.recurrent": False, "network.hidden_sizes": [8]}
+        runs.append(mqe_jax.learn("go1gate", few, env=given, impl="c"))
     one, two = (run.policy for run in runs)
     assert one.actor.digest == two.actor.digest
     assert one.needs == two.needs and one.needs.robot == "go1"
