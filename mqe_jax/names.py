@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, overload
 
 from mqe_jax.acting.seats import Act, Policy, Seats, check_policy
 from mqe_jax.core import devices
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, nearest, warn
 from mqe_jax.core.limits import Number
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import (
@@ -243,44 +243,34 @@ def table(
 
     With `sensors`, robots that have none get the sensors of the set `onboard`.
 
-    A run brings its own task, parameters and policy. Without a policy and parameters other than
-    sensors and a robot, a task has its shipped policy, on both sides of a match. Otherwise it has
-    its scripted one, or `forward`, or `random` if actions are not commands. A task by its id has
-    the parameters that trained policies need, such as their skill.
+    A run brings its own task, parameters and policy. A task has its shipped policy, on both sides
+    of a match; if that does not fit the parameters, with a warning its scripted one, or `forward`,
+    or `random` if actions are not commands. A task by its id has the parameters that trained
+    policies need, such as their skill.
     """
     read = {} if read is None else read
-    name, own, run = target(task, read)
-    given = dict(env or {})
-    params = merge(own, given)
-    first: Any = run if policy is None else policy
-    second: Any = opponent
-    if first is None:
-        first = _usual_policy(name, params)
-        second = first if first == name and second is None else second
-    policies = [find(first, name, read=read)]
-    if opponent is not None:
-        policies.append(find(opponent, name, field="opponent", read=read))
-    place = task if isinstance(task, QuadrupedEnv) else name
-    if isinstance(place, str):
-        needed = parameters_of(name, policies, scaled="robot" in given)
-        given = merge(merge(params, needed), given)
-    if sensors and not sensors_of({**params, **given}.get("senses", ())):
-        given["senses"] = ONBOARD
-    with imports_of(read.get(run or ""), run or ""):
-        made = environment(place, given, impl=impl, num_envs=num_envs)
-    sources = {"policy": first}
-    if len(made.teams) > 1:
-        sources["opponent"] = "idle" if second is None else second
-    elif opponent is not None:
-        raise InputError(f"opponent: {name} is not a competitive task; omit the opponent")
-    teams = [
-        seat(source, made, field, read, deterministic=deterministic)
-        for field, source in sources.items()
-    ]
-    seats = Seats.of_teams(made, *teams)
-    groups = seats.groups | {ONBOARD} if sensors else seats.groups
-    batch = VectorEnv(made, num_envs, final=()).with_groups(groups)
-    return Table(made, batch, seats, _about(sources, teams[0]))
+    found = target(task, read)
+    options: dict[str, Any] = {
+        "env": dict(env or {}),
+        "impl": impl,
+        "num_envs": num_envs,
+        "deterministic": deterministic,
+        "sensors": sensors,
+        "read": read,
+    }
+    first = found.run if policy is None else policy
+    if first is not None:
+        return _seated(task, found, first, opponent, **options)
+    usual = _usual_policy(found.task, merge(found.params, options["env"]))
+    if found.task not in zoo.names():
+        return _seated(task, found, usual, opponent, **options)
+    try:
+        return _seated(task, found, found.task, opponent, others=found.task, **options)
+    except InputError as error:
+        reason = str(error)
+    seated = _seated(task, found, usual, opponent, **options)
+    warn(f"{reason}; {usual!r} acts in place of the shipped policy")
+    return seated
 
 
 def _about(sources: Mapping[str, Source], policy: Any) -> dict[str, Any]:
@@ -329,6 +319,50 @@ def target(task: str | Path | QuadrupedEnv, read: Read | None = None) -> Target:
         return Target(task_id(policy.task), policy.config.env, source)
 
 
+def _seated(
+    task: str | Path | QuadrupedEnv,
+    found: Target,
+    policy: Source,
+    opponent: Source | None,
+    *,
+    env: Params,
+    impl: str,
+    num_envs: int,
+    deterministic: bool,
+    sensors: bool,
+    read: Read,
+    others: Source = "idle",
+) -> Table:
+    """Returns the table of a policy; `others` are its opponents in a match if none is given."""
+    name = found.task
+    policies = [find(policy, name, read=read)]
+    if opponent is not None:
+        policies.append(find(opponent, name, field="opponent", read=read))
+    given = dict(env)
+    place = task if isinstance(task, QuadrupedEnv) else name
+    params = merge(found.params, given)
+    if isinstance(place, str):
+        needed = parameters_of(name, policies, scaled="robot" in given)
+        given = merge(merge(params, needed), given)
+    if sensors and not sensors_of({**params, **given}.get("senses", ())):
+        given["senses"] = ONBOARD
+    with imports_of(read.get(found.run or ""), found.run or ""):
+        made = environment(place, given, impl=impl, num_envs=num_envs)
+    sources = {"policy": policy}
+    if len(made.teams) > 1:
+        sources["opponent"] = others if opponent is None else opponent
+    elif opponent is not None:
+        raise InputError(f"opponent: {name} is not a competitive task; omit the opponent")
+    teams = [
+        seat(source, made, field, read, deterministic=deterministic)
+        for field, source in sources.items()
+    ]
+    seats = Seats.of_teams(made, *teams)
+    groups = seats.groups | {ONBOARD} if sensors else seats.groups
+    batch = VectorEnv(made, num_envs, final=()).with_groups(groups)
+    return Table(made, batch, seats, _about(sources, teams[0]))
+
+
 @contextlib.contextmanager
 def imports_of(policy: TrainedPolicy | None, run: str) -> Iterator[None]:
     """Adds to an InputError the flags of `mqe` that import what the training of a run imported."""
@@ -343,9 +377,7 @@ def imports_of(policy: TrainedPolicy | None, run: str) -> Iterator[None]:
 
 
 def _usual_policy(name: str, params: Params) -> str:
-    """Returns the policy that a task has by default."""
-    if name in zoo.names() and not {*params} - {"senses", "robot", "skill_weights"}:
-        return name
+    """Returns the policy that a task has without a shipped one."""
     if params.get("control", "command") != "command":
         return "random"
     return "scripted" if name in SCRIPTED else "forward"

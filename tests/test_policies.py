@@ -111,9 +111,12 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
     assert isinstance(acting("go1gate", policy="scripted")[0], SimplePolicy)
     with pytest.warns(UserWarning, match="trained in go1gate on the robot go1, it acts on go2"):
         assert isinstance(acting("go1gate", robot="go2")[0], Actor)
-    assert isinstance(acting("go1gate", set=["gate_width=0.8"])[0], SimplePolicy)
+    assert isinstance(acting("go1gate", set=["gate_width=0.8", "friction=0.5"])[0], Actor)
     assert isinstance(acting("go1plane")[0], SimplePolicy)  # none is shipped
-    (joints,) = acting("go1gate", control="position")
+    with pytest.warns(UserWarning, match="'scripted' acts in place of the shipped policy"):
+        assert isinstance(acting("go1gate", set=["num_agents=3"])[0], SimplePolicy)
+    with pytest.warns(UserWarning, match="'random' acts in place of the shipped policy"):
+        (joints,) = acting("go1gate", control="position")
     assert joints.act(jnp.zeros((1, 2, 16)), (), jax.random.PRNGKey(0))[0].shape == (1, 2, 12)
     first, second = acting("go1tug")
     assert isinstance(first, Actor) and first.params is second.params

@@ -86,9 +86,9 @@ class PolicyOptions(TaskOptions):
     policy: PolicyName = None
     """A run folder, a policy file or a task with a shipped policy. Or scripted (hand-written for
     the task), another scripted policy of the task, random, idle (zero commands), forward (straight
-    on at half speed). Default: the run's policy, else the shipped (see `mqe zoo`), scripted or
-    forward one; random if actions are not commands. A task by its id gets the skill, gait, command
-    ranges, control mode and robot that a trained policy needs."""
+    on at half speed). Default: the run's policy, else the shipped one (see `mqe zoo`); where it
+    does not fit, scripted, forward, or random if actions are not commands. A task by its id gets
+    the skill, gait, command ranges, control mode and robot that a trained policy needs."""
     opponent: PolicyName = None
     """Policy of team 1 in a match: what --policy accepts. Default: the shipped one if team 0 has it
     by default, else idle."""

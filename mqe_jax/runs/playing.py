@@ -67,10 +67,10 @@ def evaluate(
     Args:
         task: id, environment, or the run folder or policy file of a trained policy, which brings
             its task.
-        policy: a policy, or what `load_policy` accepts. Default: the run's policy, else the
-            shipped, scripted or `forward` one (`random` if actions are not commands). A task by its
-            id gets the skill, gait, command ranges, control mode and robot that a trained policy
-            needs.
+        policy: a policy, or what `load_policy` accepts. Default: the run's policy, else the shipped
+            one; where it does not fit, with a warning, the scripted or `forward` one, or `random`
+            if actions are not commands. A task by its id gets the skill, gait, command ranges,
+            control mode and robot that a trained policy needs.
         opponent: policy of the other team of a match, or a population
             (`mqe_jax.policies.zoo.population`), whose members play `episodes` each. Default: the
             shipped policy if `policy` is the shipped one by default, else `idle`.
