@@ -33,7 +33,7 @@ from mqe_jax.train.learner import TrainState
 from mqe_jax.train.monitor import EvaluationLog, Monitor, read_evaluations
 from mqe_jax.train.policy import TrainedPolicy, read_policy, save_policy
 from mqe_jax.train.runner import train, train_seeds
-from mqe_jax.train.schedules import check_ended
+from mqe_jax.train.schedules import check_ended, ended, left_out
 from mqe_jax.train.start import check_same
 from tests.fake_env import SMALL
 from tests.inputs import refuses
@@ -131,6 +131,21 @@ def test_a_longer_run_brings_back_nothing_that_has_ended(tmp_path: Path) -> None
     assert int(train(PROBE, warmed, run_dir, resume=True).updates) == 5
 
 
+def test_a_longer_run_leaves_out_what_has_ended(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    fewer = settings(curriculum__failure_bootstrap=0.5, total_steps=32)
+    train(PROBE, fewer, run_dir)
+    longer = dataclasses.replace(fewer, total_steps=96)
+    said = r"at most 64, .*; curriculum.failure_bootstrap 0.0 prevents this"
+    refuses(said, train, PROBE, longer, run_dir, resume=True)
+    without = override(longer, {"curriculum.failure_bootstrap": 0.0})
+    said = "curriculum.failure_bootstrap: 0.25 differs from the run"
+    other = override(longer, {"curriculum.failure_bootstrap": 0.25})
+    refuses(said, train, PROBE, other, run_dir, resume=True)
+    assert int(train(PROBE, without, run_dir, resume=True).updates) == 6
+    assert load_run_config(run_dir) == without
+
+
 def test_schedules_that_have_ended_bound_the_total_of_a_run() -> None:
     changes: dict[str, dict[str, Any]] = {
         "curriculum.assistance": {"curriculum": {"assistance": 0.5, "assistance_until": 0.4}},
@@ -142,8 +157,10 @@ def test_schedules_that_have_ended_bound_the_total_of_a_run() -> None:
     for name, change in changes.items():
         before = override(settings(), change)  # the schedule ends with the second of five updates
         longer = override(before, {"total_steps": 96})
-        check_ended(longer, before, 1)
-        refuses(f"at most 80, .*{name}", check_ended, longer, before, 2)
+        assert ended(before, 1) == []
+        assert ended(before, 2) == [name]
+        refuses(f"at most 80, .*{name}", check_ended, longer, [name], 2)
+        check_ended(override(longer, left_out([name])), [name], 2)
 
 
 @pytest.mark.parametrize("before", [{"width": 0.7}, {"width": 0.7, "other": 1}])

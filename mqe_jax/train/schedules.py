@@ -1,6 +1,7 @@
 """The settings that change during training, as functions of the number of updates done."""
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,25 +53,51 @@ def current_values(config: TrainConfig, updates: jax.Array) -> Scheduled:
     )
 
 
-def check_ended(config: TrainConfig, before: TrainConfig, updates: int) -> None:
-    """Raises an InputError if the total of a resumed run brings back what has ended.
+_OFF: dict[str, dict[str, Any]] = {
+    "ppo.critic_warmup": {},
+    "curriculum.assistance": {"curriculum.assistance": 0.0, "curriculum.demonstrator": None},
+    "curriculum.failure_bootstrap": {"curriculum.failure_bootstrap": 0.0},
+    "imitation": {"imitation.teacher": None},
+}
+"""Settings without what a schedule ends, by its name."""
 
-    The run had the settings `before` and has done a number of updates.
+
+def ended(config: TrainConfig, updates: int) -> list[str]:
+    """Returns the names of what a schedule has ended after a number of updates."""
+    spans = _spans(config)
+    return [name for name, until in spans.items() if updates >= until * config.num_updates]
+
+
+def left_out(names: Iterable[str]) -> dict[str, Any]:
+    """Returns the settings without what has ended, by name."""
+    return {setting: value for name in names for setting, value in _OFF[name].items()}
+
+
+def check_ended(config: TrainConfig, names: Iterable[str], updates: int) -> None:
+    """Raises an InputError if the total of a resumed run brings back what has ended, `names`.
+
+    The run has done a number of updates.
     """
+    spans = _spans(config)
+    for name in names:
+        until = spans.get(name, 0.0)
+        if updates < until * config.num_updates:
+            most = int(updates / until) * config.steps_per_update
+            off = " and ".join(f"{setting} {value}" for setting, value in _OFF[name].items())
+            allowed = f"at most {most}, beyond which {name}, which has ended, would return"
+            fail("total_steps", config.total_steps, allowed + (off and f"; {off} prevents this"))
+
+
+def _spans(config: TrainConfig) -> dict[str, float]:
+    """Returns where in a training each schedule in use ends, as a fraction, by its name."""
     curriculum = config.curriculum
-    spans = (
-        ("ppo.critic_warmup", config.ppo.critic_warmup, config.ppo.critic_warmup),
-        ("curriculum.assistance", curriculum.assistance, curriculum.assistance_until),
-        (
-            "curriculum.failure_bootstrap",
+    spans = {
+        "ppo.critic_warmup": (config.ppo.critic_warmup, config.ppo.critic_warmup),
+        "curriculum.assistance": (curriculum.assistance, curriculum.assistance_until),
+        "curriculum.failure_bootstrap": (
             curriculum.failure_bootstrap,
             curriculum.failure_bootstrap_until,
         ),
-        ("imitation", config.imitation.teacher, config.imitation.until),
-    )
-    for name, used, until in spans:
-        ended = used and updates >= until * before.num_updates
-        if ended and updates < until * config.num_updates:
-            most = int(updates / until) * config.steps_per_update
-            allowed = f"at most {most}, beyond which {name}, which has ended, would return"
-            fail("total_steps", config.total_steps, allowed)
+        "imitation": (config.imitation.teacher, config.imitation.until),
+    }
+    return {name: until for name, (used, until) in spans.items() if used}

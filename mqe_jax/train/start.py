@@ -17,14 +17,14 @@ from mqe_jax.acting.seats import check_policy
 from mqe_jax.core import keys
 from mqe_jax.core.devices import Processes
 from mqe_jax.core.errors import InputError
-from mqe_jax.core.settings import fail, leaves, override, to_mapping
+from mqe_jax.core.settings import build, fail, leaves, to_mapping
 from mqe_jax.core.types import Cast, Matchmaker, Params, PyTree, VectorEnv, generator
 from mqe_jax.train.checkpoint import checkpoint_step, read_file
 from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import TrainedPolicy
-from mqe_jax.train.schedules import check_ended
+from mqe_jax.train.schedules import check_ended, ended, left_out
 from mqe_jax.train.seeds import with_shared, without_shared
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
@@ -110,15 +110,17 @@ def first_state(
         or not 0 <= seconds < math.inf
     ):
         raise InputError(f"{checkpoint}: its settings or its seconds cannot be read")
-    check_same(run, without_retired(before), config)
+    past = without_retired(before)
+    steps = checkpoint_step(checkpoint)
+    done = steps // config.steps_per_update
+    over = ended(build(TrainConfig, past), done)
+    check_same(run, past, config, left_out(over))
     changed = [name for name in found if found[name] != known.get(name)]
     if changed:
         raise InputError(f"{', '.join(changed)}: has changed since the run in {run} read it")
-    if (steps := checkpoint_step(checkpoint)) > config.num_updates * config.steps_per_update:
+    if steps > config.num_updates * config.steps_per_update:
         fail("total_steps", config.total_steps, f"at least {steps}, those of {checkpoint}")
-    totals = {name: value for name, value in before.items() if name == "total_steps"}
-    done = steps // config.steps_per_update
-    check_ended(config, override(config, totals), done)
+    check_ended(config, over, done)
     whole = metadata.get("environments", True)
     template = processes.whole
     saved = (
@@ -195,13 +197,19 @@ def learned_state(state: TrainState) -> dict[str, Any]:
     }
 
 
-def check_same(path: Path, before: Mapping[str, Any], config: TrainConfig) -> None:
-    """Raises an InputError naming the first setting in which the run to resume differs."""
+def check_same(
+    path: Path, before: Mapping[str, Any], config: TrainConfig, allowed: Mapping[str, Any]
+) -> None:
+    """Raises an InputError naming the first setting in which the run to resume differs.
+
+    `allowed` are values that settings may have instead.
+    """
     given = dict(leaves(before))
     old = {**dict(leaves(to_mapping(TrainConfig()))), **given}  # a new setting had its default
     left_out = {name: None for name in given if name.startswith(("env.", "train_env."))}
     for name, value in {**left_out, **dict(leaves(to_mapping(config)))}.items():
-        if name.split(".")[0] not in _MAY_CHANGE and old.get(name) != value:
+        kept = name.split(".")[0] in _MAY_CHANGE or old.get(name) == value
+        if not kept and not (name in allowed and allowed[name] == value):
             raise InputError(
                 f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
                 f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in "
