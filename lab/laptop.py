@@ -150,8 +150,8 @@ def levels() -> dict[str, dict[str, Any]]:
 def markdown(found: Mapping[str, Mapping[str, Any]]) -> str:
     """Returns the table of the tasks with a level on a laptop."""
     lines = [
-        "| task | laptop, minutes | laptop, % | GPU, minutes | GPU, % |",
-        "|---|---|---|---|---|",
+        "| task | laptop, minutes | mean, % | worst, % | GPU, minutes | mean, % | worst, % |",
+        "|---|---|---|---|---|---|---|",
     ]
     for task, devices in found.items():
         if "laptop" not in devices:
@@ -159,14 +159,14 @@ def markdown(found: Mapping[str, Mapping[str, Any]]) -> str:
         cells = [f"`{task}`"]
         for device in ("laptop", "gpu"):
             one = devices.get(device)
-            cells += ["", ""] if one is None else [f"{one['minutes']:g}", _percent(one)]
+            cells += [""] * 3 if one is None else _cells(one)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def _percent(one: Mapping[str, Any]) -> str:
-    mean, worst, best = (f"{100 * one[name]:.1f}" for name in ("level", "worst", "best"))
-    return f"{mean} ({worst} to {best})".replace("100.0", "100")
+def _cells(one: Mapping[str, Any]) -> list[str]:
+    mean, worst = (f"{100 * one[name]:.1f}".replace("100.0", "100") for name in ("level", "worst"))
+    return [f"{one['minutes']:g}", mean, f"{worst} of {one['trainings']}"]
 
 
 def with_teacher(row: Row) -> Row:

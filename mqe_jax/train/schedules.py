@@ -1,7 +1,8 @@
 """The settings that change during training, as functions of the number of updates done."""
 
+import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,45 +54,46 @@ def current_values(config: TrainConfig, updates: jax.Array) -> Scheduled:
     )
 
 
-_OFF: dict[str, dict[str, Any]] = {
-    "ppo.critic_warmup": {},
-    "curriculum.assistance": {"curriculum.assistance": 0.0, "curriculum.demonstrator": None},
-    "curriculum.failure_bootstrap": {"curriculum.failure_bootstrap": 0.0},
-    "imitation": {"imitation.teacher": None},
+_ENDS = {
+    "ppo.critic_warmup": "ppo.critic_warmup",
+    "curriculum.assistance": "curriculum.assistance_until",
+    "curriculum.failure_bootstrap": "curriculum.failure_bootstrap_until",
+    "imitation": "imitation.until",
 }
-"""Settings without what a schedule ends, by its name."""
+"""The setting that says where in a training a schedule ends, by the schedule's name."""
 
 
-def ended(config: TrainConfig, updates: int) -> list[str]:
-    """Returns the names of what a schedule has ended after a number of updates."""
-    spans = _spans(config)
-    return [name for name, until in spans.items() if updates >= until * config.num_updates]
+def ended(config: TrainConfig, updates: int) -> dict[str, str]:
+    """Returns the schedules that have ended after a number of updates.
 
-
-def left_out(names: Iterable[str]) -> dict[str, Any]:
-    """Returns the settings without what has ended, by name."""
-    return {setting: value for name in names for setting, value in _OFF[name].items()}
+    Each has the setting of its end, in which a resumed run may differ.
+    """
+    ends = _ends(config)
+    return {name: _ENDS[name] for name in ends if updates >= ends[name] * config.num_updates}
 
 
 def check_ended(config: TrainConfig, names: Iterable[str], updates: int) -> None:
-    """Raises an InputError if the total of a resumed run brings back what has ended, `names`.
+    """Raises an InputError if a resumed run brings back what has ended, `names`.
 
     The run has done a number of updates.
     """
-    spans = _spans(config)
+    ends = _ends(config)
     for name in names:
-        until = spans.get(name, 0.0)
+        until = ends.get(name, 0.0)
         if updates < until * config.num_updates:
             most = int(updates / until) * config.steps_per_update
-            off = " and ".join(f"{setting} {value}" for setting, value in _OFF[name].items())
-            allowed = f"at most {most}, beyond which {name}, which has ended, would return"
-            fail("total_steps", config.total_steps, allowed + (off and f"; {off} prevents this"))
+            earlier = math.floor(1e4 * updates / config.num_updates) / 1e4
+            allowed = (
+                f"at most {most}, beyond which {name}, which has ended, would return, or "
+                f"beside {_ENDS[name]} {earlier}"
+            )
+            fail("total_steps", config.total_steps, allowed)
 
 
-def _spans(config: TrainConfig) -> dict[str, float]:
+def _ends(config: TrainConfig) -> dict[str, float]:
     """Returns where in a training each schedule in use ends, as a fraction, by its name."""
     curriculum = config.curriculum
-    spans = {
+    ends = {
         "ppo.critic_warmup": (config.ppo.critic_warmup, config.ppo.critic_warmup),
         "curriculum.assistance": (curriculum.assistance, curriculum.assistance_until),
         "curriculum.failure_bootstrap": (
@@ -100,4 +102,4 @@ def _spans(config: TrainConfig) -> dict[str, float]:
         ),
         "imitation": (config.imitation.teacher, config.imitation.until),
     }
-    return {name: until for name, (used, until) in spans.items() if used}
+    return {name: until for name, (used, until) in ends.items() if used}

@@ -6,7 +6,7 @@ It is sampled, or restored from a checkpoint of the same settings.
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from mqe_jax.train.config import TrainConfig, without_retired
 from mqe_jax.train.folder import CONFIG_FILE
 from mqe_jax.train.learner import Learner, TrainState, make_learner
 from mqe_jax.train.policy import TrainedPolicy
-from mqe_jax.train.schedules import check_ended, ended, left_out
+from mqe_jax.train.schedules import check_ended, ended
 from mqe_jax.train.seeds import with_shared, without_shared
 
 _MAY_CHANGE = ("total_steps", "checkpoint", "evaluation", "loggers")
@@ -114,7 +114,7 @@ def first_state(
     steps = checkpoint_step(checkpoint)
     done = steps // config.steps_per_update
     over = ended(build(TrainConfig, past), done)
-    check_same(run, past, config, left_out(over))
+    check_same(run, past, config, over.values())
     changed = [name for name in found if found[name] != known.get(name)]
     if changed:
         raise InputError(f"{', '.join(changed)}: has changed since the run in {run} read it")
@@ -198,18 +198,18 @@ def learned_state(state: TrainState) -> dict[str, Any]:
 
 
 def check_same(
-    path: Path, before: Mapping[str, Any], config: TrainConfig, allowed: Mapping[str, Any]
+    path: Path, before: Mapping[str, Any], config: TrainConfig, free: Iterable[str]
 ) -> None:
     """Raises an InputError naming the first setting in which the run to resume differs.
 
-    `allowed` are values that settings may have instead.
+    `free` are settings in which it may.
     """
     given = dict(leaves(before))
     old = {**dict(leaves(to_mapping(TrainConfig()))), **given}  # a new setting had its default
     left_out = {name: None for name in given if name.startswith(("env.", "train_env."))}
+    may_change = {*_MAY_CHANGE, *free}
     for name, value in {**left_out, **dict(leaves(to_mapping(config)))}.items():
-        kept = name.split(".")[0] in _MAY_CHANGE or old.get(name) == value
-        if not kept and not (name in allowed and allowed[name] == value):
+        if may_change.isdisjoint({name, name.split(".")[0]}) and old.get(name) != value:
             raise InputError(
                 f"{name}: {value!r} differs from the run in {path}, which has {old.get(name)!r}; "
                 f"a resumed run may change only {', '.join(_MAY_CHANGE)}; its settings are in "
