@@ -41,6 +41,8 @@ PAGES = {"levels": ROOT / "docs" / "first_hour.md", "students": ROOT / "docs" / 
 """Pages by the section that has the table."""
 CORES = 2
 """Cores of the laptop: a training takes its processor minutes divided by them."""
+OTHER = "other machine"
+"""In the source of a training whose cores were about half as fast."""
 EPISODES = 256
 TEACHER_EPISODES = 512
 """Episodes behind a rate on a shipped policy's card."""
@@ -122,7 +124,8 @@ def keep(file: Path, rows: Sequence[Row]) -> None:
 def levels() -> dict[str, dict[str, Any]]:
     """Returns minutes and level of each task by device, `laptop` and `gpu`.
 
-    Minutes are the mean of the trainings whose time is known; `level` is the mean rate, `worst` and
+    Minutes are the mean of the trainings whose time is known, of a slower machine's only if there
+    are no others; `level` is the mean rate, `worst` and
     `best` those of single trainings. A device on which no time is known is left out.
     """
     times = {
@@ -133,7 +136,8 @@ def levels() -> dict[str, dict[str, Any]]:
     for task in SHIPPED:
         for device, (rows, column, share) in times.items():
             own = [row for row in rows if row["task"] == task]
-            known = [row[column] / share for row in own if math.isfinite(row[column])]
+            quiet = [row for row in own if OTHER not in row["source"]] or own
+            known = [row[column] / share for row in quiet if math.isfinite(row[column])]
             if not known:
                 continue
             rates = [row["rate"] for row in own]
