@@ -160,14 +160,14 @@ def test_evaluation_clip_and_viewer_run_the_same_policy(
 
     def seat(source: str, *of: Any, deterministic: bool) -> None:
         played.append((source, deterministic))
-        raise InputError("stop")
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(names, "seat", seat)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: True)  # for the viewer's packages
     flags = {"render": "-o clip.png", "view": "--port 49876"}.get(command, "")
     for target in (run_folder, "go1gate", "fake"):
         for more in ("", "--deterministic"):
-            mqe(f"{command} {target} {flags} {more}", code=2)
+            mqe(f"{command} {target} {flags} {more}", code=130)
     assert [deterministic for _, deterministic in played] == [False, True] * 3
     assert [policy for policy, _ in played[::2]] == [str(run_folder), "go1gate", "forward"]
 

@@ -328,7 +328,10 @@ def test_compiling_is_shown_and_does_not_count(
             log.write({"env_steps": step, "fps": 10.0})
     said = capsys.readouterr().err
     assert ("compiling (0:00:20)" if terminal else "gate: compiling") in said
-    assert said.count("takes about 89 minutes here; on a CPU, --config laptop takes minutes") == 1
+    assert (
+        said.count("takes about 89 minutes here; on a CPU, --config laptop of a task takes minutes")
+        == 1
+    )
     assert "1:28:00 left" in said
 
 

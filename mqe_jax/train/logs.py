@@ -297,7 +297,7 @@ class ProgressLog:
         minutes = self._left / 60
         if first and minutes > 1:
             slow = minutes > 60 and jax.default_backend() == "cpu"
-            advice = "; on a CPU, --config laptop takes minutes" if slow else ""
+            advice = "; on a CPU, --config laptop of a task takes minutes" if slow else ""
             hours = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{minutes:.0f} minutes"
             self._print(f"takes about {hours} here{advice}")
         period = _PLAIN_SECONDS if self._output is None else _OUTPUT_SECONDS

@@ -198,7 +198,7 @@ def learned_state(state: TrainState) -> dict[str, Any]:
 
 
 def check_same(
-    path: Path, before: Mapping[str, Any], config: TrainConfig, free: Iterable[str]
+    path: Path, before: Mapping[str, Any], config: TrainConfig, free: Iterable[str] = ()
 ) -> None:
     """Raises an InputError naming the first setting in which the run to resume differs.
 
