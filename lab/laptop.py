@@ -125,8 +125,8 @@ def levels() -> dict[str, dict[str, Any]]:
     """Returns minutes and level of each task by device, `laptop` and `gpu`.
 
     Minutes are the mean of the trainings whose time is known, of a slower machine's only if there
-    are no others; `level` is the mean rate, `worst` and
-    `best` those of single trainings. A device on which no time is known is left out.
+    are no others. `level` is the mean rate, `worst` and `best` are those of single trainings. A
+    device on which no time is known is left out.
     """
     times = {
         "laptop": (read(RESULTS / "laptop.csv"), "processor_minutes", CORES),
