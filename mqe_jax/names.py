@@ -224,7 +224,8 @@ class Table(NamedTuple):
     seats: Seats
     """Who acts for which agents."""
     about: dict[str, Any]
-    """Names of policy and opponent, and whether a trained policy's actions are means or samples."""
+    """Names of policy and opponent, whether a trained policy's actions are means or samples, the
+    skill of all robots."""
 
 
 def table(
@@ -360,7 +361,8 @@ def _seated(
     seats = Seats.of_teams(made, *teams)
     groups = seats.groups | {ONBOARD} if sensors else seats.groups
     batch = VectorEnv(made, num_envs, final=()).with_groups(groups)
-    return Table(made, batch, seats, _about(sources, teams[0]))
+    about = _about(sources, teams[0]) | {"skill": made.skill_text}
+    return Table(made, batch, seats, about)
 
 
 @contextlib.contextmanager

@@ -90,6 +90,7 @@ class FakeEnv(Fake):
     robot_x = np.array([0, 19])
     params = SimpleNamespace(senses=())
     labels: ClassVar = {}
+    skill_text = "none"
     overflow_x = 1.21  # m; a step that ends with the first robot beyond it overflows
 
     def __init__(self) -> None:

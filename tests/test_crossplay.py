@@ -110,8 +110,8 @@ def test_tables_are_80_columns_wide_and_have_intervals(monkeypatch: pytest.Monke
     success = np.random.default_rng(0).integers(0, 17, size=(21, 21)) / 16
     results = np.zeros((21, 21, 3), int)
     results[np.triu_indices(21, 1)] = [8, 0, 0]
-    shown = CrossPlay("go1gate", names[:19], ("scripted", "idle"), 16, success)
-    standings = Standings("go1tug", names, results, rate(results, 20))
+    shown = CrossPlay("go1gate", names[:19], ("scripted", "idle"), 16, success, "walk: vx -1 to 1")
+    standings = Standings("go1tug", names, results, rate(results, 20), "walk: vx -1 to 1")
     for text in (repr(shown), repr(standings)):
         assert max(map(len, text.splitlines())) <= 80
     assert f"{Estimate(*Rate.of(success[3, 20], 16)).text()}" in repr(shown)
@@ -129,6 +129,7 @@ def test_a_cooperative_task_is_played_by_mixed_teams(tmp_path: Path, mqe: Any) -
     assert found["worst"] is None and np.shape(found["success"]["value"]) == (2, 2)
     rows = (tmp_path / "tournament.csv").read_text().splitlines()
     assert rows[2].startswith("random,idle,2,0.0000,0.0000,0.6") and len(rows) == 5
+    assert found["skill"] == "none, control position" and f'"{found["skill"]}"' in rows[2]
     assert (tmp_path / "tournament.png").stat().st_size > 3000
 
 

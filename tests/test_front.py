@@ -303,6 +303,7 @@ def test_a_table_of_a_match_has_what_happened() -> None:
         "policy": "runs/a_b",
         "actions": "mean",
         "opponent": "scripted",
+        "skill": "agile: vx -1.5 to 2.5",
         "sides": "both",
         "seed": 0,
     }
@@ -314,6 +315,7 @@ def test_a_table_of_a_match_has_what_happened() -> None:
         ("policy", "runs/a_b, mean actions"),
         ("opponent", "scripted"),
         ("episodes", "4, on both sides"),
+        ("skill", "agile: vx -1.5 to 2.5"),
         ("",),
         ("", "%"),
         ("win", "75.0"),
@@ -331,7 +333,7 @@ def test_a_table_of_a_match_has_what_happened() -> None:
         result, labels={"both_touched": "goal touched by all", "one": "not in this task"}
     )
     rows = [row.split("  ")[0] for row in str(labelled).splitlines()]
-    assert rows[6:10] == ["win", "draw", "loss", "goal touched by all"] and not {
+    assert rows[7:11] == ["win", "draw", "loss", "goal touched by all"] and not {
         "both touched",
         "one",
     } & {*rows}
@@ -364,7 +366,9 @@ def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> Non
     words = ["eval", "go1tug", "--policy", "forward", "--impl", "c"]
     evaluate: Any = mqe_jax.evaluate
     about = evaluate("go1tug", "forward", "scripted", **options).about
-    assert about == {"policy": "forward", "opponent": "scripted", "sides": "both", "seed": 0}
+    skill = "walk: vx -1 to 1, vy -0.5 to 0.5, yaw_rate -0.5 to 0.5"
+    who = {"policy": "forward", "opponent": "scripted", "skill": skill}
+    assert about == {**who, "sides": "both", "seed": 0}
     assert isinstance(played["batch"], BothSides)
     assert played["policy"].seats[1].policy.policy.name == "scripted"
     for wrong in ({"episodes": 5}, {"num_envs": 3}):

@@ -250,7 +250,7 @@ CALLS: list[tuple[str, Callable[[Any, Any], Any], tuple[Any, ...]]] = [
     ),
     (
         "folder: ",
-        lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS).save(v),
+        lambda x, v: tournament.Standings("a", ("b",), GAMES, RATINGS, "walk").save(v),
         (None, 3, ""),
     ),
     ("policies", lambda x, v: mqe_jax.tournament("go1tug", v), (None, 3, [], [3], {})),

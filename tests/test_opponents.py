@@ -563,6 +563,8 @@ def test_a_tournament_meets_every_pair_on_both_sides(
     assert (tmp_path / "tournament.png").stat().st_size > 5000
     rows = (tmp_path / "tournament.csv").read_text().splitlines()
     assert len(rows) == 10 and rows[3].startswith(f"forward,idle,{won[0, 2]},")
+    skill = "walk: vx -1 to 1, vy -0.5 to 0.5, yaw_rate -0.5 to 0.5"
+    assert result["skill"] == skill and all(row.endswith(f',"{skill}"') for row in rows[1:])
     assert (
         (tmp_path / "policies.csv")
         .read_text()

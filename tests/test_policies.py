@@ -309,19 +309,23 @@ def test_what_a_user_makes_says_what_it_is() -> None:
     assert {*mqe_jax.__all__} <= {*dir(mqe_jax)} and "annotations" not in dir(mqe_jax)
 
 
-def test_who_acts_is_named() -> None:
+def test_who_acts_is_named_with_the_skill_of_all() -> None:
     def about(**options: Any) -> dict[str, Any]:
         return table(**Eval(impl="c", **options).playing).about
 
-    match = {"policy": "population/1/middle", "actions": "sampled", "opponent": "idle"}
-    assert about(target="go1wrestling", policy="population/1/middle") == match
-    assert (
-        about(target="go1wrestling", policy="population/1/middle", deterministic=True)["actions"]
-        == "mean"
-    )
+    found = about(target="go1wrestling", policy="population/1/middle")
+    skill = found.pop("skill")
+    assert found == {"policy": "population/1/middle", "actions": "sampled", "opponent": "idle"}
+    found = about(target="go1wrestling", policy="population/1/middle", deterministic=True)
+    assert found["actions"] == "mean" and found["skill"] == skill
     assert about(target="go1bridge") == {
         "policy": "go1bridge",
         "actions": "sampled",
         "opponent": "go1bridge",
+        "skill": "agile: vx -1.5 to 2.5, vy -1 to 1, yaw_rate -2.5 to 2.5",
     }
-    assert about(target="go1tug", policy="scripted") == {"policy": "scripted", "opponent": "idle"}
+    usual = "walk: vx -1 to 1, vy -0.5 to 0.5, yaw_rate -0.5 to 0.5"
+    scripted = {"policy": "scripted", "opponent": "idle", "skill": usual}
+    assert about(target="go1tug", policy="scripted") == scripted
+    met = about(target="go1tug", policy="scripted", opponent="go1tug")
+    assert met["skill"].startswith("agile: vx -1.5 to 2.5"), "the opponent brings it for both"

@@ -219,7 +219,7 @@ def test_the_table_of_a_match_gives_equilibrium_and_cycles(tmp_path: Path) -> No
     for i, j in ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)):
         results[i, j] = [100, 0, 0]
     names = ("runs/rock", "runs/paper", "runs/scissors", "idle")
-    Standings("go1tug", names, results, rate(results, 3)).save(tmp_path)
+    Standings("go1tug", names, results, rate(results, 3), "walk").save(tmp_path)
     lines = games.describe(tmp_path / "tournament.csv").splitlines()
     assert lines[1].split()[1] == "runs/rock" and " 33 (" in lines[1]
     assert lines[4].split()[1:3] == ["idle", "-100"] and lines[4].endswith("0 (0 to 0)")
@@ -228,7 +228,7 @@ def test_the_table_of_a_match_gives_equilibrium_and_cycles(tmp_path: Path) -> No
 
 def test_the_table_of_mixed_teams_gives_means(tmp_path: Path) -> None:
     success = np.array([[1.0, 0.25, 0.5], [0.75, 0.5, 0.0], [0.25, 0.25, 0.0]])
-    CrossPlay("go1gate", ("a", "b"), ("idle",), 64, success).save(tmp_path)
+    CrossPlay("go1gate", ("a", "b"), ("idle",), 64, success, "walk").save(tmp_path)
     text = games.describe(tmp_path / "tournament.csv")
     assert [line.split()[:2] for line in text.splitlines()[1:]] == [
         ["same", "75.0"],

@@ -83,7 +83,7 @@ class Result:
     match: dict[str, float]
     """`win_rate`, `draw_rate` and `loss_rate` of team 0; empty without an opponent."""
     about: dict[str, Any] = field(default_factory=dict)
-    """Who acted, by name: policy, actions, opponent, sides, seed."""
+    """Who acted, by name: policy, actions, opponent, skill (of all robots), sides, seed."""
     by_opponent: "dict[str, Result]" = field(default_factory=dict)
     """Results against each member of a population; the other fields are their means."""
     labels: Mapping[str, str] = field(default_factory=dict)
@@ -183,6 +183,8 @@ class Result:
             about["policy"] += f", {self.about['actions']} actions"
         sides = ", on both sides" if self.about.get("sides") == "both" else ""
         who = {"task": self.task, **about, "episodes": f"{self.episodes}{sides}"}
+        if "skill" in self.about:
+            who["skill"] = self.about["skill"]
         hidden = {f"ending/{name}" for name, share in self.endings.items() if share == 0}
         rates = {name: rate for name, rate in self.rates.items() if name not in hidden}
         if self.match:

@@ -178,7 +178,7 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
     def __repr__(self) -> str:
         actions = f"{self.control} {self.action_size}"
         if self.control == "command":
-            actions += f" ({self.params.commanded_text()})"
+            actions += f" ({self.skill_text})"
         agents = " vs ".join(str(len(team)) for team in self.teams)
         changed = differences(self.params, self.Params())
         if self.params.senses:
@@ -191,6 +191,13 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
             *(f"{name}={value!r}" for name, value in changed.items()),
         ]
         return f"<{self.name}: {', '.join(facts)}>"
+
+    @property
+    def skill_text(self) -> str:
+        """The skill and what its commands range over, such as `walk: vx -1 to 1`."""
+        if self.control != "command":
+            return f"none, control {self.control}"
+        return self.params.commanded_text()
 
     @property
     def privileged_layout(self) -> ObservationLayout:

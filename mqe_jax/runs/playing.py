@@ -187,10 +187,10 @@ def tournament(
     key = jax.random.PRNGKey(seed)
     if not match:
         results = cross_play(batch, teams, episodes, key)
-        return CrossPlay(made.name, own, tuple(references), episodes, results)
+        return CrossPlay(made.name, own, tuple(references), episodes, results, made.skill_text)
     results = league.round_robin(batch, teams, key)
     ratings = league.rate(results, everyone.index(references[0]))
-    return Standings(made.name, everyone, results, ratings)
+    return Standings(made.name, everyone, results, ratings, made.skill_text)
 
 
 @checked
@@ -267,7 +267,7 @@ class Clip:
     episodes: list[Any]
     """The episodes, `mqe_jax.viz.recording.Episode` each."""
     about: dict[str, Any]
-    """Who acted, by name: policy, actions, opponent, seed."""
+    """Who acted, by name: policy, actions, opponent, skill, seed."""
     look: dict[str, Any]
     """Options of `mqe_jax.viz.render.render_episode`: view, size, fps, speed."""
 

@@ -70,6 +70,8 @@ class CrossPlay:
     """Episodes of each team."""
     success: Array
     """Success rates (N, N): the row's policy is agent 0's, the column's that of the others."""
+    skill: str
+    """The skill of all robots, with the ranges of its commands."""
 
     @property
     def means(self) -> dict[str, float]:
@@ -109,7 +111,7 @@ class CrossPlay:
             50 * (rate.high - rate.low) for rate in itertools.starmap(self.rate, self._pairs)
         )
         shown = {"same": "policies with themselves", "cross": "different policies"}
-        lines = [f"{self.task}: success in % of {self.episodes} episodes"]
+        lines = [f"{self.task}, skill {self.skill}", f"success in % of {self.episodes} episodes"]
         for name, mean in self.means.items():
             lines.append(f"{shown.get(name, f'policies with {name}'):<26}{100 * mean:.1f}")
         if self.worst is not None:
@@ -147,6 +149,7 @@ class CrossPlay:
         bounds = np.array([[self.rate(i, j) for j in size] for i in size])
         return {
             "task": self.task,
+            "skill": self.skill,
             "policies": [*self.policies],
             "references": [*self.references],
             "episodes": self.episodes,
@@ -161,10 +164,11 @@ class CrossPlay:
         folder = Path(folder)
         names = [*self.policies, *self.references]
         rows = [
-            (names[i], names[j], self.episodes, *(f"{x:.4f}" for x in self.rate(i, j)))
+            (names[i], names[j], self.episodes, *(f"{x:.4f}" for x in self.rate(i, j)), self.skill)
             for i, j in self._pairs
         ]
-        write_table(folder / CSV, ("agent0", "others", "episodes", "success", "low", "high"), rows)
+        header = ("agent0", "others", "episodes", "success", "low", "high", "skill")
+        write_table(folder / CSV, header, rows)
         draw(
             names,
             self.success,

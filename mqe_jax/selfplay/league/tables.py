@@ -56,18 +56,25 @@ def write_table(file: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]
 
 
 def draw(
-    names: Sequence[str], shares: NDArray[Any], title: str, path: Path, *, diagonal: bool = True
+    names: Sequence[str],
+    shares: NDArray[Any],
+    title: str,
+    path: Path,
+    *,
+    least: float = 0.0,
+    diagonal: bool = True,
 ) -> None:
-    """Draws shares (P, P) in percent, rows against columns, atomically."""
+    """Draws shares (P, P) from `least` to 1 in percent, rows against columns, atomically."""
     from matplotlib.figure import Figure
 
     size = 2.6 + 0.6 * len(names)
     figure = Figure((size + 0.8, size), dpi=120, layout="constrained")
     axes = figure.add_subplot()
-    axes.imshow(shares, cmap="RdYlGn", vmin=0, vmax=1)
+    axes.imshow(shares, cmap="RdYlGn", vmin=least, vmax=1)
     for (row, column), value in np.ndenumerate(shares):
         if diagonal or row != column:
-            axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=9)
+            text = format(100 * value + 0.0, ".0f" if least == 0 else "+.0f")
+            axes.text(column, row, text, ha="center", va="center", fontsize=9)
     shown = [to_label(shorten(name)) for name in names]
     axes.set_xticks(range(len(names)), shown, rotation=45, ha="right")
     axes.set_yticks(range(len(names)), shown)

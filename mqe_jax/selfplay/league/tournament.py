@@ -151,15 +151,19 @@ class Standings:
     task: str
     """Id of the match."""
     policies: tuple[str, ...]
-    """Names of the policies."""
+    """Names of the policies; all arrays have their order."""
     results: NDArray[np.int64]
-    """Outcomes of each policy as team 0 against each (P, P, 3), as of `round_robin`."""
+    """Number of episodes that each policy as team 0 (first axis) won, drew and lost (last axis)
+    against each as team 1 (P, P, 3)."""
     ratings: Estimate
-    """Ratings, relative to one of them."""
+    """Bradley-Terry ratings with their 95% intervals, Elo points (P,); the reference policy has
+    0."""
+    skill: str
+    """The skill of all robots, with the ranges of its commands."""
 
     @functools.cached_property
     def analysis(self) -> Analysis:
-        """Mean and worst case, with intervals."""
+        """Wins minus losses of a game: of each pair, their mean and their worst, with intervals."""
         return analyse(self.results)
 
     def __repr__(self) -> str:
@@ -173,6 +177,8 @@ class Standings:
             name: [kind.at(i).text(form="+.0f") for i in order] for name, kind in columns.items()
         }
         lines = [
+            f"{self.task}, skill {self.skill}",
+            "",
             *table({"policy": names, "rating (95% interval)": ratings}),
             "",
             "wins minus losses of 100 games on both sides together (95% interval)",
@@ -191,11 +197,12 @@ class Standings:
             each = {"mean": found.mean.at(i).to_dict(), "worst": found.worst.at(i).to_dict()}
             policies.append({"policy": self.policies[i], **self.ratings.at(i).to_dict(), **each})
         pairs = {"results": self.results.tolist(), "payoff": found.payoff.to_dict()}
-        return {"task": self.task, "ratings": policies, "policies": [*self.policies], **pairs}
+        about = {"task": self.task, "skill": self.skill, "policies": [*self.policies]}
+        return {**about, "ratings": policies, **pairs}
 
     @checked
     def save(self, folder: str | Path) -> None:
-        """Writes the results of every pair, their analysis and a figure of the points.
+        """Writes the results of every pair, their analysis and a picture of the pairs.
 
         It replaces files atomically.
         """
@@ -205,23 +212,28 @@ class Standings:
         for i, j in itertools.product(range(len(self.policies)), repeat=2):
             games = max(int(both[i, j].sum()), 1)
             rates = [f"{x:.4f}" for count in both[i, j] for x in Rate.of(count / games, games)]
-            pairs.append((self.policies[i], self.policies[j], *self.results[i, j], *rates))
+            row = self.policies[i], self.policies[j], *self.results[i, j], *rates, self.skill
+            pairs.append(row)
         sides = [f"{name}{end}" for name in RESULTS for end in ("_both_sides", "_low", "_high")]
-        write_table(folder / CSV, ("team0", "team1", *RESULTS, *sides), pairs)
+        write_table(folder / CSV, ("team0", "team1", *RESULTS, *sides, "skill"), pairs)
         found = self.analysis
         kinds = {"rating": self.ratings, "mean": found.mean, "worst": found.worst}
         header = [f"{name}{end}" for name in kinds for end in ("", "_low", "_high")]
         rows = [
-            (self.policies[i], *(f"{x[i]:.6g}" for kind in kinds.values() for x in kind))
+            (
+                self.policies[i],
+                *(f"{x[i]:.6g}" for kind in kinds.values() for x in kind),
+                self.skill,
+            )
             for i in self._order
         ]
-        write_table(folder / POLICIES, ("policy", *header), rows)
-        share = scores(self.results) / np.maximum(scores(self.results) + scores(self.results).T, 1)
+        write_table(folder / POLICIES, ("policy", *header, "skill"), rows)
         draw(
             self.policies,
-            share,
-            "points of 100 games, row against column",
+            found.payoff.value,
+            "wins minus losses of 100 games, row against column",
             folder / PICTURE,
+            least=-1.0,
             diagonal=False,
         )
 
