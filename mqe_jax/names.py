@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, overload
 
-from mqe_jax.acting.seats import Act, Policy, Seats, check_policy
+from mqe_jax.acting.seats import Act, Policy, Seats, check_policy, title
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError, nearest, warn
 from mqe_jax.core.limits import Number
@@ -22,6 +22,7 @@ from mqe_jax.core.settings import (
     Parameters,
     PathText,
     check,
+    check_call,
     checked,
     differences,
     fail,
@@ -49,7 +50,12 @@ from mqe_jax.train.policy import (
 )
 
 Source = str | Path | Policy | Act
-"""What users pass as a policy: a name, a path, a policy, or a memoryless function `act`."""
+"""What users pass as a policy: a name, a path, a policy, or a memoryless function `act`.
+
+The function is compiled. It maps observations (N, A, O) of one team in N environments, a memory
+that is () and a random key to actions (N, A, D) and the memory. Actions in [-1, 1] are shares of
+the ranges that the environment has.
+"""
 Config = str | Path | TrainConfig | Mapping[str, Any] | None
 """Settings of a training: a shipped name, a file, settings, or changes of the defaults."""
 Params = Mapping[str, Any]
@@ -91,6 +97,9 @@ def find(
     if not isinstance(source, str | Path):
         if isinstance(source, type) or not (callable(source) or hasattr(source, "act")):
             fail(field, source, "a policy, its function act(obs, memory, key), a name or a path")
+        if not hasattr(source, "act"):
+            function: Any = source
+            check_call(field, function, "obs", "memory", "key")
         return source
     source = path_text(check(field, source, PathText))
     known = {} if read is None else read
@@ -112,7 +121,7 @@ def _find(name: str, task: str, field: str) -> Found:
     allowed = (*simple.names(task), *zoo.names())
     raise InputError(
         f"{field}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}, "
-        "a run folder, or a policy file"
+        "a run folder, a policy file, or one that register_scripted adds (mqe: --import FILE)"
     )
 
 
@@ -203,7 +212,7 @@ def fit(
     """
     named = isinstance(found, Named)
     if not named and not hasattr(found, "act"):
-        return simple.from_function(found, env)
+        return simple.from_function(found, env, name or title(found))
     if named:
         return simple.named(found.name, env, field)
     name = name or repr(found)
@@ -276,12 +285,12 @@ def table(
 
 def _about(sources: Mapping[str, Source], policy: Any) -> dict[str, Any]:
     """Returns the names of who plays, and the kind of actions of a trained policy."""
-    about: dict[str, Any] = {"policy": str(sources["policy"])}
+    about: dict[str, Any] = {"policy": title(sources["policy"])}
     mean = getattr(getattr(policy, "policy", policy), "deterministic", None)
     if mean is not None:
         about["actions"] = "mean" if mean else "sampled"
     if "opponent" in sources:
-        about["opponent"] = str(sources["opponent"])
+        about["opponent"] = title(sources["opponent"])
     return about
 
 
@@ -510,6 +519,8 @@ def versus(
     given: Any = [opponents] if alone else opponents
     if not isinstance(given, Sequence):
         fail("opponents", given, "a policy, or a list of policies")
+    if isinstance(env, QuadrupedEnv):
+        fail("env", env.name, "a batch of environments, VectorEnv(env, N)")
     read: Read = {}
     policies = [seat(each, env.env, "opponents", read) for each in given]
     return Versus(env, policies, draw_reward)
@@ -539,4 +550,4 @@ def seat(
     Arguments and errors are those of `find` and `fit`.
     """
     found = find(source, env.name, field=field, read=read)
-    return fit(found, env, deterministic=deterministic, field=field, name=str(source))
+    return fit(found, env, deterministic=deterministic, field=field, name=title(source))

@@ -57,13 +57,14 @@ def resolve(
             the settings whose `group` is `policy`.
     """
     task = ALIASES.get(task, task)
+    defined = None if algorithm is None else preset(algorithm)
     if isinstance(config, TrainConfig):
         below = [_Layer.of("", vars(config))]
     else:
         usual = default_name(task) if algorithm is None else f"paper/{algorithm}"
         below = _layers_of(task, usual if config is None else config)
-    if algorithm is not None:
-        below.append(_Layer.of("", preset(algorithm)))
+    if defined is not None:
+        below.append(_Layer.of("", defined))
     above = [_Layer.of(f"{name}." if name else "", values) for name, values in layers.items()]
     if _select_onboard([*below, *above]):
         below.append(_Layer.of("", _parts("onboard")))

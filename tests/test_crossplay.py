@@ -211,7 +211,10 @@ def test_a_seat_alone_uses_the_key_and_several_split_it() -> None:
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
-        (lambda memory: jnp.zeros((5, 3, 2)), r"returns \w+' is not allowed.*\(action, memory\)"),
+        (
+            lambda memory: jnp.zeros((5, 3, 2)),
+            r"returns an array' is not allowed.*\(action, memory\)",
+        ),
         (lambda memory: (jnp.zeros((5, 2, 2)), memory), r"actions \(5, 2, 2\)'.*\(5, 3, 2\)"),
         (lambda memory: (jnp.zeros((5, 3, 2)), (memory, memory)), "memory's structure"),
     ],

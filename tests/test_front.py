@@ -352,6 +352,36 @@ def test_a_function_is_a_policy() -> None:
     assert result.draw and result.outcomes == {"passes": 0.0, "both_touched": 0.0}
 
 
+def test_mistakes_of_a_function_are_named() -> None:
+    def act(value: Any) -> Any:
+        return lambda obs, memory, key: value(obs)
+
+    wrong: dict[str, Any] = {
+        r"'<lambda>\(obs\)' .* a function of \(obs, memory, key\)": lambda obs: obs,
+        r"returns an array' .* returns \(action, memory\)": act(lambda obs: obs),
+        r"returns NoneType' .* returns \(action, memory\)": act(lambda obs: None),
+        r"returns actions \(4, 2, 2\)'": act(lambda obs: (np.zeros((4, 2, 2), np.float32), ())),
+        "with a memory": act(lambda obs: (np.zeros((4, 2, 3), np.float32), obs)),
+        "is compiled; it must use jax.numpy": act(lambda obs: (np.tanh(np.asarray(obs)), ())),
+        "is compiled; .* jnp.where": act(lambda obs: (obs if obs[0, 0, 0] > 0 else -obs, ())),
+    }
+    for message, policy in wrong.items():
+        refuses(f"^policy: .*{message}", mqe_jax.evaluate, "fake", policy, episodes=4)
+
+
+def test_actions_that_are_not_finite_are_an_error_not_a_draw() -> None:
+    def broken(obs: Any, memory: Any, key: Any) -> Any:
+        return np.full((*obs.shape[:2], 3), np.nan, np.float32), memory
+
+    match = mqe_jax.make("go1tug", impl="c", num_envs=4, episode_length=0.04)
+    options: dict[str, Any] = {"episodes": 2, "num_envs": 2}
+    said = "broken returns actions with NaN or infinity"
+    refuses(f"policy: {said}", mqe_jax.evaluate, match, broken, "idle", **options)
+    both = options | {"sides": "both"}
+    refuses(f"opponent: {said}", mqe_jax.evaluate, match, "idle", broken, **both)
+    refuses(f"policies: {said}", mqe_jax.tournament, match, [broken], episodes=1)
+
+
 def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
     played: dict[str, Any] = {}
 

@@ -211,9 +211,10 @@ def test_an_opponents_memory_starts_anew_with_its_episode(
 
 
 def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: VectorEnv) -> None:
-    refuses("opponents: 3 is not allowed", versus, door, ["idle"] * 3)
+    refuses("env: 'go1revolvingdoor' .* VectorEnv", versus, door.env, ["idle"])
+    refuses("opponents: 4 environments .* do not divide among 3", versus, door, ["idle"] * 3)
     refuses(
-        r"opponents: 4 is not allowed; it must be a divisor .* of a process, 2",
+        "opponents: 2 environments of a process do not divide among 4",
         versus(door, ["idle"] * 4).share,
         2,
     )
@@ -532,6 +533,34 @@ def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(
     changes = {"task": "go1revolvingdoor", "env": params, "num_envs": 2, "evaluation.every": 1}
     config = override(resolve("go1revolvingdoor", "paper/mappo"), changes)
     assert cast.environments(config, impl="c").eval_env is not None
+
+
+def test_a_tournament_takes_policies_and_functions_by_name(monkeypatch: Any) -> None:
+    def ahead(obs: Any, memory: Any, key: Any) -> Any:
+        return jnp.zeros((*obs.shape[:2], 3)).at[..., 0].set(1.0), memory
+
+    played: dict[str, Any] = {}
+
+    def count(batch: Any, teams: dict[str, Any], key: Any) -> Any:
+        played.update(teams)
+        return np.ones((len(teams), len(teams), 3), int)
+
+    monkeypatch.setattr(tournament, "round_robin", count)
+    match = matches("go1tug", control="command").env
+    ready = load_policy("forward", match)
+    found: Any = playing.tournament(match, {"own": ahead, "ready": ready, "half": "forward"})
+    assert found.policies == ("own", "ready", "half", "scripted", "idle", "random")
+    obs = jnp.zeros((1, 1, match.observation_size))
+    asked = {name: float(team.act(obs, (), KEY)[0][0, 0, 0]) for name, team in played.items()}
+    assert (asked["own"], asked["ready"], asked["half"], asked["idle"]) == (1.0, 0.25, 0.25, 0.0)
+    found = playing.tournament(match, [ahead, "forward", "forward", "idle"])
+    assert found.policies == ("ahead", "forward", "idle", "scripted", "random")
+    for wrong in ([ahead, lambda *given: ahead(*given), lambda *given: given], {"idle": ahead}):
+        refuses("policies: .* the name of one policy; {'own'", playing.tournament, match, wrong)
+    for wrong in ("forward", [], {}, 3, None):
+        refuses("policies: .* a list of policies, or a map", playing.tournament, match, wrong)
+    refuses("policies: 3 is not allowed; it must be a policy", playing.tournament, match, [3])
+    refuses("policies: unknown 'forwar'.*register_scripted", playing.tournament, match, ["forwar"])
 
 
 def test_a_tournament_meets_every_pair_on_both_sides(

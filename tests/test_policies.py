@@ -329,3 +329,40 @@ def test_who_acts_is_named_with_the_skill_of_all() -> None:
     assert about(target="go1tug", policy="scripted") == scripted
     met = about(target="go1tug", policy="scripted", opponent="go1tug")
     assert met["skill"].startswith("agile: vx -1.5 to 2.5"), "the opponent brings it for both"
+
+
+def test_mistakes_of_a_registered_policy_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(NAMED_SCRIPTED, "go1tug", {})
+    for name in ("scripted", "idle", "go1tug"):
+        taken = f"name: '{name}' is not allowed; it must be another one"
+        refuses(taken, register_scripted, "go1tug", name, lambda obs: obs["base"][:, :3])
+    two = r"policy 'two': '<lambda>\(obs, key\)' is not allowed; it must be a function of \(obs\)"
+    refuses(two, register_scripted, "go1tug", "two", lambda obs, key: obs)  # type: ignore[misc]
+    wrong: dict[str, tuple[Any, str]] = {
+        "flat": (lambda obs: jnp.zeros(3), r"'flat': .* returns \(3,\)' .* returns \(1, 3\)"),
+        "ball": (lambda obs: obs["ball"], r"'ball': no block 'ball'.*allowed: base, cylinder"),
+        "numpy": (lambda obs: np.tanh(obs["base"][:, :3]), "numpy is compiled; .* use jax.numpy"),
+    }
+    env = make("go1tug", impl="c", num_envs=1)
+    for name, (policy, message) in wrong.items():
+        register_scripted("go1tug", name, policy)
+        made = load_policy(name, env)
+        refuses(f"policy.*{message}", made.act, jnp.zeros((2, 1, 10)), (), jax.random.PRNGKey(0))
+
+
+def test_actions_are_of_the_default_ranges_if_registered_else_of_the_environments(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(NAMED_SCRIPTED, "go1tug", {})
+
+    def ahead(obs: dict[str, jax.Array]) -> jax.Array:
+        return jnp.zeros((len(obs["base"]), 3)).at[:, 0].set(1.0)
+
+    register_scripted("go1tug", "ahead", ahead)
+    env = make("go1tug", impl="c", num_envs=1, skill="agile")
+    wide = make("go1tug", impl="c", num_envs=1, command_ranges={"vx": [-1.2, 1.2]})
+    for match in (env, wide):
+        obs = jnp.zeros((1, 1, 10))
+        action, _ = load_policy("ahead", match).act(obs, (), jax.random.PRNGKey(0))
+        asked = match.controller.change(action[0])[0, 0]
+        np.testing.assert_allclose(asked, 1.0, atol=1e-5, err_msg="m/s")

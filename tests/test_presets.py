@@ -113,6 +113,7 @@ def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
 
 def test_unknown_names_get_the_nearest() -> None:
     refuses(r"algorithm: 'mapo'.*did you mean 'mappo'", resolve, "go1gate", "demo", "mapo")
+    refuses(r"algorithm: 'qmix'.*one of mappo", resolve, "go1gate", None, "qmix")
     refuses(r"config: unknown name 'deno' \(did you mean 'demo'", resolve, "go1gate", "deno")
 
 
@@ -337,6 +338,7 @@ TRAINING: list[tuple[dict[str, Any], str]] = [
     ({"ppo": {"gama": 1.0}}, "ppo.gama: unknown name .*did you mean 'gamma'"),
     ({"gamma": 1.0}, "gamma: unknown name .*did you mean 'ppo.gamma'"),
     ({"ppo": {"learning_rate": 1.0}}, ".*did you mean 'optimizer.learning_rate'"),
+    ({"lr": 1.0}, "lr: unknown name .*did you mean 'optimizer.learning_rate'"),
     ({"every": 1}, "every: unknown name .*did you mean 'checkpoint.every'"),
     ({"steps": 1}, "steps: unknown name .*did you mean 'total_steps'"),
     ({"num_envs": 0}, "num_envs: 0 is not allowed; it must be greater than 0"),

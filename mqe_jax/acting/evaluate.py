@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.acting.results import Result
-from mqe_jax.acting.seats import Act, Policy, Seats
-from mqe_jax.core.errors import InputError
+from mqe_jax.acting.seats import Act, Policy, Seats, title
+from mqe_jax.core.errors import InputError, brief
 from mqe_jax.core.precision import single
 from mqe_jax.core.types import (
     RESULTS,
@@ -37,6 +37,7 @@ class _Progress(NamedTuple):
     step_sums: dict[str, jax.Array]  # sums of metrics over counted steps (N,) each
     outcome: Outcome  # sums over counted episodes, leading axis N
     diverged: jax.Array  # counted episodes that ended because the physics diverged (N,)
+    finite: jax.Array  # whether all actions of each agent were finite (N, A) bool
 
 
 def evaluate_batch(
@@ -55,7 +56,8 @@ def evaluate_batch(
     ones are ignored: short episodes are not over-represented. `policy` acts for all agents. It may
     be a function like a policy's `act`, and `memory` its initial recurrent state, leading axis N;
     `Seats.of_teams` has a policy for each team. A compiled call makes `block` steps. InputError for
-    a policy of another task, and for episodes that do not end within `max_steps`.
+    a policy of another task, for actions that are not finite, and for episodes that do not end
+    within `max_steps`.
 
     Example:
         ```python
@@ -126,6 +128,7 @@ class Evaluator:
             progress = self._run(progress, seats, keys, np.uint32(done_steps), quota)
             finished = np.minimum(np.asarray(progress.finished), quota)
             report(float(finished.sum() / (quota.sum() * len(keys))))
+            self._check_finite(seats, np.asarray(progress.finite))
             if np.all(finished == quota):
                 # Only the sums are indexed: environment states may contain unbatched leaves.
                 sums = jax.device_get(progress._replace(env_state=(), memory=()))
@@ -143,6 +146,19 @@ class Evaluator:
             "steps"
         )
 
+    def _check_finite(self, seats: Seats, finite: np.ndarray) -> None:
+        """Raises an InputError that names the policy of actions that were not finite."""
+        own = teams_of(self._env)[0]
+        for seat in seats.seats:
+            if not finite[..., list(seat.acts)].all():
+                field = "policy" if seat.acts[0] in own else "opponent"
+                raise InputError(not_finite(field, title(seat.policy)))
+
+
+def not_finite(field: str, name: str) -> str:
+    """Returns the message of a policy whose actions are not finite."""
+    return f"{field}: {brief(name)} returns actions with NaN or infinity; they must be in [-1, 1]"
+
 
 def _begin(env: VectorEnv, seats: Seats, key: jax.Array) -> _Progress:
     state = env.reset(key)
@@ -153,7 +169,8 @@ def _begin(env: VectorEnv, seats: Seats, key: jax.Array) -> _Progress:
         jax.tree.map(lambda x: jnp.zeros(x.shape), state.outcome),
     )
     memory = seats.initial_memory(env.num_envs)
-    return _Progress(state, memory, none, none, zero, *sums, zero)
+    finite = jnp.ones((env.num_envs, env.num_agents), bool)
+    return _Progress(state, memory, none, none, zero, *sums, zero, finite)
 
 
 def _run_block(
@@ -193,6 +210,7 @@ def _run_block(
                 step_sums=step_sums,
                 outcome=ends,
                 diverged=diverged,
+                finite=p.finite & jnp.all(jnp.isfinite(action), axis=-1),
             ),
             None,
         )

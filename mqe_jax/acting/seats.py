@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, Protocol, Self
 
 import jax
@@ -192,15 +193,29 @@ class Seat:
         return action.at[rows, rows_of(self.acts)].set(chosen), memory
 
 
+def action_and_memory(returned: Any) -> tuple[Any, Any]:
+    """Returns the two values that a policy's `act` returned; InputError for anything else."""
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        kind = "an array" if hasattr(returned, "shape") else type(returned).__name__
+        fail("policy", f"a function that returns {kind}", "one that returns (action, memory)")
+    return returned[0], returned[1]
+
+
+def title(policy: Any) -> str:
+    """Returns how messages and tables name a policy, which may be a name, a path or a function."""
+    inner = policy.policy if isinstance(policy, Fixed) else policy
+    if isinstance(inner, Fixed):
+        return title(inner)
+    own = getattr(inner, "__name__", "") or getattr(inner, "name", "")
+    return str(inner) if isinstance(inner, Path) else str(own or inner)
+
+
 def _check_act(returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
     """Returns what a policy's `act` returned: actions, and a recurrent state like its `memory`.
 
     Actions have the passed shape. InputError for anything else.
     """
-    if not isinstance(returned, tuple | list) or len(returned) != 2:
-        found = f"a function that returns {type(returned).__name__}"
-        fail("policy", found, "one that returns (action, memory)")
-    action, after = returned
+    action, after = action_and_memory(returned)
     expected = shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32))
     if shapes_of(action) != expected or is_typed_key(action):
         given = getattr(action, "shape", type(action).__name__)

@@ -90,11 +90,16 @@ def known_name(wrong: str, name: str, known: Collection[str]) -> str:
     return name
 
 
+def _initials(name: str) -> str:
+    """Returns the first letters of the words of a dotted name's end: lr of a.learning_rate."""
+    return "".join(word[:1] for word in name.rpartition(".")[2].split("_"))
+
+
 def nearest(word: object, known: Iterable[object], least: float = 0.5) -> str:
     """Returns ' (did you mean ...?)' for the closest known word, or an empty string.
 
     `least` is the share of letters that must match. A word that ends with the whole of it is closer
-    than one that only looks like it.
+    than one that only looks like it, and so is one with these initials.
     """
     import difflib  # 10 ms, which a program needs for a message only
 
@@ -102,5 +107,6 @@ def nearest(word: object, known: Iterable[object], least: float = 0.5) -> str:
     names = [str(name) for name in known]
     match = difflib.get_close_matches(text, names, 1, 0.85)
     match += sorted((x for x in names if x.endswith((f".{text}", f"_{text}"))), key=len)
+    match += [x for x in names if len(text) > 1 and text == _initials(x)]
     match += difflib.get_close_matches(text, names, 1, least)
     return f" (did you mean {match[0]!r}?)" if match else ""

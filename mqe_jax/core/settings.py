@@ -282,6 +282,19 @@ def fail(name: str, value: object, allowed: str) -> NoReturn:
     raise InputError(f"{name}: {short_repr(value)} is not allowed; it must be {allowed}")
 
 
+def check_call(name: str, function: Callable[..., Any], *arguments: str) -> None:
+    """Raises the `InputError` of a function that cannot be called with these arguments."""
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # of a builtin function
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        found = f"{getattr(function, '__name__', 'function')}{signature}"
+        fail(name, found, f"a function of ({', '.join(arguments)})")
+
+
 def build(kind: type[T], values: Mapping[str, Any]) -> T:
     """Builds settings from names and values.
 

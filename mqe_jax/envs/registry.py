@@ -17,7 +17,7 @@ from mqe_jax.core import imports
 from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.lazy import load
 from mqe_jax.core.literal import echo
-from mqe_jax.core.settings import checked, fail
+from mqe_jax.core.settings import check_call, checked, fail
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -167,9 +167,20 @@ NAMED_SCRIPTED: dict[str, dict[str, ScriptedPolicy | str]] = {
 as in `SCRIPTED`."""
 
 
+NAMES = ("scripted", "random", "idle", "forward")
+"""Policies of all tasks: scripted, uniform random actions, zero actions, half speed ahead."""
+
+
 @checked
 def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
     """Registers a further scripted policy of a task under a name that no other one has.
+
+    The policy is a function of the observation blocks of one team in one environment: arrays (A,
+    width) by name, as `mqe tasks TASK` lists them. It returns actions (A, 3) in [-1, 1], which are
+    shares of vx, vy and yaw rate in their default ranges: 1 is 1 m/s in every skill and with any
+    `command_ranges`. (To a function `act(obs, memory, key)`, actions are shares of the ranges that
+    the environment has.) It is compiled: it uses `jax.numpy`, and what it captures, such as
+    weights, is constant.
 
     Example:
         ```python
@@ -178,10 +189,16 @@ def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
         register_scripted("go1tug", "wait", lambda obs: jax.numpy.zeros((len(obs["base"]), 3)))
         policy = mqe_jax.load_policy("wait", mqe_jax.make("go1tug"))
         ```
+
+    Raises:
+        InputError: for an unknown task, a name that is taken, or a function of other arguments.
     """
     if not name:
         fail("name", name, "a text that is not empty")
     known_name("task: unknown", task, TASKS)
+    if name in NAMES or name in TASKS:
+        fail("name", name, "another one: it is that of a policy of the package")
+    check_call(f"policy {name!r}", policy, "obs")
     if NAMED_SCRIPTED.setdefault(task, {}).setdefault(name, policy) is not policy:
         raise InputError(f"policy: the name {name!r} is already registered for {task}")
 

@@ -8,19 +8,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mqe_jax.acting.seats import action_and_memory
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
-from mqe_jax.core.settings import checked
+from mqe_jax.core.settings import checked, fail
 from mqe_jax.core.types import Memory, Observations, RandomKey
 from mqe_jax.envs import QuadrupedEnv, TaskParams
-from mqe_jax.envs.registry import NAMED_SCRIPTED
-from mqe_jax.policies.scripted import find_scripted, scripted_policy
+from mqe_jax.envs.registry import NAMED_SCRIPTED, NAMES
+from mqe_jax.policies.scripted import compiling, find_scripted, scripted_policy
 from mqe_jax.skills.control import Commander
 from mqe_jax.train.policy import check_obs
-
-NAMES = ("scripted", "random", "idle", "forward")
-"""Policies of all tasks: scripted, uniform random actions, zero actions, half speed ahead."""
 
 _FORWARD = 0.25
 """The first action of `forward`."""
@@ -78,12 +76,21 @@ def named(name: str, env: QuadrupedEnv, field: str = "policy") -> SimplePolicy:
     return SimplePolicy(env.name, agents, plan, name, identity)
 
 
-def from_function(act: Callable[..., Any], env: QuadrupedEnv) -> SimplePolicy:
+def from_function(act: Callable[..., Any], env: QuadrupedEnv, name: str = "") -> SimplePolicy:
     """Returns the policy of a function `act(obs, memory, key)` for one team of a task.
 
-    The function has no recurrent state.
+    The function has no recurrent state: its memory is ().
     """
-    return SimplePolicy(env.name, len(env.teams[0]), lambda obs, key: act(obs, (), key)[0])
+
+    def plan(obs: jax.Array, key: jax.Array) -> jax.Array:
+        with compiling(name):
+            action, memory = action_and_memory(act(obs, (), key))
+        if jax.tree.leaves(memory):
+            allowed = "one that returns (action, ()); an object with `initial_memory` has a memory"
+            fail("policy", f"{name or 'a function'} with a memory", allowed)
+        return action
+
+    return SimplePolicy(env.name, len(env.teams[0]), plan, name)
 
 
 def _uniform(shape: tuple[int, ...], obs: jax.Array, key: jax.Array) -> jax.Array:

@@ -4,17 +4,17 @@ import base64
 import dataclasses
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import jax
-from annotated_types import MinLen
 
 from mqe_jax import names
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.results import Result, pool
+from mqe_jax.acting.seats import title
 from mqe_jax.core.limits import (
     Candidates,
     ClipLength,
@@ -26,7 +26,7 @@ from mqe_jax.core.limits import (
     Speed,
     Time,
 )
-from mqe_jax.core.settings import Parameters, checked, fail, merge
+from mqe_jax.core.settings import Parameters, check, checked, fail, merge
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.envs.registry import task_id
 from mqe_jax.names import Read, Source, Table
@@ -132,7 +132,7 @@ def _measure(
 @checked
 def tournament(
     task: str | QuadrupedEnv,
-    policies: Annotated[Sequence[str], MinLen(1)],
+    policies: Sequence[Source] | Mapping[str, Source],
     *,
     env: Parameters | None = None,
     impl: str = "auto",
@@ -148,14 +148,17 @@ def tournament(
     Example:
         ```python
         standings = mqe_jax.tournament("go1tug", ["go1tug", "forward"], episodes=2)
+        print(standings.ratings.value, standings.results[0, 1])  # of go1tug against forward
         standings.save("runs/tournament")
         ```
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `load_policy` accepts, and populations. In a match, scripted, idle and random
-            play too; ratings are relative to scripted, else to idle. In a task of one team, agent 0
-            follows each policy with each one as its mates; scripted and idle play too.
+        policies: what `evaluate` accepts, and populations: a list, or a mapping of names to them.
+            In a match, scripted, idle and random play too; ratings are relative to scripted, else
+            to idle. In a task of one team, agent 0 follows each policy with each one as its mates;
+            scripted and idle play too. As in `evaluate`, a trained policy brings its skill, with
+            which then all robots act.
         episodes: episodes of each pair on each side, or of each team.
 
     Returns:
@@ -165,8 +168,8 @@ def tournament(
         InputError: as `evaluate`.
     """
     name = task_id(task) if isinstance(task, str) else task.name
-    policies = population.expand(policies, name)
-    found = {source: names.find(source, name) for source in policies}
+    given = _named(policies, name)
+    found = {each: names.find(source, name, field="policies") for each, source in given.items()}
     params = dict(env or {})
     if isinstance(task, str):
         params = merge(names.parameters_of(name, found.values()), params)
@@ -180,8 +183,9 @@ def tournament(
     everyone = tuple(dict.fromkeys([*own, *references]))
     envs, copies = (len(everyone) * episodes, 1) if match else (episodes, len(everyone))
     batch = VectorEnv(made, envs, copies, final=())
+    found = {each: names.find(each, name) for each in references} | found
     teams = {
-        each: names.seat(each, made, "policy", found, deterministic=deterministic)
+        each: names.fit(found[each], made, deterministic=deterministic, name=each)
         for each in everyone
     }
     key = jax.random.PRNGKey(seed)
@@ -191,6 +195,25 @@ def tournament(
     results = league.round_robin(batch, teams, key)
     ratings = league.rate(results, everyone.index(references[0]))
     return Standings(made.name, everyone, results, ratings, made.skill_text)
+
+
+def _named(policies: Any, task: str) -> dict[str, Source]:
+    """Returns what plays a tournament, by the names that its tables have."""
+    if isinstance(policies, Mapping):
+        pairs = [(check("policies", name, str), each) for name, each in policies.items()]
+    elif isinstance(policies, Sequence) and not isinstance(policies, str):
+        pairs = [(title(each), each) for each in population.expand(policies, task)]
+    else:
+        pairs = []
+    if not pairs:
+        fail("policies", policies, "a list of policies, or a mapping of names to them")
+    named: dict[str, Source] = {}
+    for name, each in pairs:
+        texts = isinstance(each, str) and isinstance(named.get(name, name), str)
+        if (name in named or name in REFERENCES) and not (texts and each == name):
+            fail("policies", name, "the name of one policy; {'own': policy} gives it another name")
+        named[name] = each
+    return named
 
 
 @checked

@@ -148,8 +148,10 @@ class Versus(OneTeam):
     def _check_blocks(self, num_envs: int) -> None:
         blocks = len(self.seats.seats)
         if not blocks or num_envs % blocks:
-            allowed = f"a divisor of the environments of a process, {num_envs}"
-            fail("opponents", blocks, allowed)
+            raise InputError(
+                f"opponents: {num_envs} environments of a process do not divide among {blocks} "
+                "opponents"
+            )
 
     @single
     @checked

@@ -1,16 +1,19 @@
 """Scripted policies (`--policy scripted`), at least one per task, and their steering."""
 
+import contextlib
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, known_name
 from mqe_jax.core.lazy import load
+from mqe_jax.core.settings import fail
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import ObservationLayout
+from mqe_jax.envs.params import TaskParams
 from mqe_jax.envs.registry import NAMED_SCRIPTED, SCRIPTED, ScriptedPolicy
 
 # The blocks (A, width) of one environment's observations by name.
@@ -49,13 +52,48 @@ def scripted_policy(env: QuadrupedEnv, name: str = "scripted") -> Callable[[jax.
         ```
 
     Raises:
-        InputError: if the task has none of this name.
+        InputError: if the task has none of this name, or if it reads a block that the task does not
+            have, or returns actions of another shape.
     """
-    plan = find_scripted(env.name, name)
+    agents = len(env.teams[0])
+    plan = functools.partial(_plan, find_scripted(env.name, name), name, agents)
     layout = env.layouts["policy"]
     if env.varies:
         return functools.partial(_plan_with_absent, plan, layout)
     return lambda obs: plan(layout.split(obs))
+
+
+@contextlib.contextmanager
+def compiling(name: str) -> Iterator[None]:
+    """Raises an InputError if a policy needs numbers that it has only after it is compiled."""
+    errors = jax.errors
+    try:
+        yield
+    except (
+        errors.TracerArrayConversionError,
+        errors.ConcretizationTypeError,
+        errors.TracerIntegerConversionError,
+    ) as error:
+        allowed = "jax.numpy in place of numpy, and jnp.where in place of if"
+        raise InputError(f"policy: {name} is compiled; it must use {allowed}") from error
+
+
+def _plan(
+    policy: ScriptedPolicy, name: str, agents: int, blocks: dict[str, jax.Array]
+) -> jax.Array:
+    """Returns the actions (A, 3) of a policy, checked."""
+    try:
+        with compiling(name):
+            action = policy(blocks)
+    except KeyError as error:
+        known_name(f"policy {name!r}: no block", str(error.args[0]), blocks)
+        raise
+    expected = (agents, len(TaskParams.commands))
+    shape = getattr(action, "shape", type(action).__name__)
+    if shape != expected:
+        allowed = f"one that returns {expected}, an action for each robot of the team"
+        fail(f"policy {name!r}", f"a function that returns {shape}", allowed)
+    return action
 
 
 def _plan_with_absent(plan: ScriptedPolicy, layout: ObservationLayout, obs: jax.Array) -> jax.Array:

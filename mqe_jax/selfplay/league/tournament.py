@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from mqe_jax.acting.evaluate import not_finite
 from mqe_jax.acting.results import Rate
-from mqe_jax.acting.seats import Policy, Seat, Seats, check_policy, exchangeable
+from mqe_jax.acting.seats import Policy, Seat, Seats, check_policy, exchangeable, title
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import checked
 from mqe_jax.core.types import (
@@ -48,7 +50,8 @@ def play(
 
     The first episode of each environment counts.
     """
-    return _play(matches, [policy], opponents, [key])[0]
+    names = [title(each) for each in opponents]
+    return _play(matches, [policy], opponents, [key], [title(policy)], names)[0]
 
 
 def round_robin(
@@ -56,19 +59,26 @@ def round_robin(
 ) -> NDArray[np.int64]:
     """Returns the outcomes of each policy as team 0 against each as team 1.
 
-    They are (P, P, 3), in the order of `RESULTS`.
+    They are (P, P, 3), in the order of `RESULTS`. InputError for a policy whose actions are not
+    finite.
     """
     teams = list(policies.values())
-    return _play(matches, teams, teams, jax.random.split(key, len(teams)))
+    names = list(policies)
+    return _play(matches, teams, teams, jax.random.split(key, len(teams)), names, names)
 
 
 @single
 def _play(
-    matches: VectorEnv, policies: Sequence[Policy], opponents: Sequence[Policy], keys: Any
+    matches: VectorEnv,
+    policies: Sequence[Policy],
+    opponents: Sequence[Policy],
+    keys: Any,
+    names: Sequence[str],
+    names_of_opponents: Sequence[str],
 ) -> NDArray[np.int64]:
     """Returns the outcomes of P policies as team 0 against each of K opponents (P, K, 3).
 
-    Each policy has its key. One compiled program serves all policies.
+    Each policy has its key and its name. One compiled program serves all policies.
     """
     for policy in policies:
         check_policy(policy, matches)
@@ -78,28 +88,40 @@ def _play(
     (team,) = env.teams
 
     @jax.jit
-    def run(seats: Seats, key: jax.Array) -> jax.Array:
+    def run(seats: Seats, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         def advance(carry: Any, key: jax.Array) -> tuple[Any, None]:
-            state, memory, finished, outcome = carry
+            state, memory, finished, outcome, finite = carry
             action, memory = seats.act(observations(state), memory, key, still)
             state = env.step(state, action)
             done = state.terminated | state.truncated
             now = state.outcome.result[:, 0] > 0
             outcome = jnp.where((done & ~finished)[:, None], now, outcome)
-            return (state, memory, finished | done, outcome), None
+            finite &= jnp.all(jnp.isfinite(state.action), axis=-1)
+            return (state, memory, finished | done, outcome, finite), None
 
         key, reset_key = jax.random.split(key)
         memory = seats.initial_memory(count)
         nothing = jnp.zeros((count,), bool), jnp.zeros((count, 3), bool)
-        start = env.reset(reset_key), memory, *nothing
-        (_, _, _, outcome), _ = jax.lax.scan(
+        every = jnp.ones((count, matches.num_agents), bool)
+        start = env.reset(reset_key), memory, *nothing, every
+        (_, _, _, outcome, finite), _ = jax.lax.scan(
             advance, start, jax.random.split(key, matches.max_episode_steps)
         )
-        return outcome
+        return outcome, finite
 
+    outcomes = []
     teams = [Seats((Seat(actor, team, team),)) for actor in exchangeable(policies)]
-    outcomes = np.stack([run(seats, key) for seats, key in zip(teams, keys, strict=True)])
-    return outcomes.reshape(len(policies), -1, len(opponents), 3).sum(axis=1)
+    for seats, key, name in zip(teams, keys, names, strict=True):
+        outcome, finite = map(np.asarray, run(seats, key))
+        half = len(team)
+        sound = [finite[place :: len(opponents), half:].all() for place in range(len(opponents))]
+        for each, right in zip(
+            [name, *names_of_opponents], [finite[:, :half].all(), *sound], strict=True
+        ):
+            if not right:
+                raise InputError(not_finite("policies", each))
+        outcomes.append(outcome)
+    return np.stack(outcomes).reshape(len(policies), -1, len(opponents), 3).sum(axis=1)
 
 
 def scores(results: NDArray[Any]) -> Array:
