@@ -12,6 +12,7 @@ from mqe_jax.core.limits import Environments, Horizon, Seed
 from mqe_jax.core.settings import checked
 from mqe_jax.core.types import RESULTS
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
+from mqe_jax.envs.match import Match
 
 _OVERLAP = 0.05  # m, of two bodies at the start
 
@@ -58,10 +59,12 @@ def check_task(
         shape = (num_envs, env.num_agents, env.action_size)
         return batch.step(state, env.action_limit * jax.random.uniform(key, shape, minval=-1.0))
 
+    _check_sides(env)
     reset = jax.jit(batch.reset)
     first_key, key = jax.random.split(jax.random.PRNGKey(seed))
     first = reset(first_key)
     _check_same("reset", first, reset(first_key))
+    _check_blocks(env, first)
     _check_shapes(env, first)
     _check_start(env, first)
     keys = jax.random.split(key, steps)
@@ -86,6 +89,31 @@ def _check_same(method: str, one: Any, other: Any) -> None:
         name = jax.tree_util.keystr(path).lstrip(".")
         same = np.array_equal(value, again, equal_nan=True)
         assert same, f"{method}: the same random key gives another State.{name}"
+
+
+def _check_sides(env: QuadrupedEnv) -> None:
+    """Checks that in a match each team, seen from its own side, starts as the other."""
+    if not isinstance(env, Match):
+        return
+    poses = np.array(env.spawn_poses(), np.float32)[: env.num_agents]
+    info = np.zeros((len(poses), 6), np.float32)
+    info[:, [0, 1, 5]] = poses
+    first, second = np.asarray(env.views(jnp.asarray(info))).reshape(2, 2, -1, 6)[[0, 1], [0, 1]]
+    turned = np.angle(np.exp(1j * (first - second)[:, 5]))
+    apart = np.abs(first - second)[:, :2].max()
+    seen = f"{second[0, :2].round(2).tolist()}, yaw {second[0, 5]:.2f}"
+    assert max(apart, np.abs(turned).max()) < 1e-3, (
+        f"spawn_poses: team 1 sees its first robot start at {seen}, team 0 at "
+        f"{poses[0, :2].round(2).tolist()}, yaw {poses[0, 2]:.2f}; they are equal if spawn_poses, "
+        f"symmetry ({env.symmetry}) and center {env.center} agree"
+    )
+
+
+def _check_blocks(env: QuadrupedEnv, state: Any) -> None:
+    """Checks that observations are finite before the environment makes them so."""
+    blocks = jax.jit(jax.vmap(lambda x: env.observe(x, env.read(x.data, x.active))))(state)
+    for name, block in blocks.items():
+        assert np.isfinite(block).all(), f"observe: {name}: a number is NaN or infinite"
 
 
 def _check_shapes(env: QuadrupedEnv, state: Any) -> None:

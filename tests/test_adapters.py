@@ -4,6 +4,7 @@ opponent.
 
 import dataclasses
 import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -27,6 +28,9 @@ from mqe_jax.adapters.host import HostEnvs
 from mqe_jax.adapters.opponent import TeamEnv
 from mqe_jax.envs import tasks
 from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.envs.gate import Go1Gate
+from mqe_jax.envs.registry import TASKS as TASK_CLASSES
+from mqe_jax.envs.registry import register_task
 from mqe_jax.names import versus
 from mqe_jax.policies.simple import SimplePolicy
 from mqe_jax.skills.weights import ASSETS
@@ -197,6 +201,9 @@ def test_bad_calls_are_named() -> None:
     vector.reset(seed=SEED)
     refuses(r"action: shape \(2, 2, 3\); expected \(3, 2, 3\)", vector.step, action[:2])
     refuses("NaN or infinity", vector.step, action * np.nan)
+    single = SingleEnv("go1gate", impl="c", **SHORT)
+    said = r"action: shape \(3,\); expected \(2, 3\) \(agents, action size\)"
+    refuses(said, single.step, action[0, 0])
     for seed in ([1, 2], 1.5, "abc"):
         refuses(r"seed: .*3 integers", vector.reset, seed=seed)
     refuses(r"seed: 4294967296 is not allowed", vector.reset, seed=2**32)
@@ -212,6 +219,24 @@ def test_every_task_is_registered() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "SingleEnv<mqe/go1gate-v0>" in out.stdout
+
+
+def test_a_task_of_ones_own_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "own-gate"
+    monkeypatch.delitem(TASK_CLASSES, name, raising=False)
+    register_task(type("OwnGate", (Go1Gate,), {"name": name}))
+    env: Any = gymnasium.make(f"mqe/{name}-v0", impl="c")
+    assert env.unwrapped.env.name == name
+    monkeypatch.delitem(TASK_CLASSES, name)
+    del gymnasium.registry[f"mqe/{name}-v0"]
+
+
+def test_a_forked_process_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without it, `make_vec(vectorization_mode="async")` waits for ever."""
+    task_env("go1gate", impl="c")
+    child = os.getpid() + 1
+    monkeypatch.setattr(os, "getpid", lambda: child)
+    refuses("JAX would hang in a forked process; .*'context': 'spawn'", SingleEnv, "go1gate")
 
 
 def match(task: str = "go1wrestling", **settings: Any) -> Any:

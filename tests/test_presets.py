@@ -297,6 +297,11 @@ def test_accepted(values: dict[str, Any], expected: dict[str, Any]) -> None:
     assert [type(getattr(made, name)) for name in expected] == kinds
 
 
+def test_a_field_without_annotation_is_an_error() -> None:
+    said = "Own: rewards is no field; write rewards: Inner = Inner"
+    refuses(said, settings_class, type("Own", (), {"rewards": Inner()}))
+
+
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"count": 0}, "count: 0 is not allowed; it must be greater than 0"),
     ({"count": 1.5}, "count: 1.5 is not allowed; it must be a valid integer"),

@@ -6,6 +6,8 @@ such a library, which knows the tasks by name.
 """
 
 import dataclasses
+import functools
+import os
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,12 @@ def missing(library: str, error: ImportError) -> InputError:
     return InputError(f"mqe_jax.adapters.{library}: needs the package {library} ({error}); {hint}")
 
 
+@functools.cache
+def _first_process() -> int:
+    """Returns the process that first made an environment; a fork of it has no threads of JAX."""
+    return os.getpid()
+
+
 @checked
 def task_env(
     task: str | QuadrupedEnv,
@@ -57,6 +65,11 @@ def task_env(
     Raises:
         InputError: for an argument that is not allowed.
     """
+    if _first_process() != os.getpid():
+        raise InputError(
+            "environment: JAX would hang in a forked process; start it by spawn, in Gymnasium "
+            "vector_kwargs={'context': 'spawn'}"
+        )
     name = task.name if isinstance(task, QuadrupedEnv) else task_id(task)
     rival = None if opponent is None else names.find(opponent, name, field="opponent")
     if isinstance(task, QuadrupedEnv):

@@ -36,6 +36,7 @@ from mqe_jax.core.types import RandomKeys, where_rows
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs import State as TaskState
 from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.envs.registry import REGISTERED
 
 try:
     from brax.envs import register_environment
@@ -50,7 +51,7 @@ FINAL_OBS = "AutoResetWrapper_final_obs"
 
 
 def register() -> None:
-    """Registers every task under its id; call it again after `mqe_jax.envs.register_task`."""
+    """Registers every task under its id, as later `mqe_jax.envs.register_task` does."""
     for task in envs.tasks():
         register_environment(task, functools.partial(Env, task))  # pyright: ignore[reportArgumentType]
 
@@ -202,6 +203,7 @@ def wrap(
 
 
 register()
+REGISTERED.append(register)
 
 
 def _replicate(tree: Any, devices: Sequence[Any]) -> Any:

@@ -20,15 +20,16 @@ from gymnasium.vector.utils import batch_space
 
 from mqe_jax import envs
 from mqe_jax.adapters import seen_space, task_env, team_reward
-from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs
+from mqe_jax.adapters.host import RENDER_MODES, RENDER_SIZE, HostEnvs, check_action
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, Pixels, PositiveInt, Seed
 from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs.registry import REGISTERED
 
 
 def register() -> None:
-    """Registers every task as `mqe/TASK-v0`; call it again after `mqe_jax.envs.register_task`."""
+    """Registers every task as `mqe/TASK-v0`, as later `mqe_jax.envs.register_task` does."""
     for task in envs.tasks():
         if f"mqe/{task}-v0" not in registry:
             gymnasium.register(
@@ -78,7 +79,8 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._host.reset([seed], self.np_random)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        out = self._host.step([action])
+        shape = (self.env.num_agents, self.env.action_size)
+        out = self._host.step([check_action(action, shape)])
         info: dict[str, Any] = {name: value[0] for name, value in out.info.items()}
         info["agent_rewards"] = out.reward[0]
         reward = float(team_reward(self.env, out.reward.astype(float), out.active)[0])
@@ -220,3 +222,4 @@ def _reset_mask(options: Mapping[str, Any] | None, num_envs: int) -> np.ndarray:
 
 
 register()
+REGISTERED.append(register)

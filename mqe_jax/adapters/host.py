@@ -125,18 +125,7 @@ class HostEnvs:
         if self.state is None:
             raise InputError("step: reset the environment first")
         shape = (self.num_envs, self.env.num_agents, self.env.action_size)
-        try:
-            with np.errstate(all="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("error")  # complex numbers
-                action = np.asarray(action, np.float32)
-        except (TypeError, ValueError, OverflowError, np.exceptions.ComplexWarning):
-            fail("action", action, "an array of numbers")
-        if action.shape != shape:
-            axes = "(environments, agents, action size)"
-            raise InputError(f"action: shape {action.shape}; expected {shape} {axes}")
-        if not np.isfinite(action).all():
-            raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
-        self.state, out = self._programs[1](self.state, action, reset)
+        self.state, out = self._programs[1](self.state, check_action(action, shape), reset)
         return jax.tree.map(np.array, jax.device_get(out))  # copies, as JAX arrays are read-only
 
     def render(self, index: int = 0) -> np.ndarray | None:
@@ -153,6 +142,22 @@ class HostEnvs:
             model = rendering_model(self._task.mj_model, episode)
             self._camera = default_camera(model, episode, self._size[0] / self._size[1])
         return np.array(next(iter(render_frames(self._task, episode, [self._camera], self._size))))
+
+
+def check_action(action: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns actions as an array of this shape; InputError for another one, or without numbers."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("error")  # complex numbers
+            numbers = np.asarray(action, np.float32)
+    except (TypeError, ValueError, OverflowError, np.exceptions.ComplexWarning):
+        fail("action", action, "an array of numbers")
+    if numbers.shape != shape:
+        axes = ", ".join(("environments", "agents", "action size")[-len(shape) :])
+        raise InputError(f"action: shape {numbers.shape}; expected {shape} ({axes})")
+    if not np.isfinite(numbers).all():
+        raise InputError("action: contains NaN or infinity; expected numbers in [-1, 1]")
+    return numbers
 
 
 def info_of(state: State) -> dict[str, jax.Array]:

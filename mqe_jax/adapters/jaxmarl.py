@@ -33,6 +33,7 @@ from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.core.types import RandomKey
 from mqe_jax.envs import QuadrupedEnv, State
 from mqe_jax.envs.autoreset import autoreset
+from mqe_jax.envs.registry import REGISTERED
 
 try:
     import jaxmarl
@@ -231,3 +232,4 @@ class Env(MultiAgentEnv):
 
 
 register()
+REGISTERED.append(register)

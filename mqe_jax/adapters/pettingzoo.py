@@ -19,6 +19,7 @@ from mqe_jax.core.errors import InputError, short_repr
 from mqe_jax.core.limits import Pixels, PositiveInt
 from mqe_jax.core.settings import check, checked, fail
 from mqe_jax.envs import QuadrupedEnv
+from mqe_jax.envs.registry import REGISTERED
 
 try:
     import pettingzoo
@@ -29,7 +30,7 @@ except ImportError as error:
 
 
 def register() -> None:
-    """Registers every task as `mqe/TASK-v0`; call it again after `mqe_jax.envs.register_task`."""
+    """Registers every task as `mqe/TASK-v0`, as later `mqe_jax.envs.register_task` does."""
     for task in envs.tasks():
         name = f"mqe/{task}-v0"
         if name not in pettingzoo.parallel_registry:
@@ -204,3 +205,4 @@ def _rows(space: gymnasium.spaces.Box) -> list[gymnasium.spaces.Box]:
 
 
 register()
+REGISTERED.append(register)

@@ -120,6 +120,11 @@ def settings_class(cls: type[T]) -> type[T]:
     decorated too.
     """
     hints = typing.get_type_hints(cls, include_extras=True)
+    for name in vars(cls).keys() - inspect.get_annotations(cls).keys():
+        value = vars(cls)[name]
+        if is_settings(value) and not isinstance(value, type):
+            kind = type(value).__name__
+            raise InputError(f"{cls.__name__}: {name} is no field; write {name}: {kind} = {kind}()")
     cls.__annotations__ = {name: _accept_yaml(hints[name]) for name in inspect.get_annotations(cls)}
     made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
 

@@ -104,10 +104,11 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         self.objects = self.compiled.objects
         for name, (places, noise) in self.spreads.items():
             room = self.compiled.layout.room(places)
+            what = "spawn_poses" if name == "spawn_noise" else "its places"
             if room < 0.0:
-                raise InputError(f"{name}: its middle is {-room:.2f} m outside of the outer walls")
+                raise InputError(f"{name}: {what} lie {-room:.2f} m outside of the outer walls")
             if noise > room:
-                allowed = f"at most {room:.2f}, the distance to the nearest outer wall"
+                allowed = f"at most {room:.2f}, the distance of {what} to the nearest outer wall"
                 fail(name, getattr(self.params, name), allowed)
         constraints = self.params.constraints_per_robot * scene.num_robots
         constraints += 4 * self.extra_contacts

@@ -5,13 +5,14 @@ A match is symmetric under a half turn about its centre ("turn") or a reflection
 policy can control either team.
 """
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.settings import fail
+from mqe_jax.core.returned import check_shape
+from mqe_jax.core.settings import check, fail
 from mqe_jax.core.types import Outcome
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.observation import (
@@ -83,6 +84,7 @@ class Match(QuadrupedEnv[S, P]):
         return np.repeat([0, 1], self.num_agents // 2)
 
     def __init__(self, params: P | None = None, **options: Any) -> None:
+        check("symmetry", self.symmetry, Literal["turn", "reflect"])
         super().__init__(params, **options)
         if self.symmetry == "turn" or self.control != "command":
             return
@@ -107,8 +109,8 @@ class Match(QuadrupedEnv[S, P]):
 
     def wins(self, state: State[S], robot_state: RobotState) -> jax.Array:
         """Returns which team wins if the episode ends in this step (2,) bool, at most one."""
-        out = self.eliminated(state, robot_state)
-        leading = self.leading(state, robot_state)
+        out = check_shape("eliminated", self.eliminated(state, robot_state), (2,))
+        leading = check_shape("leading", self.leading(state, robot_state), (2,))
         return jnp.where(jnp.any(out), out[::-1] & ~out, leading & ~leading[::-1])
 
     def further(self, state: State[S], robot_state: RobotState) -> dict[str, jax.Array]:

@@ -33,7 +33,8 @@ class Randomization:
     """
 
     friction: Frictions | None = None
-    """Sliding friction of the robots' collision geoms (lowest, highest)."""
+    """Sliding friction of the robots' collision geoms (lowest, highest), in place of the task
+    parameter `friction`."""
     payload: Payloads | None = None
     """Additional mass of the trunk, kg; its inertia is scaled by the same factor as its mass."""
     center_of_mass: Offsets | None = None

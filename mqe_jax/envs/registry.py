@@ -170,6 +170,9 @@ as in `SCRIPTED`."""
 NAMES = ("scripted", "random", "idle", "forward")
 """Policies of all tasks: scripted, uniform random actions, zero actions, half speed ahead."""
 
+REGISTERED: list[Callable[[], None]] = []
+"""What `register_task` calls: the adapters make the task known to their libraries."""
+
 
 @checked
 def register_scripted(task: str, name: str, policy: ScriptedPolicy) -> None:
@@ -233,6 +236,8 @@ def register_task(
     TASKS[task.name] = task
     if scripted is not None:
         SCRIPTED[task.name] = scripted
+    for known_to in REGISTERED:
+        known_to()
     return task
 
 

@@ -28,6 +28,9 @@ from mqe_jax.viz import curves
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_FEW_UPDATES = 20
+_MANY_STEPS = 100_000  # of a training that is no trial
+
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run:
@@ -217,6 +220,9 @@ def _train(
     if steps > 1.1 * config.total_steps:
         update = f"num_envs {config.num_envs} x rollout_steps {config.rollout_steps}"
         echo(f"mqe: total_steps {config.total_steps:,} become {steps:,}, whole updates of {update}")
+    if config.num_updates < _FEW_UPDATES and steps >= _MANY_STEPS:
+        size = f"{config.num_updates} updates of {config.steps_per_update:,} steps"
+        echo(f"mqe: {size} are few to learn from; --config laptop has small ones")
     with (
         guard(cast.env, dump_diverged) as env,
         open_training(cast._replace(env=env), configs, folders, resume) as training,

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _REWARDS = ("average_step_reward", "episode_return")
+_EPISODES = 10  # fewest of an update whose success is drawn
 _INK = "#23252b"
 _RUN = "#2f7fd6"
 _SECOND = "#3fae49"
@@ -72,10 +73,10 @@ def plot_curves(
         steps = table["env_steps"] / 1e6
         reward = table[name]
         axes.plot(steps, reward, color=_RUN, lw=0.6, alpha=0.3)
-        label = "mqe_jax" if table is tables[0] else None
-        axes.plot(steps, smooth(reward), color=_RUN, lw=1.8, label=label)
+        axes.plot(steps, smooth(reward), color=_RUN, lw=1.8)
     last = max(table["env_steps"][-1] for table in tables) / 1e6
-    axes.set(xlabel="environment steps (millions)", ylabel=name.replace("_", " "), xlim=(0, last))
+    axes.set(xlabel="environment steps (millions)", xlim=(0, last))
+    axes.set_ylabel(name.replace("_", " "), color=_RUN)
     if any(np.isfinite(table.get("success", math.nan)).any() for table in tables):
         right = axes.twinx()
         notes = []
@@ -87,17 +88,20 @@ def plot_curves(
             rate = each["sampled"].get("success_rate")
             height = math.nan if rate is None else 100 * rate
             right.plot(each["env_steps"] / 1e6, height, "o", color=_SECOND, ms=4)
-        right.set(ylim=(0, 100))
+        right.set(ylim=(0, 101))  # a line at 100% is beside the frame
         right.set_ylabel("\n".join(["success rate in training (%)", *notes]), color=_SECOND)
         right.spines[["top", "left"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, loc="best")
     return figure
 
 
 def _plot_success(axes: Any, table: Mapping[str, np.ndarray]) -> bool:
-    """Draws a seed's success in training, dotted with assistance; returns whether there is any."""
+    """Draws a seed's success in training, dotted with assistance; returns whether there is any.
+
+    Updates in which few episodes ended have no success.
+    """
     steps = table["env_steps"] / 1e6
-    rate = 100 * np.asarray(smooth(table["success"]))
+    ended = np.asarray(table.get("episodes", np.full(len(steps), _EPISODES)))
+    rate = 100 * np.asarray(smooth(np.where(ended < _EPISODES, math.nan, table["success"])))
     assisted = np.asarray(table.get("assistance", np.zeros(len(steps)))) > 0
     for shown, style in ((assisted, ":"), (~assisted, "-")):
         axes.plot(steps, np.where(shown, rate, math.nan), style, color=_SECOND, lw=1.4, alpha=0.9)

@@ -10,6 +10,8 @@ from mqe_jax.physics.robots.robot import Robot
 
 ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GO1, GO2)}
 
+_OTHERS = ("an MJCF", "a YAML that names one", "menagerie:NAME")
+
 
 def get(name: str) -> Robot:
     """Returns a robot by name, or that of an MJCF or YAML file, or of `menagerie:NAME`.
@@ -21,7 +23,7 @@ def get(name: str) -> Robot:
         from mqe_jax.physics.robots.files import load  # which takes MuJoCo
 
         return load(name)
-    return ROBOTS[known_name("robot: unknown name", name, ROBOTS)]
+    return ROBOTS[known_name("robot: unknown name", name, (*ROBOTS, *_OTHERS))]
 
 
 def is_file(name: str) -> bool:
