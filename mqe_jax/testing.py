@@ -59,10 +59,10 @@ def check_task(
         shape = (num_envs, env.num_agents, env.action_size)
         return batch.step(state, env.action_limit * jax.random.uniform(key, shape, minval=-1.0))
 
-    _check_sides(env)
     reset = jax.jit(batch.reset)
     first_key, key = jax.random.split(jax.random.PRNGKey(seed))
     first = reset(first_key)
+    _check_sides(env)
     _check_same("reset", first, reset(first_key))
     _check_blocks(env, first)
     _check_shapes(env, first)

@@ -25,6 +25,7 @@ from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import Network
 from mqe_jax.train.runner import Training
 from mqe_jax.train.stages import Stages
+from mqe_jax.viz.curves import smooth
 from tests.fake_env import SMALL, FakeEnv, FakeVectorEnv
 from tests.inputs import refuses
 from tests.training import assert_same, registered
@@ -252,13 +253,22 @@ def test_a_run_is_plotted(run: mqe_jax.Run) -> None:
     )
     assert figure._repr_png_().startswith(b"\x89PNG")  # pyright: ignore[reportAttributeAccessIssue]
     evaluated = {"env_steps": 32, "sampled": {"success_rate": 0.5}}
-    metrics = run.metrics | {"assistance": np.array([1.0, 0.0]), "success": np.full(2, 0.5)}
+    metrics = run.metrics | {
+        "assistance": np.array([1.0, 0.0]),
+        "success": np.full(2, 0.5),
+        "episodes": np.ones(2),
+    }
     shown = dataclasses.replace(run, metrics=metrics, evaluations=[evaluated]).plot().axes[1]
     assert shown.get_ylabel().splitlines()[1:] == ["dotted: with assistance", "points: evaluated"]
     assisted, alone, point = shown.lines
     np.testing.assert_array_equal(np.isnan(assisted.get_ydata()), [False, True])
     np.testing.assert_array_equal(np.isnan(alone.get_ydata()), [True, False])
     np.testing.assert_allclose(np.asarray(point.get_xydata()), [[32e-6, 50.0]])
+
+
+def test_an_update_counts_as_much_as_episodes_ended_in_it() -> None:
+    assert smooth([1.0, 0.0, np.nan], 1.0, [1, 3, 5]) == [1.0, 0.25, 0.25]
+    assert smooth([1.0, 0.0], 1.0) == [1.0, 0.5]
 
 
 def test_a_run_whose_weights_are_not_finite_is_not_saved(run: mqe_jax.Run) -> None:

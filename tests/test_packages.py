@@ -81,7 +81,8 @@ def test_a_run_asks_for_what_else_its_import_registered(forget: Any, mqe: Any) -
     policy = mqe_jax.load_policy("go1gate")
     config = override(policy.config, {"env.robot": "own"})
     for names, said in {
-        ("own.py", "my robots.py"): "robot: unknown name 'own'; allowed: go1, go2; "
+        ("own.py", "my robots.py"): "robot: unknown name 'own'; allowed: go1, go2, an MJCF, "
+        "a YAML that names one, menagerie:NAME; "
         "add --import own.py --import 'my robots.py'\n",
         3: "run/policy.safetensors: its settings cannot be read (imports: 3 is not allowed; "
         "it must be a list)\n",

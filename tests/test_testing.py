@@ -68,7 +68,7 @@ def unfair_score(env: Any, before: Any, after: Any, collision: Any) -> Any:
         (
             Go1Tug,
             "spawn_poses",
-            lambda env: [(0.0, 0.0, 0.0)],
+            lambda env: [*Go1Tug.spawn_poses(env)][:1],
             "spawn_poses: 1; expected 2, one per",
         ),
         (Go1Tug, "symmetry", "rotate", "symmetry: 'rotate' is not allowed; it must be 'turn' or"),

@@ -102,9 +102,6 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
         self.robots = self.compiled.robots
         self.index = self.compiled.index
         self.objects = self.compiled.objects
-        starts = len(self.spawn_poses())
-        if starts != len(self.robots):
-            raise InputError(f"spawn_poses: {starts}; expected {len(self.robots)}, one per robot")
         for name, (places, noise) in self.spreads.items():
             room = self.compiled.layout.room(places)
             what = "spawn_poses" if name == "spawn_noise" else "its places"

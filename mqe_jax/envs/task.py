@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.returned import weights_of
 from mqe_jax.core.settings import to_mapping
 from mqe_jax.envs.observation import (
@@ -129,6 +130,10 @@ class Task(Sensing, Generic[S, P]):
         """Samples spawn poses x, y, z, yaw of all robots (R, 4), m and rad."""
         params = self.params
         poses = [(x, y, params.spawn_height, yaw) for x, y, yaw in self.spawn_poses()]
+        if len(poses) != len(self.robots):
+            raise InputError(
+                f"spawn_poses: {len(poses)}; expected {len(self.robots)}, one per robot"
+            )
         most = params.spawn_noise
         noise = jax.random.uniform(key, (len(poses), 2), minval=-most, maxval=most)
         return jnp.asarray(np.array(poses, np.float32)).at[:, :2].add(noise)

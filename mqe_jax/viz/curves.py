@@ -27,19 +27,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _REWARDS = ("average_step_reward", "episode_return")
-_EPISODES = 10  # fewest of an update whose success is drawn
 _INK = "#23252b"
 _RUN = "#2f7fd6"
 _SECOND = "#3fae49"
 
 
-def smooth(values: ArrayLike, fraction: float = 0.02) -> list[float]:
-    """Returns the running mean over a window of `fraction` of the rows, of finite values only."""
+def smooth(
+    values: ArrayLike, fraction: float = 0.02, weights: ArrayLike | None = None
+) -> list[float]:
+    """Returns the running mean over a window of `fraction` of the rows, of finite values only.
+
+    `weights` are those of the rows, by default equal.
+    """
     values = np.asarray(values, np.float64)
+    weight = np.ones(len(values)) if weights is None else np.asarray(weights, np.float64)
+    weight = np.where(np.isfinite(values), weight, 0.0)
     width = max(1, round(len(values) * fraction))
-    windows = [values[max(0, end - width) : end] for end in range(1, len(values) + 1)]
-    finite = [window[np.isfinite(window)] for window in windows]
-    return [float(window.mean()) if window.size else math.nan for window in finite]
+    windows = [slice(max(0, end - width), end) for end in range(1, len(values) + 1)]
+    totals = [weight[window].sum() for window in windows]
+    sums = [np.nansum(values[window] * weight[window]) for window in windows]
+    return [float(x / total) if total else math.nan for x, total in zip(sums, totals, strict=True)]
 
 
 def plot_curves(
@@ -97,11 +104,10 @@ def plot_curves(
 def _plot_success(axes: Any, table: Mapping[str, np.ndarray]) -> bool:
     """Draws a seed's success in training, dotted with assistance; returns whether there is any.
 
-    Updates in which few episodes ended have no success.
+    An update counts as much as episodes ended in it.
     """
     steps = table["env_steps"] / 1e6
-    ended = np.asarray(table.get("episodes", np.full(len(steps), _EPISODES)))
-    rate = 100 * np.asarray(smooth(np.where(ended < _EPISODES, math.nan, table["success"])))
+    rate = 100 * np.asarray(smooth(table["success"], weights=table.get("episodes")))
     assisted = np.asarray(table.get("assistance", np.zeros(len(steps)))) > 0
     for shown, style in ((assisted, ":"), (~assisted, "-")):
         axes.plot(steps, np.where(shown, rate, math.nan), style, color=_SECOND, lw=1.4, alpha=0.9)
