@@ -16,7 +16,7 @@ from mqe_jax import make, names
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.cli.train import parse_train
 from mqe_jax.core.settings import override
-from mqe_jax.core.types import Batch, Observations
+from mqe_jax.core.types import EXACT, Batch, Observations
 from mqe_jax.policies import zoo
 from mqe_jax.runs.cast import prepare
 from mqe_jax.train.learner import make_learner
@@ -171,16 +171,18 @@ class SeeingState(ProbeState):
 
 
 class Seeing(Probe):
-    """Environments whose group `signs` shows the sign alone; the second entry of an action moves
+    """Environments whose group `shown` has the sign alone; the second entry of an action moves
     nothing.
     """
+
+    shown = "signs"
 
     def moving(self, action: jax.Array) -> jax.Array:
         return action[..., :1]
 
     def _seeing(self, state: Any) -> Any:
         signs = jnp.broadcast_to(state.hidden[:, None, None], (self.num_envs, self.num_agents, 1))
-        return SeeingState(**{**vars(state), "groups": {"signs": signs}})
+        return SeeingState(**{**vars(state), "groups": {self.shown: signs}})
 
     def reset(self, key: jax.Array) -> Any:
         return self._seeing(super().reset(key))
@@ -203,13 +205,29 @@ class Counter:
         return jnp.tile(obs.group("signs") * memory[:, None, None] / 8, 2), memory + 1
 
 
-def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
+class SeeingExactly(Seeing):
+    """Environments that show a teacher the sign, and the policy more."""
+
+    shown = EXACT
+
+
+class PlainCounter(Counter):
+    """A teacher that sees what policies see, without errors."""
+
+    groups = ("policy",)
+
+    def act(self, obs: Any, memory: Any, key: Any) -> Any:
+        return super().act(Observations({"signs": obs.obs}), memory, key)
+
+
+@pytest.mark.parametrize(("kind", "teacher"), [(Seeing, Counter), (SeeingExactly, PlainCounter)])
+def test_a_recurrent_teacher_of_another_group_is_imitated(kind: Any, teacher: Any) -> None:
     """Its memory passes from rollout to rollout, and starts anew with each episode."""
 
     def show(hidden, step):
         return jnp.stack([hidden, step.astype(jnp.float32)], axis=-1)
 
-    env = Seeing(
+    env = kind(
         show,
         pay_one,
         num_envs=32,
@@ -234,7 +252,7 @@ def test_a_recurrent_teacher_of_another_group_is_imitated() -> None:
         network__log_std_min=-1.0,
         stages=registered(Watched),
     )
-    metrics = updated(env, config, 12, teacher=Counter())[1]
+    metrics = updated(env, config, 12, teacher=teacher())[1]
     for obs, action in shown:
         np.testing.assert_allclose(action, obs[..., 2:3] * obs[..., 3:] / 8 / 0.5, atol=1e-6)
     losses = [float(row["loss/imitation"]) for row in metrics]

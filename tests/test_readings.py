@@ -10,11 +10,13 @@ import pytest
 
 from mqe_jax import InputError, presets, tasks
 from mqe_jax.core.blocks import Block, entities
+from mqe_jax.core.types import observations
 from mqe_jax.envs import make
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.readings import Reading, ReadingErrors, Readings
 from mqe_jax.envs.sets import randomization_of
+from mqe_jax.runs.cast import prepare
 
 ENVS = 128
 READINGS = Readings(
@@ -63,6 +65,22 @@ def test_errors_have_the_sizes_of_their_quantities_and_a_bias_for_the_episode() 
         assert np.std(values) == pytest.approx(size, rel=0.1)
     agents = position[0].reshape(ENVS, 2, 2)
     assert abs(np.corrcoef(agents[:, 0, 0], agents[:, 1, 0])[0, 1]) < 0.3  # errors of their own
+
+
+def test_teachers_see_no_errors() -> None:
+    given = {"observation_noise": 0.2, "readings": {"position": {"bias": 0.5}, "delay": 2}}
+    settings = {"num_envs": 8, "rollout_steps": 4, "total_steps": 32, "ppo.minibatches": 1}
+    teacher = {"imitation.teacher": "scripted", "curriculum.demonstrator": None}
+    _, cast = prepare("go1gate", {**settings, **teacher}, {"randomization": given}, impl="c")
+    _, plain = prepare("go1gate", settings | teacher, impl="c")
+    states = [each.env.reset(KEY) for each in (cast, plain)]
+    seen, usual = (
+        observations(jax.jit(each.env.step)(x, jnp.zeros((8, 2, 3))))
+        for each, x in zip((cast, plain), states, strict=True)
+    )
+    np.testing.assert_allclose(seen.exact().obs, usual.obs, atol=1e-5)
+    assert np.abs(seen.obs - usual.obs).max() > 0.1
+    assert usual.exact() is usual
 
 
 def test_readings_are_late_and_get_lost() -> None:

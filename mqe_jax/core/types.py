@@ -242,6 +242,10 @@ class Outcome:
         return values | {f"ending/{name}": x for name, x in self.ending.items()}
 
 
+EXACT = "exact"
+"""The group of observations that is `policy` without errors."""
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Observations:
@@ -265,6 +269,12 @@ class Observations:
                 f"{', '.join(self.groups)}"
             )
         return self.groups[name]
+
+    def exact(self) -> "Observations":
+        """Returns what a teacher sees: the group `exact`, if it is observed, as `policy`."""
+        if EXACT not in self.groups:
+            return self
+        return dataclasses.replace(self, groups={**self.groups, "policy": self.groups[EXACT]})
 
     @classmethod
     def at(cls, seen: Any, group: str = "policy") -> "Observations":

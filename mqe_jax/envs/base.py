@@ -26,7 +26,7 @@ from mqe_jax.core.limits import Environments
 from mqe_jax.core.precision import single
 from mqe_jax.core.returned import alike, check_shape, check_signatures, results, weights_of
 from mqe_jax.core.settings import Parameters, check, checked, differences, fail
-from mqe_jax.core.types import Level, Outcome, RandomKey
+from mqe_jax.core.types import EXACT, Level, Outcome, RandomKey
 from mqe_jax.envs.assembly import make_controller, make_scene
 from mqe_jax.envs.observation import ObservationLayout, finite, observe_bodies
 from mqe_jax.envs.params import P, weights_digest
@@ -442,11 +442,11 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
                 blocks, senses = self.suite.observe(self.snapshot(state, robots), state.senses, key)
                 state = dataclasses.replace(state, senses=senses)
             else:
-                blocks = self.observe_group(name, state, robots)
+                blocks = self.observe_group("policy" if name == EXACT else name, state, robots)
             if not self.robots.alike:
                 blocks = {**blocks, "bodies": observe_bodies(self.robots, self.teams)}
             obs = layout.pack(blocks, self.num_agents)
-            if noise:
+            if noise and name != EXACT:
                 key = jax.random.fold_in(state.key, keys.NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
             if name in self.reading_errors:

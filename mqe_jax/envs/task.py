@@ -17,6 +17,7 @@ import numpy as np
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.returned import weights_of
 from mqe_jax.core.settings import to_mapping
+from mqe_jax.core.types import EXACT
 from mqe_jax.envs.observation import (
     ObservationLayout,
     bodies_block,
@@ -231,8 +232,9 @@ class Task(Sensing, Generic[S, P]):
     def layouts(self) -> Mapping[str, ObservationLayout]:
         """Layouts of all groups of observations by name.
 
-        The group `policy` is always observed, the others if a policy or a critic names them. Each
-        has the block `bodies` if robots are unlike.
+        The group `policy` is always observed, the others if a policy or a critic names them.
+        `exact` is `policy` without errors, where it has some: teachers see it. Each has the block
+        `bodies` if robots are unlike.
         """
         layouts = {
             "policy": self.observation_layout,
@@ -242,6 +244,9 @@ class Task(Sensing, Generic[S, P]):
             layouts[ONBOARD] = ObservationLayout(self.suite.blocks)
         if self.variable_num_agents:
             layouts[ENTITIES] = entity_layout(self.sized_layout)
+        randomization = self.params.randomization
+        if randomization.observation_noise or randomization.readings != Readings():
+            layouts[EXACT] = self.observation_layout
         if self.robots.alike:
             return layouts
         bodies = bodies_block(self.robots)

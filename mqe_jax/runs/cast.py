@@ -9,7 +9,7 @@ from mqe_jax import names
 from mqe_jax.acting.seats import Policy, Seats, groups_of
 from mqe_jax.core.limits import Environments, SeedCount, bounds
 from mqe_jax.core.settings import Parameters, checked, fail, leaves, override, to_mapping
-from mqe_jax.core.types import Cast
+from mqe_jax.core.types import EXACT, Cast
 from mqe_jax.core.types import VectorEnv as AnyVectorEnv
 from mqe_jax.envs import SCRIPTED, QuadrupedEnv, TaskParams, VectorEnv
 from mqe_jax.envs.autoreset import EnvBatch
@@ -161,7 +161,8 @@ def environments(
     match = len(trained.teams) > 1
     both = match and not config.opponents
     batch = _batch(trained, config, num_envs // 2 if both else num_envs, seeds, demonstrator)
-    env: Any = batch.with_groups(groups)
+    exact = () if teacher is None else {EXACT}.intersection(trained.layouts)
+    env: Any = batch.with_groups(groups.union(exact))
     if config.time_limit_ends:
         env = Deadline(env)
     league = None

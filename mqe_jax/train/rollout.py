@@ -80,9 +80,10 @@ def rollout(
     """Steps every environment `length` times under the policy.
 
     Returns the new state, transitions (T, N, ...) and metrics (). The environment receives
-    `action_scale` times the sampled action. A teacher, which sees its own group of observations,
-    labels every step with its action. Metrics are means over steps and environments, but `diverged`
-    and `overflow` are counts; `ended` has the number of `episodes` that ended and means over them.
+    `action_scale` times the sampled action. A teacher labels every step with its action. It sees
+    its own group of observations, `exact` instead of `policy`. Metrics are means over steps and
+    environments, but `diverged` and `overflow` are counts; `ended` has the number of `episodes`
+    that ended and means over them.
     """
 
     def one_step(
@@ -110,7 +111,7 @@ def rollout(
             remembered = teacher.restart((state.teacher_memory,), state.is_first)
             teacher_key = jax.random.fold_in(key, keys.SECOND)
             label, (teacher_memory,) = teacher.act(
-                observations(before), remembered, teacher_key, jnp.zeros_like(action)
+                observations(before).exact(), remembered, teacher_key, jnp.zeros_like(action)
             )
         after = env.step(before, action_scale * action)
         done = after.terminated | after.truncated
