@@ -82,6 +82,7 @@ def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: A
     assert all(sizes["outputs"][f"next_{name}"] == sizes["inputs"][name] for name in memory)
     properties = {entry.key: entry.value for entry in model.metadata_props}
     assert (properties["task"], properties["control"]) == ("go1pushbox", "command")
+    assert (properties["kp_nm_per_rad"], properties["kd_nms_per_rad"]) == ("20.0", "0.5")
     assert properties["period_s"] == "0.02" and properties["opset"] == "17"
     assert file.stat().st_size < 4.0e6  # weights that float16 represents are stored as such
 

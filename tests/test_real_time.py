@@ -140,11 +140,14 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_robot_asks_for_the_velocity_of_its_action(file: Path) -> None:
     readings = np.random.default_rng(0).normal(size=(20, 16))
     alone = robot.Robot(str(file))
+    last = np.zeros(3)
     own = robot.Robot(str(file))
     controller: Any = make("go1gate", impl="c", num_envs=1, **RANGES).controller
     for step, row in enumerate(readings):
         action = alone.act(row[None], [step == 0])
+        np.testing.assert_array_equal(own.last_action, last)
         velocity = own.velocity(row, starts=step == 0)
+        last = action[0]
         np.testing.assert_allclose(velocity, controller.change(action)[0], atol=1e-5)
         back = controller.change(controller.action_of(velocity))
         np.testing.assert_allclose(back, velocity, atol=1e-5)
@@ -176,32 +179,35 @@ def test_a_world_names_a_robot_whose_process_is_killed_and_outlasts_a_late_one(w
     """The killed one stands at once, the late one when its last command is 0.2 s old."""
     from mqe_jax.export.real_time import open_robots
 
-    keys = jax.random.split(jax.random.PRNGKey(0), 1)
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
     velocities = []
+    at = 15
     step = world._step
 
     def stepped(state: Any, memory: Any, velocity: Any) -> Any:
         velocities.append(velocity.copy())
-        if len(velocities) == 15:
+        if len(velocities) == at:
             os.kill(robots[1]._process.pid, number)
         return step(state, memory, velocity)
 
     world._step = stepped
     number = signal.SIGSTOP
     with open_robots(world, 1, 0.0, None) as robots:
-        course = world.play(robots, keys)
+        course = world.play(robots, keys[:1])
     assert course.steps == 50 and course.stood >= 10
     assert np.abs(velocities[14][1]).max() > 0.0 and not np.any(velocities[40:], axis=(0, 2))[1]
     velocities.clear()
     number = signal.SIGKILL
-    said = r"^export: the process of robot 1 ended with -9 .*; it stood 0\.\d\d s after a command$"
+    at = 65
+    said = r"^export: the process of robot 1 ended with -9 .*; it was told to stand 0\.\d\d s "
+    said += "after its last command; [01] of 1 finished episodes succeeded$"
     with (
         pytest.raises(ConnectionError, match=said) as error,
         open_robots(world, 1, 0.0, None) as robots,
     ):
         world.play(robots, keys)
     world._step = step
-    assert float(str(error.value).split()[-5]) <= 0.24 and len(velocities) <= 15 + 12
+    assert float(str(error.value).split("stand ")[1][:4]) <= 0.24 and len(velocities) <= at + 12
     assert not velocities[-1][1].any()
 
 

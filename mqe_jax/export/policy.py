@@ -21,7 +21,7 @@ joints; entries beyond a robot's own mean nothing.
 
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -39,6 +39,7 @@ from mqe_jax.envs.params import weights_digest
 from mqe_jax.export.translate import OPSET, translate
 from mqe_jax.physics.robots.fleet import Fleet, pad
 from mqe_jax.physics.robots.index import Proprioception
+from mqe_jax.physics.robots.robot import Robot
 from mqe_jax.skills.control import Group
 from mqe_jax.train.policy import TrainedPolicy
 
@@ -179,11 +180,6 @@ def shapes(model: onnx.ModelProto) -> dict[str, dict[str, list[Any]]]:
 def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
     """Returns the metadata of a policy's graph."""
     blocks = env.layouts[policy.needs.group].blocks
-    team = env.robots[: policy.agents]
-
-    def of_robots(rows: list[Any]) -> str:
-        return json.dumps(rows if len({*team}) > 1 else rows[0])
-
     layout = [[block.name, block.width, block.meaning] for block in blocks]
     return {
         "mqe_jax": mqe_jax.__version__,
@@ -194,9 +190,23 @@ def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
         "period_s": f"{env.dt:g}",
         "group": policy.needs.group,
         "observation": json.dumps(layout),
+        **joint_properties(env.robots[: policy.agents]),
+        "env_steps": str(policy.metadata.get("env_steps", "")),
+    }
+
+
+def joint_properties(team: Sequence[Robot]) -> dict[str, str]:
+    """Returns the metadata on the joints of a graph's robots: one value if robots are alike."""
+
+    def of_robots(rows: list[Any]) -> str:
+        return json.dumps(rows if len({*team}) > 1 else rows[0])
+
+    return {
         "joints": of_robots([list(robot.joint_names) for robot in team]),
         "default_joints_rad": of_robots(
             [np.round(robot.default_joints, 6).tolist() for robot in team]
         ),
-        "env_steps": str(policy.metadata.get("env_steps", "")),
+        "kp_nm_per_rad": of_robots([round(robot.kp, 6) for robot in team]),
+        "kd_nms_per_rad": of_robots([round(robot.kd, 6) for robot in team]),
+        "joint_angles": "rad, in blocks of the observation minus default_joints_rad",
     }

@@ -95,7 +95,8 @@ class World:
         """Plays an episode for each random key (N, 2); `report` is called after each.
 
         Raises:
-            ConnectionError: naming a robot whose process has ended. The robot stands then.
+            ConnectionError: naming a robot whose process has ended, and the result until then. The
+                robot stands.
         """
         course = Course()
         for robot in robots.values():
@@ -103,7 +104,12 @@ class World:
         for episode, key in enumerate(keys):
             state, memory = self._begin(key)
             time.sleep(PAUSE)
-            self._play(robots, episode, state, memory, course)
+            try:
+                self._play(robots, episode, state, memory, course)
+            except ConnectionError as error:
+                won = round(sum(course.successes))
+                said = f"{error}; {won} of {episode} finished episodes succeeded"
+                raise ConnectionError(said) from None
             report()
         return course
 
@@ -144,7 +150,8 @@ class World:
             for agent, robot in robots.items():
                 if robot.ended:
                     passed = (now - last[agent]) * self.env.dt
-                    raise ConnectionError(f"{robot.end}; it stood {passed:.2f} s after a command")
+                    what = f"told to stand {passed:.2f} s after its last command"
+                    raise ConnectionError(f"{robot.end}; it was {what}")
             tick = max(tick + self.env.dt, time.monotonic())
             time.sleep(max(0.0, tick - time.monotonic()))
             course.steps += 1

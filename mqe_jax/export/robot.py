@@ -40,9 +40,12 @@ class Robot:
         options.intra_op_num_threads = 1  # a team has one program per robot
         self._session: Any = onnxruntime.InferenceSession(graph, options, ["CPUExecutionProvider"])
         self._shapes = {x.name: tuple(x.shape[1:]) for x in self._session.get_inputs()}
-        self._outputs = [x.name for x in self._session.get_outputs()]
+        outputs = {x.name: tuple(x.shape[1:]) for x in self._session.get_outputs()}
+        self._outputs = [*outputs]
         self._random = np.random.default_rng(seed)
         self._memory: dict[str, np.ndarray] = {}
+        self.last_action = np.zeros(math.prod(outputs["action"]), np.float32)
+        """Action of the last `velocity` (D,), 0 before: what the block `action` of readings has."""
         # metadata of the graph
         self.properties: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
         about = json.loads(self.properties.get("velocity", "{}"))
@@ -67,6 +70,7 @@ class Robot:
         `readings` (O,); `starts` says whether the episode starts. ValueError as `act` and `speed`.
         """
         (action,) = self.act(np.asarray(readings)[None], [float(starts)])
+        self.last_action = action
         about = self._commands
         change = np.where(action < 0, *about["slopes"]) * action
         return np.clip(about["default"] + change, *about["limits"].T)

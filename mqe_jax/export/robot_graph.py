@@ -5,6 +5,8 @@
 | `obs` (N, 1, O) | `action` (N, 1, D) | the robot's row of the policy's group; actions in [-1, 1] |
 | `noise` (N, K) | | standard normal numbers, of a policy that samples |
 | `memory`, `memory_NAME` | `next_memory`, ... | recurrent state, zero at an episode's start |
+
+`skill_onnx` has the graph of its skill: from commands and joints to joint targets.
 """
 
 import dataclasses
@@ -15,14 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import onnx
+from onnx import helper
 
 from mqe_jax.acting.seats import check_policy
 from mqe_jax.core.settings import fail, to_mapping
 from mqe_jax.core.types import observations, shapes_of
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
-from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors
-from mqe_jax.export.policy import properties
-from mqe_jax.export.task import Shapes, readings_function
+from mqe_jax.export.check import LARGEST_ERROR, STEPS, Arrays, check_errors, verify
+from mqe_jax.export.policy import joint_properties, properties
+from mqe_jax.export.task import Shapes, readings_function, skill_function
 from mqe_jax.export.translate import translate
 from mqe_jax.train.policy import TrainedPolicy, template
 
@@ -78,6 +81,27 @@ def verify_robot(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelPr
             "one whose robots act on their own readings only (--per-robot)",
         )
     return model, check_errors(model, inputs, outputs, f"{STEPS} steps of {env.name}")
+
+
+def skill_onnx(env: QuadrupedEnv) -> onnx.ModelProto:
+    """Returns the graph of the skill of a task's robots, which must be alike.
+
+    `joint_position` and `joint_target` are angles in rad, not minus the stance. At an episode's
+    start, the inputs with the skill's name are zero; then they are the outputs `next_NAME`. The
+    metadata has the joints, their stance and gains, and the default of each command.
+    """
+    function, sizes = skill_function(env)
+    skill = env.controller.skill
+    random = np.random.default_rng(0)
+    given = {
+        name: random.normal(size=(STEPS, *size)).astype(np.float32) for name, size in sizes.items()
+    }
+    model = verify(function, sizes, skill.name, given)
+    names = [command.name for command in skill.commands]
+    defaults = dict(zip(names, env.controller.default_commands.tolist(), strict=True))
+    about = joint_properties(env.robots) | {"default_commands": json.dumps(defaults)}
+    helper.set_model_props(model, about)
+    return model
 
 
 def _one_robot(policy: TrainedPolicy) -> TrainedPolicy:

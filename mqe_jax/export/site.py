@@ -29,8 +29,9 @@ from mqe_jax.envs.randomization import Randomization
 from mqe_jax.export.check import verify
 from mqe_jax.export.libraries import add_libraries
 from mqe_jax.export.policy import shapes
+from mqe_jax.export.robot_graph import skill_onnx
 from mqe_jax.export.scene import scene_settings, scene_xml
-from mqe_jax.export.task import TaskFunctions, policy_function, skill_function, state_arrays
+from mqe_jax.export.task import TaskFunctions, policy_function, state_arrays
 from mqe_jax.export.translate import Function
 from mqe_jax.physics import robots
 from mqe_jax.policies import zoo
@@ -254,7 +255,8 @@ def write_skill(env: QuadrupedEnv, folder: Path) -> dict[str, Any]:
 
     Returns its file and the shapes of its graph.
     """
-    graph = _graph(*skill_function(env), env.controller.skill.name, {})
+    graph = skill_onnx(env)
+    del graph.metadata_props[:]  # tasks with other default commands share it
     content = graph.SerializeToString()
     name = f"{env.controller.skill.name}-{hashlib.sha256(content).hexdigest()[:8]}.onnx"
     (folder / "skills").mkdir(parents=True, exist_ok=True)
