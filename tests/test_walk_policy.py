@@ -192,6 +192,14 @@ def test_weights_with_other_names_or_shapes_are_refused(read: Any, tmp_path: pat
         refuses(rf"weights\.safetensors: {re.escape(message)}.*; expected", read, file)
 
 
+def test_weights_of_another_skill_or_robot_are_named() -> None:
+    assets = walk_policy.ASSETS
+    said = r"walk policy: .*agile_go1.* weights of the skill agile, which --set skill=agile chooses"
+    refuses(said, walk_policy.load_params, GO1, assets / "agile_go1.safetensors")
+    with pytest.warns(UserWarning, match=r"walk_go2.safetensors was trained on go2, it moves go1"):
+        walk_policy.load_params(GO1, assets / "walk_go2.safetensors")
+
+
 def test_observation_has_the_order_and_scales_of_walk_these_ways() -> None:
     memory = walk_policy.WalkMemory(
         jnp.zeros((30, 70)), jnp.full(12, 0.5), jnp.full(12, 0.25), jnp.zeros(())

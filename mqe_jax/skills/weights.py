@@ -20,13 +20,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.errors import InputError
-from mqe_jax.core.files import check_locks, linear_layers, read_tensors, write_atomically
+from mqe_jax.core.errors import InputError, warn
+from mqe_jax.core.files import (
+    check_locks,
+    linear_layers,
+    parse_json,
+    parsing,
+    read_tensors,
+    write_atomically,
+)
 from mqe_jax.physics.robots.quadruped import JOINTS, NUM_JOINTS
 from mqe_jax.physics.robots.robot import Robot
 
 ASSETS = pathlib.Path(__file__).parents[1] / "assets"
 Params = dict[str, dict[str, dict[str, jax.Array]]]
+_KNOWN: dict[str, Networks] = {}  # by skill
 
 
 def layers(
@@ -56,6 +64,9 @@ class Networks:
     title: str  # what messages call it
     widths: Mapping[str, tuple[int, ...]]
     """Widths of each part from input to output, by name; the last part outputs the action."""
+
+    def __post_init__(self) -> None:
+        _KNOWN[self.skill] = self
 
     @property
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -100,6 +111,8 @@ class Networks:
     def load(self, robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
         """Reads weights as float32 from a safetensors file, by default those shipped for the robot.
 
+        Warns of weights that were trained on another robot.
+
         Raises:
             InputError: if the file is missing, damaged, or holds other names or shapes.
         """
@@ -115,7 +128,16 @@ class Networks:
             )
         if not file.is_file():
             raise InputError(f"{self.title}: no file {file}; {train}")
-        return self.nest(read_tensors(file, self.title), str(file))
+        flat = read_tensors(file, self.title)
+        found = {name.rpartition(".")[0] for name in flat}
+        fitting = [name for name, other in _KNOWN.items() if found == {*other.sizes}]
+        if fitting and self.skill not in fitting:
+            use = f"weights of the skill {fitting[0]}, which --set skill={fitting[0]} chooses"
+            raise InputError(f"{self.title}: {file} has {use}")
+        trained = _about(file).get("robot", robot.identity)
+        if trained != robot.identity:
+            warn(f"{self.title}: {file} was trained on {trained}, it moves {robot.identity}")
+        return self.nest(flat, str(file))
 
     def save(
         self,
@@ -144,3 +166,14 @@ class Networks:
             write_atomically(file, save(flat, {"about": json.dumps(dict(metadata or {}))}))
         except OSError as error:
             raise InputError(f"{self.title}: cannot write {file}: {error.strerror}") from None
+
+
+def _about(file: pathlib.Path) -> dict[str, Any]:
+    """Returns the metadata that `Networks.save` has written into a file."""
+    from safetensors import safe_open
+
+    with (
+        parsing(file, "weights with metadata that mqe has written"),
+        safe_open(file, "np") as opened,
+    ):
+        return dict(parse_json((opened.metadata() or {}).get("about", "{}"), "about"))
