@@ -22,7 +22,7 @@ class Race(Duel[None, RaceParams]):
     """Two robots race to x = 4 m."""
 
     name, title, Params = "race", "Race", RaceParams
-    symmetry = "reflect"  # the robots start side by side: team 1 sees and acts in a mirror
+    symmetry = "reflect"  # the robots start side by side
 
     def scene(self):
         return Scene(Track(blocks=(SpawnArea(1.5), Plane(4.0), EndWall()), width=4.0))
