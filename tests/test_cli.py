@@ -382,6 +382,10 @@ BAD = {
         ["train", "fake", *SMALL, "--run-dir", ""],
         ["run-dir: '' is not allowed; it must be not empty"],
     ),
+    "two configs": (
+        ["train", "fake", "--config", "laptop", "--config=robust"],
+        ["config: 'laptop and robust' is not allowed; it must be one"],
+    ),
     "long word": (["eval", "x" * 100_000], ["at most 4096 characters"]),
     "no text": (["eval", "a\udcff"], ["control character"]),
     "task as a parameter": (

@@ -223,6 +223,9 @@ def test_a_shipped_task_is_shown(task: str, mqe: Any) -> None:
     assert all(f"\n  {name}=" in shown for name in vars(env.params.rewards))
     assert all(f"\n  {name}" in shown for name in vars(env.params) if name not in GROUPS)
     assert f" {default_name(task)}: " in shown
+    assert (
+        "randomization.payload=None" in shown and "[lowest, highest], each 0.001 to 100)" in shown
+    )
     assert max(map(len, shown.splitlines())) <= 80
     found = json.loads(mqe(f"tasks {task} --json").out)
     assert sum(block["width"] for block in found["observation"]) == env.observation_size

@@ -23,6 +23,7 @@ from mqe_jax.envs import make
 from mqe_jax.export.scene import scene_settings, scene_xml
 from mqe_jax.names import load_policy, table
 from mqe_jax.physics import robots
+from mqe_jax.physics.robots import files
 from mqe_jax.physics.robots.build import build_robot
 from mqe_jax.physics.robots.index import Proprioception, RobotState
 from mqe_jax.physics.robots.model import ModelRobot
@@ -327,6 +328,7 @@ def hostile(folder: Path) -> dict[str, tuple[str, str, str]]:
         "stance": (dog((" 0 0.8 -1.5 0 0.8", " 0 0.8 -3.5 0 0.8")), "",
                    "joint 'FL_knee': -3.5 rad of the stance is outside of its limits"),
         "unknown key": (dog(), "speeds: 3", "own.yaml: speeds: unknown"),
+        "unnamed feet": (dog(), "feet: [FR_foot]", "'FR_foot' names nothing; there are no names"),
         "unknown joint": (dog(), "speed: {FL_nee: 3}", "speed: 'FL_nee' names nothing"),
         "five numbers": (dog(), "speed: [1, 2, 3, 4, 5]", "speed: 5 numbers; expected 1, 12, or 3"),
         "two motors": (dog(("<actuator>", "<actuator><velocity joint='FL_knee' kv='1'/>")), "",
@@ -475,15 +477,20 @@ def test_sizes_of_tasks_follow_the_body_and_the_users_number_wins() -> None:
 def test_the_card_of_a_task_shows_the_robot_and_its_sizes(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    command = ["tasks", "go1gate", "--robot", BIPED, "--control", "position", "--impl", "c"]
+    command = ["tasks", "go1gate", "--robot", BIPED, "--impl", "c"]
     with pytest.warns(UserWarning, match="no speed limit"):
-        robots.files._LOADED.clear()  # pyright: ignore[reportAttributeAccessIssue]
+        files._LOADED.clear()  # pyright: ignore[reportAttributeAccessIssue]
         assert cli.main(command) == 0
-    shown = capsys.readouterr().out
+    shown, said = capsys.readouterr()
+    assert "shown with control position: skill: 'walk' needs four legs of three joints" in said
     for text in ("biped@", "left_hip_roll", "16.4 kg", "no limit", "140 N m/rad", "set speed"):
         assert text in shown, text
     width = make("go1gate", impl="c", control="position", robot=BIPED).params.gate_width
     assert f"gate_width={width:g}" in shown
+    assert cli.main(["tasks", "go1gate", "--robot", DOG, "--impl", "c"]) == 0
+    shown, said = capsys.readouterr()
+    assert "no weights are shipped for dog; train a skill, 'mqe skill train agile --robot" in said
+    assert "0, 0.8, -1.5, 0, 0.8" in shown and "0.125, 0.25, 0.25, 0.125, 0.25" in shown
 
 
 def rewards_of(robot: ModelRobot, factor: float = 1.0) -> dict[str, float]:

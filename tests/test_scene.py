@@ -244,7 +244,7 @@ def test_missing_walk_weights_say_how_to_make_them() -> None:
         )
     )
     try:
-        said = r"no weights are shipped for new.*mqe skill train walk --robot new.*'position'"
+        said = r"no weights are shipped for new; .*mqe skill train agile --robot new.*'position'"
         refuses(said, make, "go1gate", impl="c", robot="new")
         for control in ("position", "torque"):
             make("go1gate", impl="c", robot="new", control=control)

@@ -61,8 +61,15 @@ def test_results_are_those_of_the_conditions(monkeypatch: pytest.MonkeyPatch) ->
     found = mqe_jax.stress("go1plane", "forward", env=low, impl="c", episodes=4, num_envs=4)
     falls = {name: result.endings["fall"] for name, result in found.results.items()}
     assert falls == {"usual": 0.0, "weak": 1.0}
-    assert found.worst in str(found)
+    assert str(found).endswith(
+        "fails most under weak: 0.0 (0.0 to 49.0)%, usually 100 (51.0 to 100)%"
+    )
     assert found.plot().axes[0].patches
+    alike = runs.Stress(dict.fromkeys(["usual", "weak", "everything"], found.results["usual"]))
+    assert str(alike).endswith("no condition differs from the usual one, by 95% intervals")
+    results = found.results
+    every = {"usual": results["usual"], "weak": results["usual"], "everything": results["weak"]}
+    assert runs.Stress(every).worst == "everything"
 
 
 def test_a_task_with_ranges_of_its_own_is_rejected() -> None:

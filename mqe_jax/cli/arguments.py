@@ -84,13 +84,21 @@ def take_imports(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _check_words(arguments: Sequence[str]) -> None:
-    """Raises an InputError for an empty value, which would stand for this folder, or no text."""
+    """Raises an InputError for an empty value, which would stand for this folder, or no text.
+
+    Also for two values of `--config`.
+    """
+    configs = []
     for flag, word in itertools.pairwise(("mqe", *arguments)):
+        if flag == "--config" or word.startswith("--config="):
+            configs.append(word.removeprefix("--config="))
         name, equals, value = word.partition("=")
         if not word or (word.startswith("--") and equals and not value):
             fail((name or flag).lstrip("-"), "", "not empty")
         if not is_text(word):
             fail(flag.lstrip("-")[: limits.SHOWN], word, TEXT)
+    if len(configs) > 1:
+        fail("config", " and ".join(configs), "one; other flags change its settings")
 
 
 def parse(arguments: Sequence[str]) -> Any:

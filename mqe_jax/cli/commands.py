@@ -23,7 +23,7 @@ from mqe_jax.cli.options import (
     print_columns,
     print_table,
 )
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, NoSkillError
 from mqe_jax.core.files import read_json
 from mqe_jax.core.limits import Environments, Episodes, Horizon, Latency
 from mqe_jax.core.literal import echo
@@ -64,7 +64,13 @@ class Tasks(TaskOptions):
             from mqe_jax.cli import task_card
             from mqe_jax.envs import make
 
-            about = task_card.describe(make(self.task, impl=self.impl, **self.overrides()))
+            given = self.overrides()
+            try:
+                env = make(self.task, impl=self.impl, **given)
+            except NoSkillError as error:
+                echo(f"mqe: shown with control position: {error}")
+                env = make(self.task, impl=self.impl, **given | {"control": "position"})
+            about = task_card.describe(env)
             if not self.json:
                 task_card.show(about, long=self.long)
             return about

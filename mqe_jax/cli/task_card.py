@@ -72,6 +72,8 @@ def _robot(robot: Robot) -> dict[str, Any]:
         "name": robot.identity,
         "title": robot.title,
         "joints": list(robot.joint_names),
+        "stance": np.round(robot.default_joints, 4).tolist(),
+        "action_scale": np.round(robot.action_scale, 4).tolist(),
         "mass": f"{sum(body.link.mass for body in robot.tree):.4g} kg",
         "height": f"{robot.stand_height:.3g} m, standing",
         "torque": span(robot.torque_limit, "N m"),
@@ -126,9 +128,9 @@ def show(card: Mapping[str, Any], *, long: bool) -> None:
     }
     _print_rows("Overview", facts.items())
     for robot in card["robots"]:
-        if "@" not in robot["name"] and len(card["robots"]) == 1:  # not of a file
-            continue
         shown = {**robot, "joints": ", ".join(robot["joints"]), "notes": "; ".join(robot["notes"])}
+        for name in ("stance", "action_scale"):
+            shown[name] = ", ".join(f"{angle:g}" for angle in robot[name]) + " rad"
         numbers = [i + 1 for i, name in enumerate(card["robot_of"]) if name == robot["name"]]
         shown["robots"] = ", ".join(map(str, numbers))
         _print_rows("Robot", ((name, text) for name, text in shown.items() if text))

@@ -41,6 +41,10 @@ class InUseError(InputError):
     """A folder that another process has locked."""
 
 
+class NoSkillError(InputError):
+    """A robot for which a skill has no weights, or cannot have any."""
+
+
 class NonFiniteError(ArithmeticError):
     """Training produced NaN or infinite numbers.
 

@@ -84,18 +84,24 @@ _CONFIG = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_typ
 
 def _check_order(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
-        raise ValueError("two numbers (lowest, highest), in this order")
+        raise ValueError("[lowest, highest], in this order")
     return value
 
 
-Range = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
-Frictions = Annotated[
-    tuple[PositiveFriction, PositiveFriction], pydantic.AfterValidator(_check_order)
-]
-Payloads = Annotated[tuple[Payload, Payload], pydantic.AfterValidator(_check_order)]
-Offsets = Annotated[tuple[Offset, Offset], pydantic.AfterValidator(_check_order)]
-Factors = Annotated[tuple[Factor, Factor], pydantic.AfterValidator(_check_order)]
-Coordinates = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_check_order)]
+def _check_pair(value: Any) -> Any:
+    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
+        raise ValueError("[lowest, highest]")
+    return value
+
+
+_Pair = pydantic.BeforeValidator(_check_pair)
+_Order = pydantic.AfterValidator(_check_order)
+Range = Annotated[tuple[Number, Number], _Pair, _Order]
+Frictions = Annotated[tuple[PositiveFriction, PositiveFriction], _Pair, _Order]
+Payloads = Annotated[tuple[Payload, Payload], _Pair, _Order]
+Offsets = Annotated[tuple[Offset, Offset], _Pair, _Order]
+Factors = Annotated[tuple[Factor, Factor], _Pair, _Order]
+Coordinates = Annotated[tuple[Coordinate, Coordinate], _Pair, _Order]
 
 
 def _parameters(value: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -6,6 +6,7 @@ import inspect
 import itertools
 import re
 import textwrap
+import types
 import typing
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -14,8 +15,6 @@ from mqe_jax.core.limits import bounds
 from mqe_jax.core.settings import hints_of
 from mqe_jax.envs.base import QuadrupedEnv
 from mqe_jax.envs.params import TaskParams
-
-_GROUPS = ("rewards", "randomization")  # parameters with their own tables
 
 
 class Field(NamedTuple):
@@ -106,10 +105,10 @@ def _ends(env: QuadrupedEnv) -> str:
     return ", ".join(ends)
 
 
-def fields(values: Any, prefix: str = "") -> Iterator[Field]:
+def fields(values: Any, prefix: str = "", of: str = "") -> Iterator[Field]:
     """Yields the fields of settings, those of their class first, then those of its bases.
 
-    Reward weights and randomisation ranges are left out.
+    Reward weights are left out. The meaning of each ends with `of`, that of the group.
     """
     kind = type(values)
     texts = [meanings(base) for base in kind.__mro__]
@@ -117,12 +116,13 @@ def fields(values: Any, prefix: str = "") -> Iterator[Field]:
     hints = hints_of(kind)
     for name in sorted(hints, key=lambda name: name in last):
         value = getattr(values, name)
-        if dataclasses.is_dataclass(value):  # an object of the scene, or a group
-            if name not in _GROUPS:
-                yield from fields(value, f"{prefix}{name}.")
-            continue
         text = next((text[name] for text in texts if name in text), "")
-        yield Field(f"{prefix}{name}", value, allowed(hints[name]), " ".join(text.split()))
+        if dataclasses.is_dataclass(value):  # an object of the scene, or a group
+            if name != "rewards":
+                yield from fields(value, f"{prefix}{name}.", text if prefix else "")
+            continue
+        meaning = " ".join(f"{text} {of}".split())
+        yield Field(f"{prefix}{name}", value, allowed(hints[name]), meaning)
 
 
 def meanings(kind: type[Any]) -> Mapping[str, str]:
@@ -146,9 +146,13 @@ def allowed(kind: Any) -> str:
     parts = typing.get_args(kind)
     if origin is typing.Literal:
         return ", ".join(map(str, parts))
-    if origin is tuple and parts:
+    if (origin is tuple and parts) or origin in (typing.Union, types.UnionType):
         return allowed(parts[0])
     if origin is typing.Annotated and parts[0] in (int, float):
         low, high = bounds(kind)
         return f"{low:g} to {high:g}" if high < 1e9 and low > -1e9 else ""
+    if origin is typing.Annotated:
+        each = allowed(parts[0])
+        ordered = each and typing.get_origin(parts[0]) is tuple
+        return f"[lowest, highest], each {each}" if ordered else each
     return ""

@@ -21,9 +21,9 @@ class Reading:
     """Errors of one quantity, in its unit; both are standard deviations of normal numbers."""
 
     noise: Deviation = 0.0
-    """Of an error that is drawn in each step."""
+    """Standard deviation of an error that is drawn in each step."""
     bias: Deviation = 0.0
-    """Of an error that is drawn for an episode."""
+    """Standard deviation of an error that is drawn for an episode."""
 
 
 @settings_class

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -141,10 +142,9 @@ class Stress:
 
     @property
     def worst(self) -> str:
-        """The disturbance under which the rate is lowest."""
+        """The condition under which the rate is lowest."""
         rates = self.rates
-        alone = [name for name in rates if name not in ("usual", "everything")]
-        return min(alone, key=lambda name: rates[name].value)
+        return min([name for name in rates if name != "usual"], key=lambda x: rates[x].value)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, of each condition those of `Result.to_dict`."""
@@ -153,10 +153,15 @@ class Stress:
     def __repr__(self) -> str:
         width = max(map(len, self.results))
         rows = [f"{name:{width}}  {rate.percent}" for name, rate in self.rates.items()]
-        lowest = self.rates[self.worst].percent
-        usual = self.rates["usual"].percent
-        rows.append(f"\nfails most under {self.worst}: {lowest}%, usually {usual}%")
-        return "\n".join(rows)
+        worst = self.rates[self.worst]
+        usual = self.rates["usual"]
+        line = f"fails most under {self.worst}: {worst.percent}%, usually {usual.percent}%"
+        # the interval of the difference (Newcombe 1998, doi 10.1002/bdm.671) has both signs
+        if usual.value - worst.value <= math.hypot(
+            usual.value - usual.low, worst.high - worst.value
+        ):
+            line = "no condition differs from the usual one, by 95% intervals"
+        return "\n".join([*rows, "", line])
 
     def plot(self) -> "Figure":
         """Returns a figure: a bar for each condition, with 95% intervals."""

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.errors import InputError, warn
+from mqe_jax.core.errors import InputError, NoSkillError, warn
 from mqe_jax.core.files import (
     check_locks,
     linear_layers,
@@ -48,9 +48,9 @@ def layers(
 
 
 def check_legs(skill: str, robot: Robot) -> None:
-    """Raises an InputError unless a robot has the legs for which skills are trained."""
+    """Raises a NoSkillError unless a robot has the legs for which skills are trained."""
     if (robot.num_joints, robot.limb) != (NUM_JOINTS, len(JOINTS)):
-        raise InputError(
+        raise NoSkillError(
             f"skill: {skill!r} needs four legs of three joints; {robot.name} has "
             f"{robot.num_joints} joints otherwise; use control 'position' or 'torque'"
         )
@@ -119,15 +119,15 @@ class Networks:
         check_legs(self.skill, robot)
         shipped = ASSETS / f"{self.skill}_{robot.walk.weights}.safetensors"
         file = shipped if path is None else pathlib.Path(path)
-        train = f"train it with 'mqe skill train {self.skill} --robot {robot.call}'"
         if not file.is_file() and path is None:
-            raise InputError(
-                f"{self.title}: no weights are shipped for {robot.name} (assets/{file.name}); "
-                f"{train} and give them as skill_weights=FILE, or use control 'position' or "
-                "'torque'"
+            raise NoSkillError(
+                f"{self.title}: no weights are shipped for {robot.name}; train a skill, 'mqe skill "
+                f"train agile --robot {robot.call}', then --set skill=agile --set skill_weights="
+                "runs/agile/agile.safetensors; or use control 'position' or 'torque'"
             )
         if not file.is_file():
-            raise InputError(f"{self.title}: no file {file}; {train}")
+            train = f"'mqe skill train {self.skill} --robot {robot.call}'"
+            raise InputError(f"{self.title}: no file {file}; train it with {train}")
         flat = read_tensors(file, self.title)
         found = {name.rpartition(".")[0] for name in flat}
         fitting = [name for name, other in _KNOWN.items() if found == {*other.sizes}]

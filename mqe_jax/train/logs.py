@@ -214,12 +214,15 @@ class ProgressLog:
     """Shows progress as a live bar, or as a plain line every ten seconds.
 
     The bar needs a terminal or a notebook; the lines go to standard error. The time left leaves out
-    compilation and evaluation.
+    compilation and evaluation. If a CPU needs more than an hour, `quicker` says what needs less.
     """
 
-    def __init__(self, title: str, total_steps: int, *, shown: bool = True) -> None:
+    def __init__(
+        self, title: str, total_steps: int, *, shown: bool = True, quicker: str = ""
+    ) -> None:
         self._title = title
         self._total = total_steps
+        self._quicker = quicker
         self._silent = not shown
         self._first = self._step = 0
         self._numbers = ""
@@ -297,7 +300,7 @@ class ProgressLog:
         minutes = self._left / 60
         if first and minutes > 1:
             slow = minutes > 60 and jax.default_backend() == "cpu"
-            advice = "; on a CPU, --config laptop of a task takes minutes" if slow else ""
+            advice = self._quicker if slow else ""
             hours = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{minutes:.0f} minutes"
             self._print(f"takes about {hours} here{advice}")
         period = _PLAIN_SECONDS if self._output is None else _OUTPUT_SECONDS

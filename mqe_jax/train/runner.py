@@ -16,6 +16,7 @@ from mqe_jax.core.devices import Processes, translate_errors
 from mqe_jax.core.errors import NonFiniteError
 from mqe_jax.core.settings import fail, to_mapping
 from mqe_jax.core.types import Cast, PyTree, VectorEnv, generator, raw_keys
+from mqe_jax.envs.registry import TASKS
 from mqe_jax.train.checkpoint import checkpoint_step, latest, nonfinite, save_checkpoint
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.folder import common_checkpoints, open_folders, write_config
@@ -98,7 +99,8 @@ def open_training(
         processes.check_equal((configs, [path and checkpoint_step(path) for path in checkpoints]))
         total = configs[0].num_updates * configs[0].steps_per_update
         title = configs[0].task or cast.env.name
-        with ProgressLog(title, total, shown=processes.leads) as progress:
+        quicker = "; on a CPU, --config laptop takes minutes" if configs[0].task in TASKS else ""
+        with ProgressLog(title, total, shown=processes.leads, quicker=quicker) as progress:
             yield Training(cast, learner, processes, configs, folders, checkpoints, progress)
 
 

@@ -239,7 +239,7 @@ class Reader:
             if not matches:
                 raise self.error(
                     f"{key}: {brief(pattern)!r} names nothing{nearest(pattern, known)}; "
-                    f"there are {brief(', '.join(known))}"
+                    f"there are {brief(', '.join(known)) or 'no names; name some in the MJCF'}"
                 )
             found |= {*matches}
         return found
