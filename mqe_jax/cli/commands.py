@@ -64,12 +64,12 @@ class Tasks(TaskOptions):
             from mqe_jax.cli import task_card
             from mqe_jax.envs import make
 
-            given: dict[str, Any] = self.overrides()
+            options = {"impl": self.impl, **self.overrides()}
             try:
-                env = make(self.task, impl=self.impl, **given)
+                env = make(self.task, **options)
             except NoSkillError as error:
                 echo(f"mqe: shown with control position: {error}")
-                env = make(self.task, impl=self.impl, **(given | {"control": "position"}))
+                env = make(self.task, **{**options, "control": "position"})
             about = task_card.describe(env)
             if not self.json:
                 task_card.show(about, long=self.long)
