@@ -280,7 +280,8 @@ def table(
         reason = str(error)
     seated = _seated(task, found, usual, opponent, **options)
     warn(f"{reason}; {usual!r} acts in place of the shipped policy")
-    return seated
+    shown = f"{usual}, in place of the shipped policy"
+    return seated._replace(about=seated.about | {"policy": shown})
 
 
 def _about(sources: Mapping[str, Source], policy: Any) -> dict[str, Any]:

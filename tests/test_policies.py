@@ -114,7 +114,9 @@ def test_a_task_acts_with_its_shipped_policy_unless_something_else_is_named() ->
     assert isinstance(acting("go1gate", set=["gate_width=0.8", "friction=0.5"])[0], Actor)
     assert isinstance(acting("go1plane")[0], SimplePolicy)  # none is shipped
     with pytest.warns(UserWarning, match="'scripted' acts in place of the shipped policy"):
-        assert isinstance(acting("go1gate", set=["num_agents=3"])[0], SimplePolicy)
+        playing = table("go1gate", env={"num_agents": 3}, impl="c")
+    assert playing.about["policy"] == "scripted, in place of the shipped policy"
+    assert isinstance(playing.seats.seats[0].policy.policy, SimplePolicy)
     with pytest.warns(UserWarning, match="'random' acts in place of the shipped policy"):
         (joints,) = acting("go1gate", control="position")
     assert joints.act(jnp.zeros((1, 2, 16)), (), jax.random.PRNGKey(0))[0].shape == (1, 2, 12)

@@ -318,6 +318,8 @@ def hostile(folder: Path) -> dict[str, tuple[str, str, str]]:
         "heavy": (dog(('mass="7"', 'mass="1e9"')), "",
                   "body_mass of 'torso': is beyond 0 to 1000; SI units are expected"),
         "not a number": (dog(('mass="7"', 'mass="nan"')), "", "<geom>: mass='nan' is not finite"),
+        "no element": (dog(("<freejoint/>", "<frejoint/>")), "",
+                       "<frejoint> is no element of a body (did you mean 'freejoint'"),
         "slide": (dog(('name="FL_roll"', 'type="slide" name="FL_roll"')), "", "is no hinge; name"),
         "two trunks": (dog(("<worldbody>", "<worldbody><body name='ball'><freejoint/>"
                             "<geom size='.1'/></body>")), "", "may be the trunk: 'ball', 'torso'"),

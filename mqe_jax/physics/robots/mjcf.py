@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from mqe_jax.core import limits
-from mqe_jax.core.errors import InputError, brief, one_line
+from mqe_jax.core.errors import InputError, brief, nearest, one_line
 from mqe_jax.core.files import parsing, read_bytes, read_text
 
 _TREE = {"body", "frame", "joint", "freejoint", "geom", "inertial"}
@@ -33,6 +33,8 @@ KEPT = {
     "keyframe": {"key"},
 }
 """Elements that MuJoCo reads, by the element around them."""
+_IGNORED = {"site", "camera", "light"}
+"""Elements of bodies that are left out."""
 _BARRED = {
     "equality": "closed loops and coupled joints are not simulated; remove it",
     "tendon": "tendons are not simulated; remove it, and drive joints",
@@ -110,6 +112,11 @@ def read(path: Path) -> Source:
     return _Reader(path).source()
 
 
+def rejected(error: Exception) -> str:
+    """Returns what MuJoCo says of a robot, without lines, which are not those of its files."""
+    return f"MuJoCo rejects it ({re.sub(', line [0-9]+', '', one_line(error))})"
+
+
 class _Reader:
     """Reads one MJCF, with what it includes."""
 
@@ -145,7 +152,7 @@ class _Reader:
         try:
             spec = mujoco.MjSpec.from_string(text, assets=assets)
         except (ValueError, OSError) as error:
-            raise self.error(f"MuJoCo rejects it ({one_line(error)})") from None
+            raise self.error(rejected(error)) from None
         return Source(
             self.path,
             spec,
@@ -215,6 +222,9 @@ class _Reader:
                     raise self.error(
                         f"<{tag}>{f' {brief(name)!r}' if name else ''}: {_BARRED[tag]}"
                     )
+                if element.tag in ("body", "frame") and tag not in _TREE | _IGNORED | {"include"}:
+                    hint = nearest(tag, _TREE)
+                    raise self.error(f"<{brief(tag)}> is no element of a {element.tag}{hint}")
                 if tag not in KEPT.get(str(element.tag), ()):
                     element.remove(child)
             if element.get("coordinate", "local") != "local":

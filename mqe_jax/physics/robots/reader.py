@@ -11,7 +11,7 @@ import numpy as np
 import pydantic
 
 from mqe_jax.core import limits
-from mqe_jax.core.errors import InputError, brief, nearest, one_line
+from mqe_jax.core.errors import InputError, brief, nearest
 from mqe_jax.core.limits import Length, NonNegative, Positive
 from mqe_jax.core.settings import Range, settings_class
 from mqe_jax.physics.robots import mjcf
@@ -211,7 +211,7 @@ class Reader:
         try:
             model = spec.compile()
         except ValueError as error:
-            raise self.error(f"MuJoCo rejects it ({one_line(error)})") from None
+            raise self.error(mjcf.rejected(error)) from None
         meshes = model.geom_dataid[model.geom_type == int(_GEOM.mjGEOM_MESH)]
         points = int(model.mesh_vertnum[meshes].sum())
         if points > limits.MESH_POINTS:
