@@ -25,7 +25,7 @@ from mqe_jax.cli.options import (
 )
 from mqe_jax.core.errors import InputError, NoSkillError
 from mqe_jax.core.files import read_json
-from mqe_jax.core.limits import Environments, Episodes, Horizon, Latency
+from mqe_jax.core.limits import Environments, Episodes, Horizon, Latency, Positive
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import fail, settings_class
 
@@ -236,6 +236,9 @@ class Eval(PolicyOptions):
     """With `--real-time`, time added to each command, s."""
     log: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """With `--real-time`, folder for a log of each robot (see `mqe replay`)."""
+    limits: tuple[Positive, Positive, Positive] | None = None
+    """With `--real-time`, largest vx, vy and yaw rate of the robots, m/s and rad/s. Default: those
+    of the graph."""
     stress: bool = False
     """Evaluate under other friction, payload, motors, delay, errors of readings and pushes, each
     with `--episodes`. A run folder gets a picture, stress.png."""
@@ -248,7 +251,7 @@ class Eval(PolicyOptions):
 
         if self.real_time:
             return self._real_time()
-        for name in ("latency", "log"):
+        for name in ("latency", "log", "limits"):
             if getattr(self, name):
                 fail(name, str(getattr(self, name)), "left out without --real-time")
         if self.stress:
@@ -295,6 +298,7 @@ class Eval(PolicyOptions):
             deterministic=self.deterministic,
             seed=self.seed,
             log=self.log,
+            limits=self.limits,
         )
         if result.speed < 0.95:
             echo(

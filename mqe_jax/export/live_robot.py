@@ -1,10 +1,11 @@
 """The program of one robot in real time: `mqe_jax.export.runner` between two pipes.
 
-`python -m mqe_jax.export.live_robot FILE SEED SECONDS [LOG]` drives a simulated robot by the file
-that `mqe export` writes with `--per-robot`. Its standard input are frames of 2 + O float32
-(little-endian), of which it reads the newest: the number of the readings, that of the episode, the
-readings. Its standard output are commands of 4: the number of the readings for which they are, vx,
-vy, yaw rate, m/s and rad/s. The first command says that the program is ready.
+`python -m mqe_jax.export.live_robot FILE SEED SECONDS [LOG [VX VY YAW_RATE]]` drives a simulated
+robot by the file that `mqe export` writes with `--per-robot`, at most at these speeds. Its standard
+input are frames of 2 + O float32 (little-endian), of which it reads the newest: the number of the
+readings, that of the episode, the readings. Its standard output are commands of 4: the number of
+the readings for which they are, vx, vy, yaw rate, m/s and rad/s. The first command says that the
+program is ready.
 
 The program ends after SECONDS, and with its parent: its input ends then, and Linux kills it.
 """
@@ -66,7 +67,7 @@ class World:
         os._exit(0)  # the parent has ended
 
 
-def main(file: str, seed: str, seconds: str, log: str = "") -> None:
+def main(file: str, seed: str, seconds: str, log: str = "", *speed: str) -> None:
     """Runs the program."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_KILL_WITH_PARENT, signal.SIGKILL)
@@ -74,7 +75,7 @@ def main(file: str, seed: str, seconds: str, log: str = "") -> None:
     timer.daemon = True
     timer.start()
     robot = Robot(file, int(seed))
-    vx, vy, yaw_rate = robot.speed
+    vx, vy, yaw_rate = map(float, speed or robot.speed)
     limits = Limits(speed=(vx, vy, yaw_rate))
     world = World(robot)
     run(

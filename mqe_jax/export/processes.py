@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
@@ -108,12 +109,15 @@ class LiveRobot(RobotProcess):
         seconds: float,
         latency: int = 0,
         log: Path | None = None,
+        speed: Sequence[float] = (),
     ) -> None:
         """Starts the process, which ends after some seconds.
 
-        Its commands count `latency` steps of the world after they have arrived.
+        Its commands count `latency` steps of the world after they have arrived. `speed` are its
+        largest vx, vy and yaw rate, by default those of the graph.
         """
         words = [str(file), str(seed), str(seconds), "" if log is None else str(log)]
+        words += map(str, speed)
         super().__init__(number, "-c", _LIVE, *words)
         self.ended = False
         self._latency = latency

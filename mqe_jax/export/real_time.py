@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -196,7 +196,11 @@ class World:
 
 @contextlib.contextmanager
 def open_robots(
-    world: World, episodes: int, latency: float, log: Path | None
+    world: World,
+    episodes: int,
+    latency: float,
+    log: Path | None,
+    speed: Sequence[float] = (),
 ) -> Iterator[dict[int, LiveRobot]]:
     """Yields a process for each robot of the world that a team of processes drives, by its number.
 
@@ -207,6 +211,7 @@ def open_robots(
         episodes: number of episodes.
         latency: time that a command takes longer, s, rounded to steps of the world.
         log: folder for the robots' logs.
+        speed: largest vx, vy and yaw rate, m/s and rad/s. Default: those of the graph.
     """
     env = world.env
     seconds = START + 2.0 * episodes * (env.max_steps * env.dt + PAUSE)
@@ -222,6 +227,7 @@ def open_robots(
                 seconds=seconds,
                 latency=round(latency / env.dt),
                 log=None if log is None else log / f"robot{agent}.csv",
+                speed=speed,
             )
             stack.callback(robots[agent].close, 1.0)
         yield robots

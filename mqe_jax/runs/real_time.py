@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from mqe_jax import names
 from mqe_jax.acting.results import Rate
-from mqe_jax.core.limits import Candidates, Latency, Seed
+from mqe_jax.core.limits import Candidates, Latency, Positive, Seed
 from mqe_jax.core.literal import line
 from mqe_jax.core.settings import Parameters, checked, fail
 from mqe_jax.envs import QuadrupedEnv
@@ -83,6 +83,7 @@ def real_time(
     deterministic: bool = False,
     seed: Seed = 0,
     log: str | Path | None = None,
+    limits: tuple[Positive, Positive, Positive] | None = None,
 ) -> RealTime:
     """Evaluates exported robots in real time, as `mqe eval TASK --export FILE --real-time`.
 
@@ -104,6 +105,8 @@ def real_time(
         episodes: number of episodes.
         latency: time added to each command, s.
         log: folder for a log of each robot, which `mqe replay` shows.
+        limits: largest vx, vy and yaw rate in real time, m/s and rad/s. Default: those of the
+            graph.
 
     Raises:
         InputError: as `evaluate`, for actions that are not velocities, and on a machine that
@@ -129,7 +132,7 @@ def real_time(
     folder = None if log is None else Path(log)
     with (
         Progress(console=Console(stderr=True)) as bar,
-        open_robots(world, episodes, latency, folder) as robots,
+        open_robots(world, episodes, latency, folder, limits or ()) as robots,
     ):
         shown = bar.add_task(f"{world.env.name} in real time", total=episodes)
         course = world.play(robots, keys, report=lambda: bar.advance(shown))
