@@ -10,8 +10,9 @@ from mqe_jax.core.errors import InputError, brief, one_line, warn
 from mqe_jax.core.files import parse_yaml, read_text
 from mqe_jax.core.settings import build
 from mqe_jax.physics.robots import mjcf
+from mqe_jax.physics.robots.compiled import RobotFile
 from mqe_jax.physics.robots.model import ModelRobot
-from mqe_jax.physics.robots.reader import Reader, RobotFile
+from mqe_jax.physics.robots.reader import Reader
 
 MENAGERIE = "menagerie:"
 """What the names of robots begin with that the package mujoco-menagerie loads."""
