@@ -87,7 +87,7 @@ def test_a_robot_stands_when_nothing_new_comes_and_walks_again(lost: str, tmp_pa
     stopped = times[~moves]
     assert np.any((stopped > 0.35) & (stopped < 0.95))  # 0.2 s after the last readings
     assert moves[-1] and times[-1] > 0.9
-    assert robot_log.summarize(robot_log.load_log(log))["stood"] > 0.0 or lost == "answers"
+    assert robot_log.summarize(robot_log.load_log(log))["stood_share"] > 0.0 or lost == "answers"
 
 
 def test_a_robot_stands_after_an_error_and_after_sigterm() -> None:

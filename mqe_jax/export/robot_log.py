@@ -38,9 +38,9 @@ def summarize(log: Log) -> dict[str, Any]:
         "seconds": seconds,
         "rate_hz": 1.0 / max(period, 1e-9),
         "longest_period_s": float(np.diff(log["time"]).max()),
-        "stood": float(1.0 - moving.mean()),
+        "stood_share": float(1.0 - moving.mean()),
         "stops": int(np.count_nonzero(np.diff(moving.astype(int)) < 0)),
-        "late_readings": float(np.mean(log["age"] > 2.0 * period)),
+        "late_readings_share": float(np.mean(log["age"] > 2.0 * period)),
     }
     return found | {f"largest_{name}": float(np.abs(log[name]).max()) for name in _UNITS}
 

@@ -97,7 +97,7 @@ def _menagerie(name: str) -> Path:
     except ModuleNotFoundError:
         raise InputError(
             f"robot: {MENAGERIE}{brief(name)} needs the package mujoco-menagerie: "
-            "pip install mqe-jax[menagerie]"
+            "pip install 'mqe-jax[menagerie]'"
         ) from None
     try:
         robot = menagerie.get(name)
