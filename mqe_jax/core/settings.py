@@ -89,6 +89,7 @@ def _check_order(value: tuple[float, float]) -> tuple[float, float]:
 
 
 def _check_pair(value: Any) -> Any:
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
         raise ValueError("[lowest, highest]")
     return value
