@@ -16,6 +16,7 @@ from mqe_jax.core.types import observations
 from mqe_jax.export.policy import skills_of
 from mqe_jax.export.task import TaskFunctions, readings_function
 from mqe_jax.names import load_policy, table, versus
+from mqe_jax.physics.robots import ROBOTS
 from mqe_jax.physics.robots.go1 import GO1
 from mqe_jax.physics.robots.index import Proprioception
 from mqe_jax.policies.translated import Translated
@@ -29,6 +30,7 @@ from mqe_jax.train.checkpoint import read_file
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.networks import EnvDims
 from mqe_jax.train.policy import TrainedPolicy, policy_in, save_policy
+from mqe_jax.walk.training import SETTINGS
 from mqe_jax.walk_policy import WalkPolicy
 from tests.inputs import refuses
 from tests.training import untrained
@@ -618,3 +620,12 @@ def test_contract(name: str) -> None:
     assert target.shape == (12,) and np.abs(target - GO1.default_joints).max() < 1.0
     assert command.shape == (len(skill.commands),) and np.isfinite(command).all()
     assert jax.tree.map(jnp.shape, memory) == jax.tree.map(jnp.shape, after)
+
+
+@pytest.mark.parametrize("robot", sorted(ROBOTS))
+def test_every_skill_that_can_be_trained_is_shipped_with_weights_of_its_own(robot: str) -> None:
+    files = {name: SKILLS[name](ROBOTS[robot]).load_params() for name in SETTINGS}
+    slopes = {name: task.slope for name, (_, task) in SETTINGS.items()}
+    assert slopes["climb"] > slopes["agile"]
+    climbing, agile_ = (files[name]["body"]["0"]["weight"] for name in ("climb", "agile"))
+    assert climbing.shape == agile_.shape and not np.allclose(climbing, agile_)

@@ -20,7 +20,7 @@ class SkillEval:
     """Evaluate a skill of one or several robots: command tracking, disturbances, falls, energy."""
 
     skill: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SKILL")]
-    """Name of the skill: walk or agile."""
+    """Name of the skill: walk, agile or climb."""
     weights: Annotated[list[str], Repeated, tyro.conf.arg(metavar="FILE|shipped")] = field(
         default_factory=list
     )

@@ -27,7 +27,7 @@ class SkillTrain:
         tyro.conf.arg(metavar="SKILL"),
         pydantic.SkipValidation(),  # pyright: ignore[reportCallIssue]
     ]
-    """Name of the skill: walk or agile."""
+    """Name of the skill: walk, agile or climb."""
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     """Settings of the training."""
     task: WalkTask = WalkTask()

@@ -140,6 +140,7 @@ class AgileSkill(Skill):
     """The agile skill."""
 
     name = "agile"
+    networks = NETWORKS
     commands = COMMANDS
     period = STEP
     turn = 3.0
@@ -169,9 +170,17 @@ class AgileSkill(Skill):
         return self.robot.joint_targets(action), AgileMemory(frames, action, gait)
 
     def load_params(self, path: str | os.PathLike[str] | None = None) -> Params:
-        return NETWORKS.load(self.robot, path)
+        return self.networks.load(self.robot, path)
 
     def clock(self, memory: AgileMemory) -> jax.Array:
         """Returns sine and cosine of the phase of the gait cycle (2,)."""
         angle = 2 * jnp.pi * memory.gait
         return jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+
+
+@register
+class ClimbSkill(AgileSkill):
+    """The agile skill, trained on slopes of up to 17 degrees in place of 9."""
+
+    name = "climb"
+    networks = dataclasses.replace(NETWORKS, skill="climb", title="climb skill")

@@ -29,6 +29,9 @@ WARM_UP = 1.0  # s at the start of an episode excluded from the errors
 _AXES = ("vx", "vy", "yaw")  # of an error
 
 
+_FAST = ("agile", "climb")
+
+
 @dataclasses.dataclass(frozen=True)
 class Scenario:
     """Settings of one evaluation scenario."""
@@ -51,7 +54,7 @@ class Scenario:
     """Instantaneous change of velocity every 5 s, m/s."""
     shove: float = 0.0
     """Maximum force of shoves, N, of 0.2 to 1 s, every 5 s on average."""
-    skills: tuple[str, ...] = ("walk", "agile")
+    skills: tuple[str, ...] = ("walk", *_FAST)
     """Skills that the scenario fits."""
 
 
@@ -70,10 +73,10 @@ SCENARIOS = {
     "changes": Scenario(period=4.0),
     "changes_pushes": Scenario(period=4.0, push=0.5),
     "changes_shoves": Scenario(period=4.0, shove=100.0),
-    "fast": Scenario(velocity=(2.5, 0.0, 0.0), skills=("agile",)),
-    "backward": Scenario(velocity=(-1.5, 0.0, 0.0), skills=("agile",)),
-    "sideways": Scenario(velocity=(0.0, 1.0, 0.0), skills=("agile",)),
-    "turn": Scenario(velocity=(0.0, 0.0, 2.5), skills=("agile",)),
+    "fast": Scenario(velocity=(2.5, 0.0, 0.0), skills=_FAST),
+    "backward": Scenario(velocity=(-1.5, 0.0, 0.0), skills=_FAST),
+    "sideways": Scenario(velocity=(0.0, 1.0, 0.0), skills=_FAST),
+    "turn": Scenario(velocity=(0.0, 0.0, 2.5), skills=_FAST),
 }
 
 
@@ -286,7 +289,7 @@ def evaluate_skill(
         ```
 
     Args:
-        skill: name of the skill: walk or agile.
+        skill: name of the skill: walk, agile or climb.
         weights: file of the weights. Default: the shipped ones.
         robot: name or file of the robot.
         impl: physics engine: 'auto', 'jax', 'warp' or 'c'.

@@ -105,11 +105,12 @@ class Walk(Trainee):
 class Agile(Trainee):
     """The agile skill, which trots at a frequency that its velocity command decides."""
 
+    kind = agile.AgileSkill
     observation_size = agile.FRAME_SIZE + agile.NOW_SIZE
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)
-        self.skill = agile.AgileSkill(robot)
+        self.skill = self.kind(robot)
 
     def sample(self, velocity: jax.Array, uniform: Draw, chance: Chance) -> jax.Array:
         return self.commands(velocity)
@@ -132,7 +133,13 @@ class Agile(Trainee):
         return agile.foot_phases(gait, commands[:3])
 
 
-TRAINEES: dict[str, type[Trainee]] = {"walk": Walk, "agile": Agile}
+class Climb(Agile):
+    """The agile skill of steeper slopes."""
+
+    kind = agile.ClimbSkill
+
+
+TRAINEES: dict[str, type[Trainee]] = {"walk": Walk, "agile": Agile, "climb": Climb}
 
 
 def make(name: str, robot: Robot) -> Trainee:

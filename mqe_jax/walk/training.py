@@ -3,6 +3,7 @@
 Settings are those of walk-these-ways (arXiv 2212.03238) where known.
 """
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -80,6 +81,7 @@ Its shoves are as those of robots and boxes.
 SETTINGS: dict[str, tuple[TrainConfig, WalkTask]] = {
     "walk": (WALK, WalkTask()),
     "agile": (AGILE, AGILE_TASK),
+    "climb": (override(AGILE, {"task": "climb"}), dataclasses.replace(AGILE_TASK, slope=0.3)),
 }
 """Settings and task of each skill that can be trained."""
 
