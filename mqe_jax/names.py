@@ -115,6 +115,8 @@ def _find(name: str, task: str, field: str) -> Found:
         return Named(member, usual=True) if isinstance(member, str) else member
     if name in simple.names(task):
         return Named(name)
+    if Path(name).suffix == ".py":
+        fail(field, name, "a policy; --import FILE registers those of a Python file by their names")
     shipped = name in zoo.names()
     if shipped or os.sep in name or Path(name).suffix or Path(name).exists():
         return read_policy(zoo.file_of(name) if shipped else name)

@@ -27,6 +27,7 @@ from mqe_jax.envs.sets import expand
 from mqe_jax.train.config import TrainConfig, read_settings
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
+_UNTUNED = "paper/mappo"  # of a cooperative task of one's own
 
 Layers = Mapping[str, Mapping[str, Any]]
 """Changes of settings, as `override` has them, by their name in errors; the last ones count."""
@@ -150,7 +151,7 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
         return _layers_of("go1gate", "laptop")
     if name in shipped:
         changes = name in ("laptop", "robust", "sizes", "student")  # of the default settings
-        below = _layers_of(task, default_name(task)) if changes else []
+        below = _defaults(task) if changes else []
         if name == "student":
             below += [_Layer.of("", _parts("onboard")), _Layer.of("", {"imitation.teacher": task})]
         file, _, part = name.partition("/")
@@ -168,6 +169,17 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     if not path.is_file():
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
     return [_Layer.of(f"{path}: ", read_settings(path))]
+
+
+def _defaults(task: str) -> list[_Layer]:
+    """Returns the layers on which changes of default settings rest.
+
+    A cooperative task that has none gets what those of all others have in common.
+    """
+    name = default_name(task)
+    if name == _UNTUNED:
+        return [_Layer.of("", _parts("tuned")["common"])]
+    return _layers_of(task, name)
 
 
 def _unscripted(config: TrainConfig) -> dict[str, Any]:
@@ -202,7 +214,7 @@ def default_name(task: str) -> str:
     """Returns the name of the settings with which a task is trained by default."""
     if task in _parts("tuned"):
         return f"tuned/{task}"
-    return "league" if is_match(task) else "paper/mappo"
+    return "league" if is_match(task) else _UNTUNED
 
 
 def is_match(task: str) -> bool:

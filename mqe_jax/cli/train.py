@@ -104,12 +104,13 @@ class Train(TaskOptions):
             raise interrupts.Interrupted(HINT.format(run_dir))
         if jax.process_index() > 0:  # one process writes the files
             return
+        echo(f"mqe: {run_dir / 'curve.png'} has the curve")
         for folder, run in zip(folders, runs, strict=True):
-            if jax.process_count() == 1:
-                echo(f"mqe: {folder} reaches {_reached(run, folder, self.impl)}")
             command = f"mqe eval {folder} {imports.flags(imports.IMPORTED)}"
             echo(f"mqe: {folder} has the policy, metrics.csv; evaluate it with: {command}")
-        echo(f"mqe: {run_dir / 'curve.png'} has the curve")
+            if jax.process_count() == 1:
+                echo(f"mqe: evaluating {_EPISODES} episodes without assistance")
+                echo(f"mqe: {folder} reaches {_reached(run, folder, self.impl)}")
 
 
 def _reached(run: Any, folder: Path, impl: str) -> str:
