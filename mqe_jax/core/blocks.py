@@ -65,6 +65,8 @@ def entities(
     quantities: tuple[str, ...] = (),
 ) -> Block:
     """Returns the block of several entities of a kind; `by_entity` fills a masked one."""
+    if masked:
+        meaning += "; then 1, or all 0 if there is none"
     several = Entities(kind, count, width, masked)
     width = count * (width + masked)
     return Block(name, width, meaning, entities=several, quantities=quantities)

@@ -137,7 +137,7 @@ def proprioception_layout(joints: int) -> ObservationLayout:
     return ObservationLayout(
         (
             Block("gravity", 3, "unit vector in the trunk's frame"),
-            Block("joint_position", joints, "rad, minus default"),
+            Block("joint_position", joints, "rad, minus the stance"),
             Block("joint_velocity", joints, "rad/s"),
         )
     )

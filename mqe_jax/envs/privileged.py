@@ -23,7 +23,7 @@ def _robot_blocks(joints: int, number: int) -> list[Block]:
         Block("quaternion", 4, "wxyz"),
         Block("linear_velocity", 3, "m/s, world"),
         Block("angular_velocity", 3, "rad/s, body"),
-        Block("joint_position", joints, "rad, minus default"),
+        Block("joint_position", joints, "rad, minus the stance"),
         Block("joint_velocity", joints, "rad/s"),
     )
     return [dataclasses.replace(part, name=f"robot{number}/{part.name}") for part in parts]

@@ -45,7 +45,7 @@ class Proprioception(Sensor):
         return (
             Block("gravity", 3, "unit vector in the trunk's frame"),
             Block("angular_velocity", 3, "of the trunk in its own frame, rad/s"),
-            Block("joint_position", joints, "rad, minus default"),
+            Block("joint_position", joints, "rad, minus the stance"),
             Block("joint_velocity", joints, "rad/s"),
             Block("action", scene.action_size, "last action"),
             Block("odometry", 4, meaning),
