@@ -31,7 +31,7 @@ from mqe_jax.policies.zoo import population
 from mqe_jax.train.policy import TrainedPolicy, save_policy
 
 DIGITS = 4
-BYTES = 128_000
+BYTES = 384_000
 """Size of a file that is shipped, at most."""
 
 
