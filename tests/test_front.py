@@ -390,6 +390,7 @@ def test_actions_that_are_not_finite_are_an_error_not_a_draw() -> None:
     both = options | {"sides": "both"}
     refuses(f"opponent: {said}", mqe_jax.evaluate, match, "idle", broken, **both)
     refuses(f"policies: {said}", mqe_jax.tournament, match, [broken], episodes=1)
+    refuses("policies: None is not allowed", mqe_jax.tournament, match, [None], episodes=1)
 
 
 def test_a_match_is_played_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:

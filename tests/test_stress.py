@@ -66,7 +66,7 @@ def test_results_are_those_of_the_conditions(monkeypatch: pytest.MonkeyPatch) ->
     )
     assert found.plot().axes[0].patches
     alike = runs.Stress(dict.fromkeys(["usual", "weak", "everything"], found.results["usual"]))
-    assert str(alike).endswith("no condition differs from the usual one, by 95% intervals")
+    assert str(alike).endswith("no condition is worse than the usual one, by 95% intervals")
     results = found.results
     every = {"usual": results["usual"], "weak": results["usual"], "everything": results["weak"]}
     assert runs.Stress(every).worst == "everything"

@@ -37,7 +37,7 @@ class _Progress(NamedTuple):
     step_sums: dict[str, jax.Array]  # sums of metrics over counted steps (N,) each
     outcome: Outcome  # sums over counted episodes, leading axis N
     diverged: jax.Array  # counted episodes that ended because the physics diverged (N,)
-    finite: jax.Array  # whether all actions of each agent were finite (N, A) bool
+    finite: jax.Array  # whether all actions of each active agent were finite (N, A)
 
 
 def evaluate_batch(
@@ -210,7 +210,7 @@ def _run_block(
                 step_sums=step_sums,
                 outcome=ends,
                 diverged=diverged,
-                finite=p.finite & jnp.all(jnp.isfinite(action), axis=-1),
+                finite=p.finite & (jnp.all(jnp.isfinite(action), axis=-1) | ~active),
             ),
             None,
         )

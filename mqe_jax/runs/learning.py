@@ -14,6 +14,7 @@ from mqe_jax.core.limits import Seed, Seeds
 from mqe_jax.core.literal import echo
 from mqe_jax.core.settings import Parameters, checked
 from mqe_jax.core.types import Cast
+from mqe_jax.envs import TASKS
 from mqe_jax.names import Config
 from mqe_jax.runs.cast import TaskLike, prepare
 from mqe_jax.runs.divergence import guard
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 _FEW_UPDATES = 20
 _MANY_STEPS = 100_000  # of a training that is no trial
+_LARGE = 10_000  # steps of an update that is larger than those of laptop.yaml
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -220,7 +222,8 @@ def _train(
     if steps > 1.1 * config.total_steps:
         update = f"num_envs {config.num_envs} x rollout_steps {config.rollout_steps}"
         echo(f"mqe: total_steps {config.total_steps:,} become {steps:,}, whole updates of {update}")
-    if config.num_updates < _FEW_UPDATES and steps >= _MANY_STEPS:
+    large = config.steps_per_update > _LARGE and config.task in TASKS
+    if config.num_updates < _FEW_UPDATES and steps >= _MANY_STEPS and large:
         size = f"{config.num_updates} updates of {config.steps_per_update:,} steps"
         echo(f"mqe: {size} are few to learn from; --config laptop has small ones")
     with (

@@ -26,7 +26,7 @@ from mqe_jax.core.limits import (
     Speed,
     Time,
 )
-from mqe_jax.core.settings import Parameters, check, checked, fail, merge
+from mqe_jax.core.settings import Parameters, check, checked, fail, merge, path_text
 from mqe_jax.envs import QuadrupedEnv, VectorEnv
 from mqe_jax.envs.registry import task_id
 from mqe_jax.names import Read, Source, Table
@@ -202,13 +202,16 @@ def _named(policies: Any, task: str) -> dict[str, Source]:
     if isinstance(policies, Mapping):
         pairs = [(check("policies", name, str), each) for name, each in policies.items()]
     elif isinstance(policies, Sequence) and not isinstance(policies, str):
-        pairs = [(title(each), each) for each in population.expand(policies, task)]
+        listed = [path_text(x) if isinstance(x, Path) else x for x in policies]
+        pairs = [(title(each), each) for each in population.expand(listed, task)]
     else:
         pairs = []
     if not pairs:
         fail("policies", policies, "a list of policies, or a mapping of names to them")
     named: dict[str, Source] = {}
     for name, each in pairs:
+        if each is None:
+            fail("policies", None, "a name, a path, a policy or a function")
         texts = isinstance(each, str) and isinstance(named.get(name, name), str)
         if (name in named or name in REFERENCES) and not (texts and each == name):
             fail("policies", name, "the name of one policy; {'own': policy} gives it another name")

@@ -160,7 +160,7 @@ class Stress:
         if usual.value - worst.value <= math.hypot(
             usual.value - usual.low, worst.high - worst.value
         ):
-            line = "no condition differs from the usual one, by 95% intervals"
+            line = "no condition is worse than the usual one, by 95% intervals"
         return "\n".join([*rows, "", line])
 
     def plot(self) -> "Figure":

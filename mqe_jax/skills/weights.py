@@ -108,10 +108,16 @@ class Networks:
             params[part][layer] = jax.device_put(arrays)
         return params
 
-    def load(self, robot: Robot, path: str | os.PathLike[str] | None = None) -> Params:
+    def load(
+        self,
+        robot: Robot,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        warns: bool = True,
+    ) -> Params:
         """Reads weights as float32 from a safetensors file, by default those shipped for the robot.
 
-        Warns of weights that were trained on another robot.
+        With `warns`, says if those of a path were trained on another robot.
 
         Raises:
             InputError: if the file is missing, damaged, or holds other names or shapes.
@@ -135,7 +141,7 @@ class Networks:
             use = f"weights of the skill {fitting[0]}, which --set skill={fitting[0]} chooses"
             raise InputError(f"{self.title}: {file} has {use}")
         trained = _about(file).get("robot", robot.identity)
-        if trained != robot.identity:
+        if path is not None and warns and trained != robot.identity:
             warn(f"{self.title}: {file} was trained on {trained}, it moves {robot.identity}")
         return self.nest(flat, str(file))
 

@@ -41,11 +41,13 @@ def smooth(
     """
     values = np.asarray(values, np.float64)
     weight = np.ones(len(values)) if weights is None else np.asarray(weights, np.float64)
-    weight = np.where(np.isfinite(values), weight, 0.0)
+    finite = np.isfinite(values)
+    values = np.where(finite, values, 0.0)
+    weight = np.where(finite, weight, 0.0)
     width = max(1, round(len(values) * fraction))
     windows = [slice(max(0, end - width), end) for end in range(1, len(values) + 1)]
     totals = [weight[window].sum() for window in windows]
-    sums = [np.nansum(values[window] * weight[window]) for window in windows]
+    sums = [(values[window] * weight[window]).sum() for window in windows]
     return [float(x / total) if total else math.nan for x, total in zip(sums, totals, strict=True)]
 
 

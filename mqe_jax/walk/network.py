@@ -198,7 +198,7 @@ def _build(settings: HistorySettings, form: Form, dims: EnvDims) -> Network:
         if settings.weights is None:
             policy = form.networks.init(policy_key)
         else:
-            policy = form.networks.load(robots.get("go1"), settings.weights)
+            policy = form.networks.load(robots.get("go1"), settings.weights, warns=False)
         return {
             "policy": jax.tree.map(jnp.asarray, policy),
             "log_std": jnp.full(dims.action, settings.log_std_init, jnp.float32),

@@ -132,7 +132,7 @@ def train_skill(
     if not isinstance(network, HistorySettings):
         fail("network.name", network.name, default_config.network.name)
     if weights is not None:
-        network.form.networks.load(body, weights)
+        network.form.networks.load(body, weights, warns=False)
         config = override(config, {"network.weights": str(Path(weights).resolve())})
     if not np.array_equal(body.mirror.source, MIRROR.source):
         warn("network.symmetry_coef: it is 0, since left and right legs of the robot differ")
