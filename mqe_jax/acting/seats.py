@@ -203,11 +203,10 @@ def action_and_memory(returned: Any) -> tuple[Any, Any]:
 
 def title(policy: Any) -> str:
     """Returns how messages and tables name a policy, which may be a name, a path or a function."""
-    inner = policy.policy if isinstance(policy, Fixed) else policy
-    if isinstance(inner, Fixed):
-        return title(inner)
-    own = getattr(inner, "__name__", "") or getattr(inner, "name", "")
-    return str(inner) if isinstance(inner, Path) else str(own or inner)
+    if isinstance(policy, Fixed):
+        return title(policy.policy)
+    own = getattr(policy, "__name__", "") or getattr(policy, "name", "")
+    return str(policy) if isinstance(policy, Path) else str(own or policy)
 
 
 def _check_act(returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:

@@ -161,7 +161,8 @@ def environments(
     match = len(trained.teams) > 1
     both = match and not config.opponents
     batch = _batch(trained, config, num_envs // 2 if both else num_envs, seeds, demonstrator)
-    exact = () if teacher is None else {EXACT}.intersection(trained.layouts)
+    taught = teacher is not None and "policy" in groups_of([teacher])
+    exact = {EXACT}.intersection(trained.layouts) if taught else ()
     env: Any = batch.with_groups(groups.union(exact))
     if config.time_limit_ends:
         env = Deadline(env)

@@ -154,7 +154,7 @@ def tournament(
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `evaluate` accepts, and populations: a list, or a mapping of names to them.
+        policies: what `evaluate` accepts: a list, also of populations, or a mapping of names.
             In a match, scripted, idle and random play too; ratings are relative to scripted, else
             to idle. In a task of one team, agent 0 follows each policy with each one as its mates;
             scripted and idle play too. As in `evaluate`, a trained policy brings its skill, with
