@@ -12,6 +12,7 @@ import pickle
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -23,7 +24,7 @@ import pytest
 from mqe_jax.core.memory import bytes_of
 from mqe_jax.envs import VectorEnv, make
 from mqe_jax.envs.registry import SHIPPED
-from mqe_jax.physics.engines import STATE_FIELDS, private, warp_model
+from mqe_jax.physics.engines import STATE_FIELDS, private, warp_engine, warp_model
 from mqe_jax.physics.engines.warp_engine import WarpEngine
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -53,6 +54,16 @@ def nudged(state: Any) -> Any:
     """A state with speeds that differ by a bit."""
     qvel = state.data.qvel * np.float32(1 + 2**-23)
     return dataclasses.replace(state, data=state.data.replace(qvel=qvel))
+
+
+def test_a_process_of_several_has_its_own_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the second process JAX's id of the device is 1, and Warp has only device 0."""
+    second = SimpleNamespace(platform="gpu", id=1, local_hardware_id=0)
+    monkeypatch.setattr(jax, "local_devices", lambda: [second])
+    monkeypatch.setattr(
+        warp_engine, "_warp", lambda: SimpleNamespace(get_cuda_device=[7].__getitem__)
+    )
+    assert warp_engine._device() == 7
 
 
 @pytest.mark.gpu

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mqe_jax.core import keys
-from mqe_jax.core.limits import Distance, Length, TimeLimit
+from mqe_jax.core.limits import Buffer, Distance, Length, TimeLimit
 from mqe_jax.core.settings import fail, settings_class
 from mqe_jax.envs.match import Duel
 from mqe_jax.envs.observation import BASE, Block, ObservationLayout
@@ -49,6 +49,7 @@ class TugParams(TaskParams):
     episode_length: TimeLimit = 15.0
     spawn_height: Length = 0.34
     spawn_noise: Distance = 0.0
+    contacts_per_robot: Buffer = 16  # on Warp also pairs that the wide cylinder comes near
     cylinder: Cylinder = Cylinder()
     """The cylinder. The arena is centred on it; its side walls are where the cylinder's reach
     ends."""

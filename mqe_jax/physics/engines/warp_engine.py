@@ -239,7 +239,7 @@ class _Arrays:
     def __init__(self, model: mujoco.MjModel, motors: Motors | None, sparse: bool) -> None:
         wp = _warp()
         self._model = model
-        self.device = wp.device_from_jax(jax.local_devices()[0])
+        self.device = _device()
         self.data: dict[int, Any] = {}
         self._armature: dict[int, Any] = {}
         self._solvers: dict[int, Any] = {}
@@ -316,6 +316,15 @@ class _Arrays:
             outputs=state,
         )
         return drive, clamp
+
+
+def _device() -> Any:
+    """Returns JAX's first device of this process; its `id` also counts those of the others."""
+    device = jax.local_devices()[0]
+    wp = _warp()
+    if device.platform == "cpu":
+        return wp.get_device("cpu")
+    return wp.get_cuda_device(device.local_hardware_id)
 
 
 def _nothing() -> None:
