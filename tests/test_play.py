@@ -164,6 +164,7 @@ def test_a_driven_robot_gets_the_readers_action_in_its_own_frame(built: SimpleNa
     expected = built.env.controller.skill_commands(jnp.stack([action[0], drive[1]]))
     np.testing.assert_allclose(command, expected)
     assert built.settings["commands"] == ["vx", "vy", "yaw_rate", "skill"]
+    assert built.settings["skills"] == ["walk", "agile"]
     assert built.env.params.action_ranges()["vx"] == (-1.5, 2.5)
 
 
@@ -232,6 +233,14 @@ def test_sources_become_tasks_with_their_policies(tmp_path: Path) -> None:
     refuses("did you mean 'go1gate'", entries, ["go1gaet"])
     refuses("num_agent.*did you mean 'num_agents'", entries, ["go1gate:num_agent=4"])
     refuses("position", TaskFunctions, SimpleNamespace(control="position"))
+
+
+def test_a_task_keeps_the_skill_of_its_team_and_gets_walk_and_agile() -> None:
+    (entry,) = entries(["go1seesaw"])
+    assert entry.env.params.skill == ("walk", "agile", "climb")
+    assert entry.env.params.action_ranges()["vx"] == (-1.5, 2.5)
+    team: Any = entry.policies["shipped"]
+    assert team.own.skill.name == "climb"
 
 
 def test_tasks_of_other_sizes_are_played_by_their_scripted_policies() -> None:
@@ -347,15 +356,19 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         assert "drive=0" in tab.url and "seed=3" in tab.url and "team0=shipped" in tab.url
         values = (
             "import('./controls.js').then((own) => new own.Controls([], () => "
-            "{}).values(['vx', 'skill']))"
+            "{}).values(['vx', 'skill'], -0.5))"
         )
-        assert tab.evaluate(values) == [0, 1]  # of several skills, keys choose the last one
+        assert tab.evaluate(values) == [0, -0.5]
+        assert tab.locator("#skill").input_value() == "agile"  # the last one
         photograph(tab, "driven")
         shown = tab.evaluate(f"Promise.all([-5, 0].map({SHOW_SCENE}))")
         assert shown[0] == pytest.approx(shown[1] - 5)
         tab.keyboard.press("r")
         tab.keyboard.press("Space")
         tab.wait_for_function("document.querySelector('#pause').textContent === 'Continue'")
+        tab.locator("#menu > summary").click()
+        tab.locator("#skill").select_option("walk")
+        assert "skill=walk" in tab.url
 
 
 def test_a_phone_shows_what_to_do_and_its_button_and_pads_drive(page: Path) -> None:

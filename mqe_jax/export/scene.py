@@ -35,6 +35,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
     | `task`, `title`, `aim`, `robot`, `mujoco` | names; what a team has to do; version of MuJoCo |
     | `dt`, `substeps`, `max_steps` | environment step, s; physics steps in it; time limit, steps |
     | `teams`, `commands` | agents of each team; names of the action's commands, in order |
+    | `skills` | names of the skills; of several, the command `skill` chooses one |
     | `robots` | of each of the R robots, colour and addresses as in `RobotIndex` |
     | `track` | x of its `start`, `length` and `width`, m |
     | `motors` | of all joints, what `mqe_jax.physics.robots.motors` needs and MJCF lacks; `runs`
@@ -60,6 +61,7 @@ def scene_settings(env: QuadrupedEnv) -> dict[str, Any]:
         "max_steps": env.max_steps,
         "teams": [list(team) for team in env.teams],
         "commands": list(env.controller.commands),
+        "skills": [part.name for part in env.controller.skill.parts],
         "robots": robots,
         "track": {
             "start": scene.track.start,

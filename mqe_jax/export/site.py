@@ -140,7 +140,7 @@ def entries(sources: Sequence[str]) -> list[Entry]:
     found: list[tuple[str, dict[str, Any], Entry]] = []
     for source in dict.fromkeys(sources or [*playable, *LARGER]):
         task, params, policies = _named(source)
-        params = _with_both_skills(task, params)
+        params = _with_several_skills(task, params)
         entry = next((entry for *key, entry in found if key == [task, params]), None)
         if entry is None:
             count = sum(known == task for known, *_ in found)
@@ -185,15 +185,15 @@ def _named(source: str) -> tuple[str, dict[str, Any], dict[str, TrainedPolicy]]:
     return task, names.parameters_of(task, shipped.values()), shipped
 
 
-def _with_both_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
-    """Returns a task's parameters with the walk policy and the agile skill.
+def _with_several_skills(task: str, params: dict[str, Any]) -> dict[str, Any]:
+    """Returns a task's parameters with the walk policy, the agile skill and the task's own one.
 
-    Policies and keys choose one of them.
+    Policies and the reader choose one of them.
     """
     settings = {name: value for name, value in params.items() if name != "control"}
     plain = TASKS[task].Params().changed(settings)
     known = [command.name for command in AgileSkill.commands]
-    shipped = plain.skill in ("walk", "agile") and not plain.skill_weights
+    shipped = plain.skill in ("walk", "agile", "climb") and not plain.skill_weights
     if not shipped or not {*plain.commands} <= {*known}:
         return params
     trained = AgileSkill(robots.get(plain.robot)).trained_ranges(known).tolist()

@@ -56,11 +56,11 @@ export class Controls {
     for (const end of ['pointerup', 'pointercancel']) pad.addEventListener(end, () => set(0, 0));
   }
 
-  /** The values of commands, zero for those that neither keys nor pads set; of several skills the last one acts. */
-  values(commands) {
+  /** The values of commands, zero for those that neither keys nor pads set; `skill` is that of the command `skill`. */
+  values(commands, skill) {
     const keys = {};
     for (const code of this.pressed) keys[KEYS[code][0]] = (keys[KEYS[code][0]] ?? 0) + KEYS[code][1];
-    const value = (name) => (name === 'skill' ? 1 : (keys[name] ?? 0) + (this.pad[name] ?? 0));
+    const value = (name) => (name === 'skill' ? skill : (keys[name] ?? 0) + (this.pad[name] ?? 0));
     return commands.map((name) => Math.max(-1, Math.min(1, value(name))));
   }
 }

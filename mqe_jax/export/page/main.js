@@ -17,6 +17,7 @@ const page = {
   playing: true,
   seed: Math.round(Number(options.get('seed') ?? 0)) || 0,
   drive: options.get('drive') ?? '',
+  skill: options.get('skill') ?? '',
   view: options.get('view') ?? '',
   speed: options.get('speed') ?? '1',
   detail: options.get('detail') ?? 'auto',
@@ -40,7 +41,7 @@ async function read(name) {
 function remember() {
   const shown = { task: element('task').value, seed: page.seed };
   episode.names.forEach((name, team) => (shown[`team${team}`] = name));
-  for (const key of ['drive', 'view']) if (page[key] !== '') shown[key] = page[key];
+  for (const key of ['drive', 'skill', 'view']) if (page[key] !== '') shown[key] = page[key];
   if (page.speed !== '1') shown.speed = page.speed;
   if (page.detail !== 'auto') shown.detail = page.detail;
   history.replaceState(null, '', `?${new URLSearchParams(shown)}`);
@@ -82,6 +83,10 @@ async function load(name, chosen) {
   const agents = robots.slice(0, settings.teams.flat().length);
   if (page.drive !== '' && !(Number(page.drive) < agents.length)) page.drive = '';
   if (page.view !== 'scene' && !(Number(page.view) < robots.length)) page.view = '';
+  const { skills } = settings;
+  if (!skills.includes(page.skill)) page.skill = '';
+  fill(element('skill'), skills.map((skill) => [skill, skill]), page.skill || skills.at(-1));
+  element('skill').parentElement.hidden = skills.length < 2;
   fill(element('drive'), [['', 'nobody'], ...agents], page.drive);
   fill(element('view'), [['', 'action'], ['scene', 'whole scene'], ...robots], page.view);
   element('aim').textContent = settings.aim;
@@ -262,13 +267,14 @@ class Meter {
 
 /** Steps the episode as far as page time has advanced; returns the number of steps. */
 async function simulate(passed) {
-  const { dt, commands } = episode.settings;
+  const { dt, commands, skills } = episode.settings;
+  const skill = (2 * element('skill').selectedIndex + 1) / skills.length - 1; // the middle of its part of the range
   const speed = Number(page.speed);
   page.due = Math.min(page.due + passed * speed, 5 * dt * Math.max(1, speed));
   const until = performance.now() + LONGEST_WORK;
   let steps = 0;
   while (page.due >= dt && episode.result === null && performance.now() < until) {
-    if (page.drive !== '') episode.drive.set(controls.values(commands), commands.length * Number(page.drive));
+    if (page.drive !== '') episode.drive.set(controls.values(commands, skill), commands.length * Number(page.drive));
     await episode.step();
     page.due -= dt;
     steps += 1;
@@ -327,6 +333,10 @@ function listen() {
   element('pause').addEventListener('click', pause);
   element('restart').addEventListener('click', () => later(start));
   element('next').addEventListener('click', () => later(advance));
+  element('skill').addEventListener('change', ({ target }) => {
+    page.skill = target.value;
+    remember();
+  });
   element('drive').addEventListener('change', ({ target }) => {
     setDrive(target.value);
     setView(target.value);
