@@ -10,7 +10,7 @@ import pytest
 
 from mqe_jax import InputError, presets, tasks
 from mqe_jax.core.blocks import Block, entities
-from mqe_jax.core.types import observations
+from mqe_jax.core.types import Observations, observations
 from mqe_jax.envs import make
 from mqe_jax.envs.observation import ObservationLayout
 from mqe_jax.envs.randomization import Randomization
@@ -80,7 +80,18 @@ def test_teachers_see_no_errors() -> None:
     )
     np.testing.assert_allclose(seen.exact().obs, usual.obs, atol=1e-5)
     assert np.abs(seen.obs - usual.obs).max() > 0.1
-    assert usual.exact() is usual
+    assert usual.exact().groups == usual.groups
+    names = ("entities", "exact_entities", "exact_policy", "policy", "proprioception")
+    assert tuple(sorted(cast.env.env.layouts)) == names
+    looked = [cast.env.env, plain.env.env]
+    key = KEY
+    one, same = (env.reset(key) for env in looked)
+    sized = looked[0].with_observations(one, ["entities", "exact_entities"]).groups
+    right = looked[1].with_observations(same, ["entities"]).groups["entities"]
+    np.testing.assert_allclose(sized["exact_entities"], right, atol=1e-5)
+    assert np.abs(sized["entities"] - right).max() > 0.1
+    teacher_of_sizes = Observations({"entities": right * 0, "exact_entities": right})
+    assert teacher_of_sizes.exact().group("entities") is right
 
 
 def test_readings_are_late_and_get_lost() -> None:

@@ -242,8 +242,8 @@ class Outcome:
         return values | {f"ending/{name}": x for name, x in self.ending.items()}
 
 
-EXACT = "exact"
-"""The group of observations that is `policy` without errors."""
+EXACT = "exact_"
+"""What the names of groups of observations without errors begin with, such as `exact_policy`."""
 
 
 @jax.tree_util.register_dataclass
@@ -271,10 +271,11 @@ class Observations:
         return self.groups[name]
 
     def exact(self) -> "Observations":
-        """Returns what a teacher sees: the group `exact`, if it is observed, as `policy`."""
-        if EXACT not in self.groups:
-            return self
-        return dataclasses.replace(self, groups={**self.groups, "policy": self.groups[EXACT]})
+        """Returns what a teacher sees: groups without errors, those observed, as the usual ones."""
+        exact = {
+            name: self.groups[EXACT + name] for name in self.groups if EXACT + name in self.groups
+        }
+        return dataclasses.replace(self, groups={**self.groups, **exact})
 
     @classmethod
     def at(cls, seen: Any, group: str = "policy") -> "Observations":

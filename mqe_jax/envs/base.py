@@ -442,11 +442,11 @@ class QuadrupedEnv(Task[S, P], metaclass=_Recorded):
                 blocks, senses = self.suite.observe(self.snapshot(state, robots), state.senses, key)
                 state = dataclasses.replace(state, senses=senses)
             else:
-                blocks = self.observe_group("policy" if name == EXACT else name, state, robots)
+                blocks = self.observe_group(name.removeprefix(EXACT), state, robots)
             if not self.robots.alike:
                 blocks = {**blocks, "bodies": observe_bodies(self.robots, self.teams)}
             obs = layout.pack(blocks, self.num_agents)
-            if noise and name != EXACT:
+            if noise and not name.startswith(EXACT):
                 key = jax.random.fold_in(state.key, keys.NOISE + number)
                 obs = obs + noise * layout.continuous * jax.random.normal(key, obs.shape)
             if name in self.reading_errors:

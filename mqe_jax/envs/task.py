@@ -233,8 +233,8 @@ class Task(Sensing, Generic[S, P]):
         """Layouts of all groups of observations by name.
 
         The group `policy` is always observed, the others if a policy or a critic names them.
-        `exact` is `policy` without errors, where it has some: teachers see it. Each has the block
-        `bodies` if robots are unlike.
+        `exact_policy` and `exact_entities` are `policy` and `entities` without errors, if these
+        have some: teachers see them. Each has the block `bodies` if robots are unlike.
         """
         layouts = {
             "policy": self.observation_layout,
@@ -246,7 +246,8 @@ class Task(Sensing, Generic[S, P]):
             layouts[ENTITIES] = entity_layout(self.sized_layout)
         randomization = self.params.randomization
         if randomization.observation_noise or randomization.readings != Readings():
-            layouts[EXACT] = self.observation_layout
+            seen = [name for name in ("policy", ENTITIES) if name in layouts]
+            layouts |= {EXACT + name: layouts[name] for name in seen}
         if self.robots.alike:
             return layouts
         bodies = bodies_block(self.robots)

@@ -161,9 +161,9 @@ def environments(
     match = len(trained.teams) > 1
     both = match and not config.opponents
     batch = _batch(trained, config, num_envs // 2 if both else num_envs, seeds, demonstrator)
-    taught = teacher is not None and "policy" in groups_of([teacher])
-    exact = {EXACT}.intersection(trained.layouts) if taught else ()
-    env: Any = batch.with_groups(groups.union(exact))
+    taught = () if teacher is None else groups_of([teacher])
+    exact = {EXACT + name for name in taught} & {*trained.layouts}
+    env: Any = batch.with_groups(groups | exact)
     if config.time_limit_ends:
         env = Deadline(env)
     league = None
