@@ -13,6 +13,7 @@ from mqe_jax.core.settings import checked
 from mqe_jax.core.types import RESULTS
 from mqe_jax.envs import QuadrupedEnv, VectorEnv, make
 from mqe_jax.envs.match import Match
+from mqe_jax.envs.task import Task
 
 _OVERLAP = 0.05  # m, of two bodies at the start
 
@@ -137,7 +138,11 @@ def _check_shapes(env: QuadrupedEnv, state: Any) -> None:
 
 
 def _check_start(env: QuadrupedEnv, state: Any) -> None:
-    """Checks that no body starts inside another."""
+    """Checks that no robot starts outside of the walls, and no body inside another."""
+    method = "spawn_poses" if type(env).spawn is Task.spawn else "spawn"
+    places = state.data.qpos[:, env.index.base_qpos[: env.num_agents, :2]][state.active]
+    room = env.compiled.layout.room(places)
+    assert room >= 0.0, f"{method}: a robot starts {-room:.2f} m outside of the outer walls"
     model = env.compiled.model
     data = mujoco.MjData(model)
     for qpos, pos, quat in zip(
@@ -151,7 +156,7 @@ def _check_start(env: QuadrupedEnv, state: Any) -> None:
             names = [model.geom(geom).name or f"geom {geom}" for geom in contact.geom]
             one, other = sorted(names, key=lambda name: not name.startswith("robot"))
             depth = -contact.dist
-            assert depth < _OVERLAP, f"spawn_poses: {one} starts {depth:.2f} m inside {other}"
+            assert depth < _OVERLAP, f"{method}: {one} starts {depth:.2f} m inside {other}"
 
 
 def _check_result(env: QuadrupedEnv, state: Any) -> None:

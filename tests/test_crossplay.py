@@ -102,6 +102,9 @@ def test_success_is_that_of_the_places_and_one_program_serves_all_teams() -> Non
     chances = rates[[0, 1, 3], [3, 3, 0]]
     assert np.all((0.1 < chances) & (chances < 0.7)) and len(set(chances)) > 1
     assert len(traced) <= 4  # both seats, and a trace of shapes
+    broken = {"own": simple(1, 1), "runs/broken": simple(np.nan, 1)}
+    batch = fake_env.FakeVectorEnv(fake_env.FakeEnv(), 2)
+    refuses("^policy: runs/broken returns actions with NaN", cross_play, batch, broken, 2, KEY)
 
 
 def test_tables_are_80_columns_wide_and_have_intervals(monkeypatch: pytest.MonkeyPatch) -> None:

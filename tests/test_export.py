@@ -34,7 +34,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 from mqe_jax.export import robot, translate  # noqa: E402
 from mqe_jax.export.check import errors, record_actions  # noqa: E402
 from mqe_jax.export.policy import input_shapes, shapes, to_onnx  # noqa: E402
-from mqe_jax.export.robot_graph import robot_onnx, verify_robot  # noqa: E402
+from mqe_jax.export.robot_graph import robot_onnx, skill_onnx, verify_robot  # noqa: E402
 from mqe_jax.export.robot_team import RobotTeam, open_team  # noqa: E402
 from mqe_jax.export.site import entries  # noqa: E402
 from mqe_jax.export.task import TaskFunctions, policy_function, state_arrays  # noqa: E402
@@ -85,6 +85,12 @@ def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: A
     assert (properties["kp_nm_per_rad"], properties["kd_nms_per_rad"]) == ("20.0", "0.5")
     assert properties["period_s"] == "0.02" and properties["opset"] == "17"
     assert file.stat().st_size < 4.0e6  # weights that float16 represents are stored as such
+
+
+@pytest.mark.parametrize("params", [{"control": "position"}, {"robots": ["go1", "go2"]}])
+def test_a_graph_of_a_skill_needs_robots_with_one_skill(params: dict[str, Any]) -> None:
+    env = make("go1gate", impl="c", num_envs=1, **params)
+    refuses("env: 'go1gate .* must be one whose robots have one skill", skill_onnx, env)
 
 
 def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() -> None:

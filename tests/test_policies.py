@@ -342,7 +342,11 @@ def test_mistakes_of_a_registered_policy_are_named(monkeypatch: pytest.MonkeyPat
     refuses(two, register_scripted, "go1tug", "two", lambda obs, key: obs)  # type: ignore[misc]
     wrong: dict[str, tuple[Any, str]] = {
         "flat": (lambda obs: jnp.zeros(3), r"'flat': .* returns \(3,\)' .* returns \(1, 3\)"),
-        "ball": (lambda obs: obs["ball"], r"'ball': no block 'ball'.*allowed: base, cylinder"),
+        "ball": (
+            lambda obs: obs["ball"],
+            r"'ball': no key 'ball' .*in line \d+ of .*test_policies.py; the blocks are base, cyl",
+        ),
+        "gains": (lambda obs: {}["base"], r"'gains': no key 'base' in line \d+ of .*policies.py;"),
         "numpy": (lambda obs: np.tanh(obs["base"][:, :3]), "numpy is compiled; .* use jax.numpy"),
     }
     env = make("go1tug", impl="c", num_envs=1)

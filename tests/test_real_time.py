@@ -140,18 +140,22 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_robot_asks_for_the_velocity_of_its_action(file: Path) -> None:
     readings = np.random.default_rng(0).normal(size=(20, 16))
     alone = robot.Robot(str(file))
-    last = np.zeros(3)
+    last = first = np.zeros(3)
     own = robot.Robot(str(file))
     controller: Any = make("go1gate", impl="c", num_envs=1, **RANGES).controller
     for step, row in enumerate(readings):
         action = alone.act(row[None], [step == 0])
         np.testing.assert_array_equal(own.last_action, last)
         velocity = own.velocity(row, starts=step == 0)
+        first = velocity if step == 0 else first
         last = action[0]
         np.testing.assert_allclose(velocity, controller.change(action)[0], atol=1e-5)
         back = controller.change(controller.action_of(velocity))
         np.testing.assert_allclose(back, velocity, atol=1e-5)
     np.testing.assert_allclose(own.speed, [1.2, 0.5, 0.5])
+    own.reset()
+    assert not own.last_action.any()
+    np.testing.assert_array_equal(own.velocity(readings[0]), first)
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,13 @@ def spawn_outside(env: Any) -> Any:
     return [(x, y - 1.4, yaw) for x, y, yaw in env.compiled.layout.spawn]
 
 
+def shift(dy: float, dz: float) -> Any:
+    def spawn(env: Any, key: Any) -> Any:
+        return Go1Gate.spawn(env, key) + jnp.array([0.0, dy, dz, 0.0])
+
+    return spawn
+
+
 def infinite_reward(env: Any, before: Any, after: Any, collision: Any) -> Any:
     return Go1Gate.rewards(env, before, after, collision) | {"approach": jnp.inf}
 
@@ -46,6 +53,9 @@ def unfair_score(env: Any, before: Any, after: Any, collision: Any) -> Any:
             spawn_outside,
             "spawn_poses lie 0.65 m outside of the outer walls",
         ),
+        (Go1Gate, "spawn", shift(-0.7, 0.0), "^spawn: robot0/.* starts .* m inside barrier/side_r"),
+        (Go1Gate, "spawn", shift(-1.4, 0.0), "^spawn: a robot starts 0.6. m outside of the outer"),
+        (Go1Gate, "spawn", shift(0.0, -0.3), "^spawn: robot./.* starts 0.1. m inside floor"),
         (Go1Gate, "rewards", infinite_reward, "rewards: a number is NaN or infinite"),
         (Go1Gate, "outcome", lambda *_: {"success": 2.0}, "success is not between 0 and 1"),
         (Go1Gate, "acting", lambda *_: jnp.zeros(2, bool), "actions do not change the robots"),

@@ -4,7 +4,7 @@ Short episodes are not over-represented.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -112,13 +112,14 @@ class Evaluator:
         keys: jax.Array,
         parts: int = 1,
         report: Callable[[float], None] = lambda share: None,
+        names: Sequence[Sequence[str]] = (),
     ) -> list[Result]:
         """Returns the results of B evaluations, for random keys (B, 2).
 
         The arrays of `seats` have a leading axis B. Seats of one form are compiled once. Errors are
         those of `evaluate_batch`. Environments i, i + parts, ... are a part, with `episodes` and a
         result of its own; results are by evaluation, then by part. `report` receives the share of
-        episodes that are finished.
+        episodes that are finished. `names` are those of each evaluation's seats in errors.
         """
         count = self._env.num_envs // parts
         shares = np.diff(-(-np.arange(count + 1) * episodes // count)).astype(np.int32)
@@ -128,7 +129,7 @@ class Evaluator:
             progress = self._run(progress, seats, keys, np.uint32(done_steps), quota)
             finished = np.minimum(np.asarray(progress.finished), quota)
             report(float(finished.sum() / (quota.sum() * len(keys))))
-            self._check_finite(seats, np.asarray(progress.finite))
+            self._check_finite(seats, np.asarray(progress.finite), names)
             if np.all(finished == quota):
                 # Only the sums are indexed: environment states may contain unbatched leaves.
                 sums = jax.device_get(progress._replace(env_state=(), memory=()))
@@ -146,13 +147,17 @@ class Evaluator:
             "steps"
         )
 
-    def _check_finite(self, seats: Seats, finite: np.ndarray) -> None:
+    def _check_finite(
+        self, seats: Seats, finite: np.ndarray, names: Sequence[Sequence[str]]
+    ) -> None:
         """Raises an InputError that names the policy of actions that were not finite."""
         own = teams_of(self._env)[0]
-        for seat in seats.seats:
-            if not finite[..., list(seat.acts)].all():
+        for place, seat in enumerate(seats.seats):
+            sound = finite[..., list(seat.acts)].all(axis=(1, 2))
+            if not sound.all():
                 field = "policy" if seat.acts[0] in own else "opponent"
-                raise InputError(not_finite(field, title(seat.policy)))
+                name = names[int(np.argmin(sound))][place] if names else title(seat.policy)
+                raise InputError(not_finite(field, name))
 
 
 def not_finite(field: str, name: str) -> str:

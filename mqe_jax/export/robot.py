@@ -43,13 +43,18 @@ class Robot:
         outputs = {x.name: tuple(x.shape[1:]) for x in self._session.get_outputs()}
         self._outputs = [*outputs]
         self._random = np.random.default_rng(seed)
-        self._memory: dict[str, np.ndarray] = {}
-        self.last_action = np.zeros(math.prod(outputs["action"]), np.float32)
-        """Action of the last `velocity` (D,), 0 before: what the block `action` of readings has."""
+        self._width = math.prod(outputs["action"])
+        self.reset()
         # metadata of the graph
         self.properties: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
         about = json.loads(self.properties.get("velocity", "{}"))
         self._velocity = {name: np.asarray(x, float) for name, x in about.items()}
+
+    def reset(self) -> None:
+        """Begins an episode: without recurrent state, and with `last_action` 0."""
+        self._memory: dict[str, np.ndarray] = {}
+        self.last_action = np.zeros(self._width, np.float32)
+        """Action of the last `velocity` (D,), 0 before: what the block `action` of readings has."""
 
     @property
     def size(self) -> int:

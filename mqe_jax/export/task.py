@@ -29,6 +29,7 @@ import jax.numpy as jnp
 
 from mqe_jax.acting.seats import Policy, groups_of
 from mqe_jax.core.errors import InputError
+from mqe_jax.core.settings import fail
 from mqe_jax.envs import QuadrupedEnv
 from mqe_jax.envs.observation import finite
 from mqe_jax.envs.state import Moment, State
@@ -188,8 +189,15 @@ def state_arrays(state: State) -> dict[str, jax.Array]:
 
 
 def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
-    """Returns the skill of a task's robots as a function of one robot, and its inputs' shapes."""
-    ((_, group),) = skills_of(env, env.num_agents).items()
+    """Returns the skill of a task's robots as a function of one robot, and its inputs' shapes.
+
+    InputError for unlike robots, and for robots without a skill.
+    """
+    groups = [*skills_of(env, env.num_agents).values()]
+    if len(groups) != 1:
+        control = f"{len(groups)} kinds of robots, control {env.control}"
+        fail("env", f"{env.name} ({control})", "one whose robots have one skill: make one of each")
+    (group,) = groups
     skill = group.skill
     memory = name_arrays(skill.name, skill.init_memory())
     shapes = {

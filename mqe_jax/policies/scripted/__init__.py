@@ -2,13 +2,14 @@
 
 import contextlib
 import functools
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mqe_jax.core.errors import InputError, known_name
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.lazy import load
 from mqe_jax.core.settings import fail
 from mqe_jax.envs.base import QuadrupedEnv
@@ -86,8 +87,11 @@ def _plan(
         with compiling(name):
             action = policy(blocks)
     except KeyError as error:
-        known_name(f"policy {name!r}: no block", str(error.args[0]), blocks)
-        raise
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise InputError(
+            f"policy {name!r}: no key {error.args[0]!r} in line {place.lineno} of "
+            f"{place.filename}; the blocks are {', '.join(blocks)}"
+        ) from error
     expected = (agents, len(TaskParams.commands))
     shape = getattr(action, "shape", type(action).__name__)
     if shape != expected:

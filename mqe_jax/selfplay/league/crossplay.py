@@ -30,13 +30,15 @@ def cross_play(
     """Returns the success rates (P, P) of each policy of agent 0 with each policy of its mates.
 
     The rows are agent 0's policies, the columns those of the others. The batch has P copies. One
-    compiled program evaluates the teams of a row at once and serves all rows.
+    compiled program evaluates the teams of a row at once and serves all rows. InputError for a
+    policy whose actions are not finite.
     """
     for name, policy in policies.items():
         check_policy(policy, batch, name)
     if batch.num_agents < 2 or len(teams_of(batch)) > 1:
         fail("task", batch.name, "one of a team of several agents")
     team = tuple(range(batch.num_agents))
+    names = [*policies]
     actors = exchangeable([*policies.values()])
 
     def seats(first: Any, others: Any) -> Seats:
@@ -48,7 +50,9 @@ def cross_play(
     for first, row_key in enumerate(jax.random.split(key, count)):
         teams = [seats(actors[first], others) for others in actors]
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *teams)
-        results = evaluator(stacked, episodes, jax.random.split(row_key, count))
+        pairs = [(names[first], name) for name in names]
+        keys = jax.random.split(row_key, count)
+        results = evaluator(stacked, episodes, keys, names=pairs)
         rates[first] = [result.success_rate for result in results]
     return rates
 
