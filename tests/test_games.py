@@ -92,7 +92,7 @@ def test_estimates_of_a_match_equal_a_recomputation_with_the_same_draws(
     random = np.random.default_rng(0)
     found = games.analyse(results)
 
-    more = results + np.array([0, 0.5, 0])
+    more = results + 1 / 6
     draws = random.standard_gamma(more, (60, count, count, 3))
     chosen = random.integers(count - 1, size=(60, count, count - 1))
     whole = payoff_of(results)

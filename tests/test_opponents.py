@@ -26,6 +26,7 @@ from mqe_jax.names import load_policy, versus
 from mqe_jax.presets import resolve
 from mqe_jax.runs import cast, playing
 from mqe_jax.selfplay.league import tournament
+from mqe_jax.selfplay.league.games import analyse
 from mqe_jax.selfplay.league.league import League
 from mqe_jax.selfplay.league.sides import BothSides
 from mqe_jax.selfplay.opponents import Mirror, Versus
@@ -517,6 +518,13 @@ def test_few_games_that_all_end_alike_leave_a_wide_interval(policies: int) -> No
         assert low < value < high
         return low, high
 
+    def drawn(games: int) -> float:
+        results = np.full((policies, policies, 3), [0, games, 0])
+        found = analyse(results).payoff.at(0, 1)
+        assert found.low < found.value == 0 < found.high
+        return found.high - found.low
+
+    assert 0.2 < drawn(4) < 1 and 0 < drawn(256) < 0.02
     few = interval(4)
     many = interval(256)
     assert few[1] - few[0] > 200 and few[0] < many[0] and few[1] < many[1]
@@ -535,13 +543,13 @@ def test_where_the_scripted_policy_does_not_fit_the_reference_is_an_idle_team(
     assert cast.environments(config, impl="c").eval_env is not None
 
 
-def test_a_tournament_takes_policies_and_functions_by_name(monkeypatch: Any) -> None:
+def test_a_tournament_takes_policies_and_functions_by_name(monkeypatch: Any, capsys: Any) -> None:
     def ahead(obs: Any, memory: Any, key: Any) -> Any:
         return jnp.zeros((*obs.shape[:2], 3)).at[..., 0].set(1.0), memory
 
     played: dict[str, Any] = {}
 
-    def count(batch: Any, teams: dict[str, Any], key: Any) -> Any:
+    def count(batch: Any, teams: dict[str, Any], key: Any, report: Any) -> Any:
         played.update(teams)
         return np.ones((len(teams), len(teams), 3), int)
 
@@ -553,8 +561,12 @@ def test_a_tournament_takes_policies_and_functions_by_name(monkeypatch: Any) -> 
     obs = jnp.zeros((1, 1, match.observation_size))
     asked = {name: float(team.act(obs, (), KEY)[0][0, 0, 0]) for name, team in played.items()}
     assert (asked["own"], asked["ready"], asked["half"], asked["idle"]) == (1.0, 0.25, 0.25, 0.0)
-    found = playing.tournament(match, [ahead, "forward", "forward", "idle"])
+    with pytest.warns(UserWarning, match="policies: 'forward' is there twice; it plays once"):
+        found = playing.tournament(match, [ahead, "forward", "forward", "idle"])
     assert found.policies == ("ahead", "forward", "idle", "scripted", "random")
+    found = playing.tournament("go1tug", {"own": ahead, "past": "population/1"}, impl="c")
+    assert found.policies[:3] == ("own", "past/scripted", "past/late")
+    assert "go1tug, 8 policies" in capsys.readouterr().err
     for wrong in ([ahead, lambda *given: ahead(*given), lambda *given: given], {"idle": ahead}):
         refuses("policies: .* the name of one policy; {'own'", playing.tournament, match, wrong)
     for wrong in ("forward", [], {}, 3, None):
@@ -599,5 +611,5 @@ def test_a_tournament_meets_every_pair_on_both_sides(
         .read_text()
         .startswith("policy,rating,rating_low,rating_high,mean,")
     )
-    monkeypatch.setattr(tournament, "round_robin", lambda *arguments: pytest.fail("played"))
+    monkeypatch.setattr(tournament, "round_robin", lambda *arguments, **named: pytest.fail("played"))
     assert "output: " in mqe(words, tmp_path / "tournament.csv", code=2).err

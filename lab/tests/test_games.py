@@ -134,7 +134,7 @@ def test_equilibria_of_a_match_equal_a_recomputation_with_the_same_draws(
     monkeypatch.setattr(league, "_SAMPLES", 60)
     results = results_of(seed, count)
     found = games.solve(results)
-    more = results + np.array([0, 0.5, 0])
+    more = results + 1 / 6
     draws = np.random.default_rng(0).standard_gamma(more, (60, count, count, 3))
     whole = payoff_of(results)
     samples = [

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import functools
 import tempfile
 import threading
 from collections.abc import Mapping, Sequence
@@ -10,11 +11,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+from rich.console import Console
+from rich.progress import Progress
 
 from mqe_jax import names
 from mqe_jax.acting.evaluate import evaluate_batch
 from mqe_jax.acting.results import Result, pool
 from mqe_jax.acting.seats import title
+from mqe_jax.core.errors import warn
 from mqe_jax.core.limits import (
     Candidates,
     ClipLength,
@@ -154,7 +158,8 @@ def tournament(
 
     Args:
         task: as `evaluate`, and so are env, impl, deterministic and seed.
-        policies: what `evaluate` accepts: a list, also of populations, or a mapping of names.
+        policies: what `evaluate` accepts: a list, also of populations, or a mapping of names to
+            them. A population of the name `a` plays as `a/MEMBER`.
             In a match, scripted, idle and random play too; ratings are relative to scripted, else
             to idle. In a task of one team, agent 0 follows each policy with each one as its mates;
             scripted and idle play too. As in `evaluate`, a trained policy brings its skill, with
@@ -189,10 +194,12 @@ def tournament(
         for each in everyone
     }
     key = jax.random.PRNGKey(seed)
+    with Progress(console=Console(stderr=True)) as bar:
+        shown = bar.add_task(f"{made.name}, {len(teams)} policies", total=len(teams))
+        play = league.round_robin if match else functools.partial(cross_play, episodes=episodes)
+        results = play(batch, teams, key=key, report=lambda: bar.advance(shown))
     if not match:
-        results = cross_play(batch, teams, episodes, key)
         return CrossPlay(made.name, own, tuple(references), episodes, results, made.skill_text)
-    results = league.round_robin(batch, teams, key)
     ratings = league.rate(results, everyone.index(references[0]))
     return Standings(made.name, everyone, results, ratings, made.skill_text)
 
@@ -200,7 +207,12 @@ def tournament(
 def _named(policies: Any, task: str) -> dict[str, Source]:
     """Returns what plays a tournament, by the names that its tables have."""
     if isinstance(policies, Mapping):
-        pairs = [(check("policies", name, str), each) for name, each in policies.items()]
+        pairs = []
+        for name, each in policies.items():
+            check("policies", name, str)
+            every = population.expand([each], task)
+            several = population.is_named(each)
+            pairs += [(f"{name}/{Path(x).name}" if several else name, x) for x in every]
     elif isinstance(policies, Sequence) and not isinstance(policies, str):
         listed = [path_text(x) if isinstance(x, Path) else x for x in policies]
         pairs = [(title(each), each) for each in population.expand(listed, task)]
@@ -215,6 +227,8 @@ def _named(policies: Any, task: str) -> dict[str, Source]:
         texts = isinstance(each, str) and isinstance(named.get(name, name), str)
         if (name in named or name in REFERENCES) and not (texts and each == name):
             fail("policies", name, "the name of one policy; {'own': policy} gives it another name")
+        if name in named:
+            warn(f"policies: {name!r} is there twice; it plays once")
         named[name] = each
     return named
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,16 @@ Array = NDArray[np.float64]
 
 
 def cross_play(
-    batch: VectorEnv, policies: Mapping[str, Policy], episodes: int, key: jax.Array
+    batch: VectorEnv,
+    policies: Mapping[str, Policy],
+    episodes: int,
+    key: jax.Array,
+    report: Callable[[], object] = lambda: None,
 ) -> Array:
     """Returns the success rates (P, P) of each policy of agent 0 with each policy of its mates.
 
-    The rows are agent 0's policies, the columns those of the others. The batch has P copies. One
+    The rows are agent 0's policies, the columns those of the others. `report` is called after each
+    row. The batch has P copies. One
     compiled program evaluates the teams of a row at once and serves all rows. InputError for a
     policy whose actions are not finite.
     """
@@ -54,6 +59,7 @@ def cross_play(
         keys = jax.random.split(row_key, count)
         results = evaluator(stacked, episodes, keys, names=pairs)
         rates[first] = [result.success_rate for result in results]
+        report()
     return rates
 
 

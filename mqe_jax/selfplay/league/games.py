@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _SAMPLES = 500  # of a bootstrap
-_DRAW = np.array([0.0, 0.5, 0.0])
+_HALF = np.full(3, 1 / 6)  # of a game that is won, drawn and lost in equal parts
 
 
 class Estimate(NamedTuple):
@@ -56,11 +56,11 @@ def resample(counts: NDArray[Any], random: np.random.Generator) -> Array:
 
 
 def games_of(results: NDArray[Any]) -> Array:
-    """Returns results with one more drawn game for every pair.
+    """Returns results with one more game for every pair, won, drawn and lost in equal parts.
 
-    The draw keeps the interval of a few equal games wide.
+    It keeps the interval of a few equal games wide.
     """
-    return results + _DRAW
+    return results + _HALF
 
 
 def estimate(value: Any, samples: Any) -> Estimate:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,16 +55,20 @@ def play(
 
 
 def round_robin(
-    matches: VectorEnv, policies: Mapping[str, Policy], key: jax.Array
+    matches: VectorEnv,
+    policies: Mapping[str, Policy],
+    key: jax.Array,
+    report: Callable[[], object] = lambda: None,
 ) -> NDArray[np.int64]:
     """Returns the outcomes of each policy as team 0 against each as team 1.
 
-    They are (P, P, 3), in the order of `RESULTS`. InputError for a policy whose actions are not
-    finite.
+    They are (P, P, 3), in the order of `RESULTS`. `report` is called after the games of each policy
+    as team 0. InputError for a policy whose actions are not finite.
     """
     teams = list(policies.values())
     names = list(policies)
-    return _play(matches, teams, teams, jax.random.split(key, len(teams)), names, names)
+    keys = jax.random.split(key, len(teams))
+    return _play(matches, teams, teams, keys, names, names, report)
 
 
 @single
@@ -75,6 +79,7 @@ def _play(
     keys: Any,
     names: Sequence[str],
     names_of_opponents: Sequence[str],
+    report: Callable[[], object] = lambda: None,
 ) -> NDArray[np.int64]:
     """Returns the outcomes of P policies as team 0 against each of K opponents (P, K, 3).
 
@@ -121,6 +126,7 @@ def _play(
             if not right:
                 raise InputError(not_finite("policies", each))
         outcomes.append(outcome)
+        report()
     return np.stack(outcomes).reshape(len(policies), -1, len(opponents), 3).sum(axis=1)
 
 
@@ -136,8 +142,8 @@ def scores(results: NDArray[Any]) -> Array:
 def rate(results: NDArray[Any], reference: int) -> Estimate:
     """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,); `reference` has 0.
 
-    A draw is half a win; every pair has one drawn game more than it played, so that ratings are
-    finite. Intervals are of a Bayesian bootstrap of all these games.
+    A draw is half a win; every pair has one game more than it played (`games_of`), so that ratings
+    are finite. Intervals are of a Bayesian bootstrap of all these games.
     """
     games = games_of(results)
     samples = _strengths(scores(resample(games, np.random.default_rng(0))), reference)
