@@ -611,5 +611,7 @@ def test_a_tournament_meets_every_pair_on_both_sides(
         .read_text()
         .startswith("policy,rating,rating_low,rating_high,mean,")
     )
-    monkeypatch.setattr(tournament, "round_robin", lambda *arguments, **named: pytest.fail("played"))
+    monkeypatch.setattr(
+        tournament, "round_robin", lambda *arguments, **named: pytest.fail("played")
+    )
     assert "output: " in mqe(words, tmp_path / "tournament.csv", code=2).err

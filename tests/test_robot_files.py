@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 import time
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -34,6 +35,7 @@ from mqe_jax.walk import training
 from mqe_jax.walk.rewards import reward_terms
 from mqe_jax.walk.training import train_skill
 from mqe_jax.walk_policy import WalkPolicy
+from tests.inputs import refuses
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "robots"
 DOG = str(EXAMPLES / "dog.xml")
@@ -262,6 +264,11 @@ def test_missing_meshes_are_dropped_with_a_line(tmp_path: Path) -> None:
     text = text.replace('mesh="shell" ', 'mesh="shell" mass="0" ')
     with pytest.warns(UserWarning, match="mesh: 1 files are missing, such as 'shell'"):
         bare = written(tmp_path, text, "speed: 20")
+    (tmp_path / "own.yaml").write_text("speed: 21")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read(tmp_path / "own.xml")  # a line that was said
+    (tmp_path / "own.yaml").write_text("speed: 20")
     (tmp_path / "shell.obj").write_text(
         "v 0 0 0\nv 0.3 0 0\nv 0 0.2 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     )
@@ -393,6 +400,29 @@ def test_what_is_left_out_is_noted(
 ) -> None:
     with pytest.warns(UserWarning, match=said):
         written(tmp_path, dog(change), yaml)
+
+
+def test_a_quadruped_that_seems_to_face_y_is_noted_unless_its_legs_are_named(
+    tmp_path: Path,
+) -> None:
+    tree = ElementTree.parse(DOG)
+    for leg in tree.iterfind(".//body[@name='torso']/body"):
+        x, y, z = leg.get("pos", "").split()
+        leg.attrib.update(pos=f"{-float(y)} {x} {z}", quat="1 0 0 1")
+    text = ElementTree.tostring(tree.getroot(), "unicode")
+    said = (
+        "body 'torso': its legs are 0.12 m apart along x and 0.44 m along y.*; turn its frame, or"
+    )
+    with pytest.warns(UserWarning, match=said):
+        written(tmp_path, text)
+    legs = written(tmp_path, text, "legs: [FL_hip, FR_hip, RL_hip, RR_hip]")
+    assert legs.joint_names[0] == "FL_roll" and not any("faced" in note for note in legs.notes)
+    assert not any("faced" in note for note in read(DOG).notes)
+
+
+def test_the_name_of_a_robot_is_no_file_of_weights_and_leads_to_one() -> None:
+    said = "agile skill: no file go1; those shipped for go1 are .*agile_go1.safetensors$"
+    refuses(said, make, "go1gate", robot=DOG, skill="agile", skill_weights="go1", impl="c")
 
 
 def test_names_are_free_and_a_trunk_without_a_joint_gets_one(tmp_path: Path) -> None:

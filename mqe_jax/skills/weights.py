@@ -132,8 +132,10 @@ class Networks:
                 "runs/agile/agile.safetensors; or use control 'position' or 'torque'"
             )
         if not file.is_file():
-            train = f"'mqe skill train {self.skill} --robot {robot.call}'"
-            raise InputError(f"{self.title}: no file {file}; train it with {train}")
+            train = f"train it with 'mqe skill train {self.skill} --robot {robot.call}'"
+            other = ASSETS / f"{self.skill}_{path}.safetensors"
+            use = f"those shipped for {path} are {other}" if other.is_file() else train
+            raise InputError(f"{self.title}: no file {file}; {use}")
         flat = read_tensors(file, self.title)
         found = {name.rpartition(".")[0] for name in flat}
         fitting = [name for name, other in _KNOWN.items() if found == {*other.sizes}]

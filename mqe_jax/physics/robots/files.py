@@ -18,6 +18,8 @@ MENAGERIE = "menagerie:"
 """What the names of robots begin with that the package mujoco-menagerie loads."""
 _LOADED: dict[str, tuple[tuple[tuple[str, int, int], ...], ModelRobot]] = {}
 """Robots by what named them, with the files' names, times and sizes when they were read."""
+_SAID: set[tuple[Path, str]] = set()
+"""Files, and what was said of them, which is said once."""
 
 
 def load(name: str) -> ModelRobot:
@@ -47,7 +49,9 @@ def load(name: str) -> ModelRobot:
     stamps = _stamps([str(x) for x in (*source.files, beside or path.with_suffix(".yaml"))])
     _LOADED[name] = stamps, robot
     for note in robot.notes:
-        warn(f"robot: {path.name}: {note}")
+        if (path, note) not in _SAID:
+            warn(f"robot: {path.name}: {note}")
+        _SAID.add((path, note))
     return robot
 
 

@@ -296,6 +296,13 @@ class Reader(Compiled):
             if len(places) < 4:
                 raise self.error("its legs are not one in each quarter about the trunk; set legs")
             ordered = [places[quarter] for quarter in sorted(places)]
+            apart = np.ptp([self.skeleton.anchor(foot.joints[0])[:2] for foot in feet], axis=0)
+            if apart[0] < apart[1]:
+                self.notes.append(
+                    f"body {brief(self.model.body(self.skeleton.root).name)!r}: its legs are "
+                    f"{apart[0]:.2f} m apart along x and {apart[1]:.2f} m along y, as if it faced "
+                    "y; turn its frame, or set legs if it faces x"
+                )
         self.joints = [name for foot in ordered for name in foot.joints]
         return ordered, True
 
