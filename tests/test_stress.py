@@ -58,9 +58,17 @@ def test_each_environment_keeps_the_values_of_its_condition_after_a_reset() -> N
 def test_results_are_those_of_the_conditions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "CONDITIONS", WEAK)
     low = {"episode_length": 1.0, "min_height": 0.2}
-    found = mqe_jax.stress("go1plane", "forward", env=low, impl="c", episodes=4, num_envs=4)
+    late = {"delay 120 ms": runs.CURVES["delay 120 ms"]}
+    monkeypatch.setattr(runs, "CURVES", late)
+    made: list[Any] = []
+    monkeypatch.setattr(runs, "Stressed", lambda *given: made.append(Stressed(*given)) or made[0])
+    options: dict[str, Any] = {"env": low, "impl": "c", "episodes": 4, "num_envs": 4}
+    found = mqe_jax.stress("go1plane", "forward", curves=True, **options)
+    state = jax.jit(made[0].reset)(jax.random.PRNGKey(0))
+    assert state.randomized.action_lag.tolist() == [0, 0, 6] * 4
+    assert made[0].env.controller.lag == 6
     falls = {name: result.endings["fall"] for name, result in found.results.items()}
-    assert falls == {"usual": 0.0, "weak": 1.0}
+    assert falls == {"usual": 0.0, "weak": 1.0, "delay 120 ms": 1.0}
     assert str(found).endswith(
         "fails most under weak: 0.0 (0.0 to 49.0)%, usually 100 (51.0 to 100)%"
     )

@@ -196,10 +196,11 @@ def tournament(
     key = jax.random.PRNGKey(seed)
     with Progress(console=Console(stderr=True)) as bar:
         shown = bar.add_task(f"{made.name}, {len(teams)} policies", total=len(teams))
-        play = league.round_robin if match else functools.partial(cross_play, episodes=episodes)
-        results = play(batch, teams, key=key, report=lambda: bar.advance(shown))
-    if not match:
-        return CrossPlay(made.name, own, tuple(references), episodes, results, made.skill_text)
+        report = functools.partial(bar.advance, shown)
+        if not match:
+            success = cross_play(batch, teams, episodes, key, report)
+            return CrossPlay(made.name, own, tuple(references), episodes, success, made.skill_text)
+        results = league.round_robin(batch, teams, key, report)
     ratings = league.rate(results, everyone.index(references[0]))
     return Standings(made.name, everyone, results, ratings, made.skill_text)
 

@@ -43,6 +43,10 @@ CONDITIONS: dict[str, Mapping[str, Any]] = {
 """Values of `RandomizedParams`, constant or in a range, by name; `errors` are those of `robust`."""
 
 
+LONGEST = 6
+"""Longest delay of `CURVES`, steps of 20 ms."""
+
+
 def _curves() -> dict[str, Mapping[str, Any]]:
     found: dict[str, Mapping[str, Any]] = {}
     for value in (0.8, 0.6, 0.5, 0.4, 0.3, 0.2):
@@ -51,6 +55,8 @@ def _curves() -> dict[str, Mapping[str, Any]]:
         found[f"payload {value:g} kg"] = {"payload": (value, value)}
     for value in (0.9, 0.8, 0.7, 0.6, 0.5, 0.4):
         found[f"motors {100 * value:g}%"] = {"motor_strength": (value, value)}
+    for steps in range(1, LONGEST + 1):
+        found[f"delay {20 * steps} ms"] = {"action_lag": (steps, steps)}
     for value in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0):
         found[f"errors x {value:g}"] = {"errors": value}
     for value in (0.2, 0.4, 0.6, 0.8, 1.0, 1.5):
@@ -108,7 +114,7 @@ def _bounds(
         least, most = value if isinstance(value, tuple | list) else (value, value)
         if name == "motor_offset":
             least = -most
-        if name == "action_lag":
+        if name == "action_lag" and value == most:
             least = 0
         like = getattr(low, name)
         low = dataclasses.replace(low, **{name: jnp.full_like(like, least)})
@@ -214,7 +220,8 @@ def stress(
     playing = names.table(task, policy, opponent, num_envs=1, **given)
     if playing.env.params.randomization != Randomization():
         fail("randomization", "ranges", "left out: each condition has its own")
-    changed = playing.env.changed({"randomization": "robust"})
+    lag = LONGEST if curves else ROBUST["action_lag"]
+    changed = playing.env.changed({"randomization": {**ROBUST, "action_lag": lag}})
     conditions = CONDITIONS | (CURVES if curves else {})
     count = min(num_envs, episodes)
     if sides == "both" and (count % 2 or episodes % 2 or len(changed.teams) < 2):
