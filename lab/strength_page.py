@@ -2,9 +2,9 @@
 
 `python -m lab.strength_page` reads the rates that `python -m lab.measure lab/strength.yaml --part
 PART` measured, as results/strength/PART.csv, mixed teams in crossplay_TASK.json and best responses
-in exploitability.csv. Version 0.3.0 measured oracle.json (mixtures). `python -m lab.strength_page
---rates FOLDER` first copies the results of every part that is below FOLDER; best responses and
-mixed teams of tasks that it lacks stay. former.csv has rates of the teams of version 0.3.0.
+in exploitability.csv. `python -m lab.strength_page --rates FOLDER` first copies the results of
+every part that is below FOLDER; best responses and mixed teams of tasks that it lacks stay.
+former.csv has rates of the teams of version 0.3.0.
 """
 
 import argparse
@@ -161,22 +161,13 @@ def population(found: Rates) -> str:
 
 
 def exploitability() -> str:
-    """Returns the table of the largest lead of the best responses to each team of version 0.3.0,
-    and to a mixture if any.
-    """
-    body = []
-    oracles = published("oracle")
-    for task in MATCHES:
-        leads = [
-            max(rate(row) for row in rows("exploitability") if row["task"] == task).percent,
-            "",
-        ]
-        last = oracles[task]["rounds"][-1] if task in oracles else {"weights": {}}
-        if len(last["weights"]) > 1:
-            leads[1] = Rate(**last["exploitability_lower_bound"]).percent
-        body.append([f"`{task}`", *leads])
-    head = ("match", "lead over the team of 0.3.0, points", "over the mixture, points")
-    return table(head, body)
+    """Returns the table of the largest lead of the best responses to each team of version 0.3.0."""
+    leads = {
+        task: max(rate(row) for row in rows("exploitability") if row["task"] == task)
+        for task in MATCHES
+    }
+    body = [[f"`{task}`", lead.percent] for task, lead in leads.items()]
+    return table(("match", "lead, points"), body)
 
 
 def robustness(found: Rates, former: Rates) -> str:
