@@ -116,7 +116,7 @@ def test_drawings_are_made_from_the_code(tmp_path: Path, monkeypatch: pytest.Mon
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
 
 
-@pytest.mark.parametrize("name", ["curves", "levers", "performance", "sizes", "students"])
+@pytest.mark.parametrize("name", ["curves", "performance", "sizes", "students"])
 def test_charts_show_the_published_data(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -85,31 +85,6 @@ def _curves(
     return figure
 
 
-def levers() -> Figure:
-    """Success of each seed with the default settings, and with one change: results/levers.csv."""
-    seeds: dict[tuple[str, str], list[float]] = {}
-    for row in read_rows("levers.csv"):
-        seeds.setdefault((row["task"], row["change"]), []).append(100 * float(row["success"]))
-    changes = [case for case in seeds if case[1]]
-    figure = Figure((WIDTH / 100, 0.9 + 0.6 * len(changes)), layout="constrained")
-    axes = figure.subplots()
-    for place, (task, change) in enumerate(changes):
-        axes.axhspan(place - 0.58, place + 0.42, color=GREY, alpha=0.1 * (place % 2), lw=0)
-        axes.text(-2, place - 0.22, f"{TITLES[task]}: {change}", fontsize=10.5, color=INK)
-        for name, color, shift in (("", BLUE, 0.0), (change, ORANGE, 0.24)):
-            values = seeds[task, name]
-            heights = [place + shift] * len(values)
-            axes.plot(values, heights, "o", color=color, ms=7, alpha=0.65, mec="none")
-    axes.set(xlim=(-3, 103), ylim=(len(changes) - 0.55, -0.6), yticks=[])
-    axes.set_xlabel("success, %; a dot is a seed, dots may coincide", fontsize=10.5)
-    axes.grid(axis="x", alpha=0.3)
-    axes.spines[["top", "left", "right"]].set_visible(False)
-    for color, label in ((BLUE, "default settings"), (ORANGE, "with the change")):
-        axes.plot([], [], "o", color=color, label=label)
-    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=10)
-    return figure
-
-
 def sizes() -> Figure:
     """Robot steps/s: by engine over the number of robots, on Warp over that of environments."""
     entries = read_measurements()

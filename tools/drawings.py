@@ -23,7 +23,6 @@ from charts import (
     VIOLET,
     WIDTH,
     curves,
-    levers,
     performance,
     sizes,
     students,
@@ -332,7 +331,6 @@ DRAWINGS: dict[str, Callable[[], Figure]] = {
     "league": league,
     "curves": curves,
     "students": students,
-    "levers": levers,
     "sizes": sizes,
     "performance": performance,
 }
