@@ -453,6 +453,17 @@ def test_a_loop_of_ones_own_trains_seeds_at_once() -> None:
 
 
 @pytest.mark.soak
+def test_an_algorithm_of_ones_own_learns_and_sees_the_ends_of_episodes() -> None:
+    example: dict[str, Any] = runpy.run_path(str(EXAMPLES / "own_ippo.py"))
+    reward = jnp.array([[[1.0]], [[0.0]]])
+    done = jnp.array([[[True]], [[False]]])
+    rows = example["Steps"](*[None] * 3, reward, 0 * reward, reward + 1, done)
+    np.testing.assert_allclose(example["advantages"](rows)[:, 0, 0], [1 + 0.98 * 2, 0.98])
+    rewards = example["main"](updates=12, num_envs=16, rollout=32)
+    assert np.mean(rewards[-3:]) > 0.004 + np.mean(rewards[:3])
+
+
+@pytest.mark.soak
 @pytest.mark.usefixtures("small")
 def test_a_policy_is_cloned_from_a_data_set(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("minari")
