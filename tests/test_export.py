@@ -90,7 +90,7 @@ def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: A
 @pytest.mark.parametrize("params", [{"control": "position"}, {"robots": ["go1", "go2"]}])
 def test_a_graph_of_a_skill_needs_robots_with_one_skill(params: dict[str, Any]) -> None:
     env = make("go1gate", impl="c", num_envs=1, **params)
-    refuses("env: 'go1gate .* must be one whose robots have one skill", skill_onnx, env)
+    refuses("env: 'go1gate, robots go1.* must be one of alike robots with", skill_onnx, env)
 
 
 def test_the_graph_does_what_the_environment_does_at_every_step_of_an_episode() -> None:

@@ -1,6 +1,7 @@
 """Errors of what policies read of the world, and the named set of randomisation."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 
 from mqe_jax import InputError, presets, tasks
 from mqe_jax.core.blocks import Block, entities
+from mqe_jax.core.settings import build
 from mqe_jax.core.types import Observations, observations
 from mqe_jax.envs import make
 from mqe_jax.envs.observation import ObservationLayout
@@ -17,6 +19,9 @@ from mqe_jax.envs.randomization import Randomization
 from mqe_jax.envs.readings import Reading, ReadingErrors, Readings
 from mqe_jax.envs.sets import randomization_of
 from mqe_jax.runs.cast import prepare
+from mqe_jax.train.config import TrainConfig
+from mqe_jax.train.policy import save_policy
+from tests.training import untrained
 
 ENVS = 128
 READINGS = Readings(
@@ -67,10 +72,10 @@ def test_errors_have_the_sizes_of_their_quantities_and_a_bias_for_the_episode() 
     assert abs(np.corrcoef(agents[:, 0, 0], agents[:, 1, 0])[0, 1]) < 0.3  # errors of their own
 
 
-def test_teachers_see_no_errors() -> None:
+def test_teachers_see_no_errors(tmp_path: Path) -> None:
     given = {"observation_noise": 0.2, "readings": {"position": {"bias": 0.5}, "delay": 2}}
     settings = {"num_envs": 8, "rollout_steps": 4, "total_steps": 32, "ppo.minibatches": 1}
-    teacher = {"imitation.teacher": "scripted", "curriculum.demonstrator": None}
+    teacher: dict[str, Any] = {"imitation.teacher": "scripted", "curriculum.demonstrator": None}
     _, cast = prepare("go1gate", {**settings, **teacher}, {"randomization": given}, impl="c")
     _, plain = prepare("go1gate", settings | teacher, impl="c")
     states = [each.env.reset(KEY) for each in (cast, plain)]
@@ -84,14 +89,18 @@ def test_teachers_see_no_errors() -> None:
     names = ("entities", "exact_entities", "exact_policy", "policy", "proprioception")
     assert tuple(sorted(cast.env.env.layouts)) == names
     looked = [cast.env.env, plain.env.env]
-    key = KEY
-    one, same = (env.reset(key) for env in looked)
+    one, same = (env.reset(KEY) for env in looked)
     sized = looked[0].with_observations(one, ["entities", "exact_entities"]).groups
     right = looked[1].with_observations(same, ["entities"]).groups["entities"]
     np.testing.assert_allclose(sized["exact_entities"], right, atol=1e-5)
     assert np.abs(sized["entities"] - right).max() > 0.1
-    teacher_of_sizes = Observations({"entities": right * 0, "exact_entities": right})
-    assert teacher_of_sizes.exact().group("entities") is right
+    both = Observations({"entities": right * 0, "exact_entities": right})
+    assert both.exact().group("entities") is right
+    sees = build(TrainConfig, {"task": "go1gate", "group": "entities"})
+    save_policy(tmp_path, untrained(looked[0], sees))
+    teacher["imitation.teacher"] = str(tmp_path)
+    _, sized_cast = prepare("go1gate", settings | teacher, {"randomization": given}, impl="c")
+    assert {"exact_entities"} == {x for x in sized_cast.env.groups if x.startswith("exact")}
 
 
 def test_readings_are_late_and_get_lost() -> None:

@@ -195,8 +195,8 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     """
     groups = [*skills_of(env, env.num_agents).values()]
     if len(groups) != 1:
-        control = f"{len(groups)} kinds of robots, control {env.control}"
-        fail("env", f"{env.name} ({control})", "one whose robots have one skill: make one of each")
+        found = f"{env.name}, robots {env.robots.identity}, control {env.control}"
+        fail("env", found, "one of alike robots with control command")
     (group,) = groups
     skill = group.skill
     memory = name_arrays(skill.name, skill.init_memory())

@@ -136,8 +136,8 @@ class Imitation:
 
     teacher: str | None = None
     """Policy to imitate: scripted, the task (its shipped policy), a run folder or a policy file. It
-    sees its own group of observations, `policy` without errors, and the task gets the parameters
-    that it needs. None disables imitation."""
+    sees its own group of observations, `policy` and `entities` without errors, and the task gets
+    the parameters that it needs. None disables imitation."""
     weight: NonNegative = 1.0
     """Initial weight of the loss, annealed linearly to 0."""
     until: Positive = 0.5
