@@ -162,7 +162,7 @@ def environments(
     both = match and not config.opponents
     batch = _batch(trained, config, num_envs // 2 if both else num_envs, seeds, demonstrator)
     taught = () if teacher is None else groups_of([teacher])
-    exact = {EXACT + name for name in taught} & {*trained.layouts}
+    exact = {EXACT + name for name in taught if EXACT + name in trained.layouts}
     env: Any = batch.with_groups(groups | exact)
     if config.time_limit_ends:
         env = Deadline(env)
