@@ -191,6 +191,7 @@ def properties(policy: TrainedPolicy, env: QuadrupedEnv) -> dict[str, str]:
         "group": policy.needs.group,
         "observation": json.dumps(layout),
         **joint_properties(env.robots[: policy.agents]),
+        "joint_angles": "rad, in blocks of the observation minus default_joints_rad",
         "env_steps": str(policy.metadata.get("env_steps", "")),
     }
 
@@ -208,5 +209,4 @@ def joint_properties(team: Sequence[Robot]) -> dict[str, str]:
         ),
         "kp_nm_per_rad": of_robots([round(robot.kp, 6) for robot in team]),
         "kd_nms_per_rad": of_robots([round(robot.kd, 6) for robot in team]),
-        "joint_angles": "rad, in blocks of the observation minus default_joints_rad",
     }
