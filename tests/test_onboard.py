@@ -208,7 +208,7 @@ class Counter:
 class SeeingExactly(Seeing):
     """Environments that show a teacher the sign, and the policy more."""
 
-    shown = EXACT
+    shown = EXACT + "policy"
 
 
 class PlainCounter(Counter):

@@ -510,8 +510,9 @@ def test_the_card_of_a_task_shows_the_robot_and_its_sizes(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     command = ["tasks", "go1gate", "--robot", BIPED, "--impl", "c"]
+    files._LOADED.clear()  # pyright: ignore[reportAttributeAccessIssue]
+    files._SAID.clear()  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.warns(UserWarning, match="no speed limit"):
-        files._LOADED.clear()  # pyright: ignore[reportAttributeAccessIssue]
         assert cli.main(command) == 0
     shown, said = capsys.readouterr()
     assert "shown with control position: skill: 'walk' needs four legs of three joints" in said
