@@ -81,5 +81,5 @@ def test_results_are_those_of_the_conditions(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_task_with_ranges_of_its_own_is_rejected() -> None:
-    with pytest.raises(InputError, match=r"randomization: .*each condition has its own"):
+    with pytest.raises(InputError, match="randomization: conditions have ranges of their own"):
         mqe_jax.stress("go1gate", env={"randomization": "robust"}, impl="c", episodes=1)

@@ -86,10 +86,9 @@ class Tournament(TaskOptions):
     ]
     """Policies. Scripted, idle and (in a match) random play too. Ratings are relative to scripted,
     or idle without it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path(
-        "runs/tournament"
-    )
-    """Folder of tournament.csv, tournament.png and, of a match, policies.csv."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    """Folder of tournament.csv, tournament.png and, of a match, policies.csv. Default:
+    runs/tournament/TASK."""
     episodes: Candidates = 64
     """Episodes of each pair on each side, or of each mixed team."""
     deterministic: bool = False
@@ -102,14 +101,15 @@ class Tournament(TaskOptions):
         from mqe_jax.runs.playing import tournament
         from mqe_jax.selfplay.league.tournament import CSV, PICTURE, POLICIES
 
+        folder = self.output or Path("runs") / "tournament" / self.task
         for name in (CSV, POLICIES, PICTURE):
-            check_output(self.output / name)
+            check_output(folder / name)
         options = {
             name: getattr(self, name) for name in ("impl", "episodes", "deterministic", "seed")
         }
         played = tournament(self.task, self.policies, env=self.overrides(), **options)
-        played.save(self.output)
-        echo(f"mqe: wrote {self.output / CSV} and {PICTURE}")
+        played.save(folder)
+        echo(f"mqe: wrote the tables and {folder / PICTURE}")
         if not self.json:
             print(played)
         return played.to_dict()

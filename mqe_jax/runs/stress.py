@@ -17,6 +17,7 @@ from mqe_jax import names
 from mqe_jax.acting.evaluate import Evaluator
 from mqe_jax.acting.results import Rate, Result
 from mqe_jax.core import keys
+from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import Environments, Episodes, Seed
 from mqe_jax.core.settings import Parameters, checked, fail
 from mqe_jax.envs import QuadrupedEnv, Randomization, VectorEnv
@@ -219,7 +220,9 @@ def stress(
     given: dict[str, Any] = {"env": env, "impl": impl, "deterministic": deterministic}
     playing = names.table(task, policy, opponent, num_envs=1, **given)
     if playing.env.params.randomization != Randomization():
-        fail("randomization", "ranges", "left out: each condition has its own")
+        raise InputError(
+            "randomization: conditions have ranges of their own; leave it out, or set it to none"
+        )
     lag = LONGEST if curves else ROBUST["action_lag"]
     changed = playing.env.changed({"randomization": {**ROBUST, "action_lag": lag}})
     conditions = CONDITIONS | (CURVES if curves else {})
