@@ -81,9 +81,9 @@ def rollout(
 
     Returns the new state, transitions (T, N, ...) and metrics (). The environment receives
     `action_scale` times the sampled action. A teacher labels every step with its action. It sees
-    its own group of observations without errors. Metrics are means over steps and
-    environments, but `diverged` and `overflow` are counts; `ended` has the number of `episodes`
-    that ended and means over them.
+    its own group of observations without errors. Metrics are means over steps and environments,
+    but `diverged` and `overflow` are counts; `ended` has the number of `episodes` that ended and
+    means over them.
     """
 
     def one_step(

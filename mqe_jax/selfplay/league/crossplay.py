@@ -34,9 +34,8 @@ def cross_play(
     """Returns the success rates (P, P) of each policy of agent 0 with each policy of its mates.
 
     The rows are agent 0's policies, the columns those of the others. `report` is called after each
-    row. The batch has P copies. One
-    compiled program evaluates the teams of a row at once and serves all rows. InputError for a
-    policy whose actions are not finite.
+    row. The batch has P copies. One compiled program evaluates the teams of a row at once and
+    serves all rows. InputError for a policy whose actions are not finite.
     """
     for name, policy in policies.items():
         check_policy(policy, batch, name)
