@@ -45,8 +45,9 @@ def resolve(
     1. The defaults of `TrainConfig`.
     2. The task parameters that `needs` returns for the other layers' settings: those of the
        policies that they name.
-    3. The settings of a file or a shipped name. The default is paper/ALGORITHM for an algorithm,
-       else tuned/TASK if it exists, else league for a match and paper/mappo for other tasks.
+    3. The settings of a file or a shipped name; a file changes those that its key `config` names.
+       The default is paper/ALGORITHM for an algorithm, else tuned/TASK if it exists, else league
+       for a match and paper/mappo for other tasks.
     4. What defines the algorithm.
     5. `onboard.yaml`, if a layer sets the task parameter `senses` and none sets `group`.
     6. `layers`.
@@ -143,10 +144,12 @@ def _has_sensors(env: Mapping[str, Any]) -> bool:
 
 def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     """Returns the layers of a shipped name or a file."""
-    shipped = ["demo", "laptop", "league", "robust", "sizes", "student"]
+    shipped = ["default", "demo", "laptop", "league", "robust", "sizes", "student"]
     for file in ("paper", "tuned"):
         shipped += [f"{file}/{part}" for part in sorted(_parts(file)) if part != "common"]
     name = path_text(check("config", config, PathText))
+    if name == "default":
+        return _layers_of(task, default_name(task))
     if name == "demo":  # of the gate, whatever the task
         return _layers_of("go1gate", "laptop")
     if name in shipped:
@@ -168,7 +171,12 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
         )
     if not path.is_file():
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
-    return [_Layer.of(f"{path}: ", read_settings(path))]
+    values = read_settings(path)
+    base = values.pop("config", None)
+    if base is not None and base not in shipped:
+        fail(f"{path}: config", base, f"one of {', '.join(shipped)}")
+    below = [] if base is None else _layers_of(task, base)
+    return [*below, _Layer.of(f"{path}: ", values)]
 
 
 def _defaults(task: str) -> list[_Layer]:

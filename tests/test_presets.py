@@ -106,9 +106,20 @@ def test_an_algorithm_changes_a_given_file_only_where_it_must() -> None:
 
 def test_without_a_name_the_tuned_file_or_the_papers_mappo_is_taken() -> None:
     assert resolve("go1gate") == resolve("go1gate", "tuned/go1gate")
+    assert resolve("go1gate") == resolve("go1gate", "default")
     assert resolve("go1plane") == resolve("go1plane", "paper/mappo")
     assert resolve("go1bridgewrestling") == resolve("go1wrestling")
     assert parse_train(["go1bridgewrestling"]).settings == resolve("go1wrestling")
+
+
+def test_a_file_changes_the_settings_that_it_names(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    for base in ("default", "laptop"):
+        file.write_text(f"config: {base}\nppo: {{clip: 0.1}}")
+        changed = resolve("go1tug", base, layers={"": {"ppo.clip": 0.1}})
+        assert resolve("go1tug", file) == changed != resolve("go1tug", base)
+    file.write_text("config: own.yaml")
+    refuses(rf"^{file}: config: 'own.yaml' .*one of default, demo", resolve, "go1tug", file)
 
 
 def test_unknown_names_get_the_nearest() -> None:
