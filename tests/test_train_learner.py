@@ -297,6 +297,8 @@ def test_a_notebook_has_one_bar(
     with logs.ProgressLog("gate", 100) as log:
         with log.doing("compiling"):
             pass
+        log.write({"env_steps": 50, "fps": 8.0, "success": 0.25, "team0/win": 0.25})
+        assert "50 of 100 steps, wins 25%" in shown[-1]
         log.write({"env_steps": 100, "fps": 8.0, "success": 0.5})
     assert shown[0].startswith("gate ░░░░░░░░░░ 0 of 100 steps, compiling")
     assert shown[-1].startswith("gate ██████████ 100 of 100 steps, success 50%, 8 steps/s")

@@ -282,7 +282,7 @@ class ProgressLog:
         self._since += time.perf_counter() - now
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Shows steps, speed, remaining time, reward per step (else return) and success."""
+        """Shows steps, speed, remaining time, reward per step (else return) and success or wins."""
         now = time.perf_counter()
         first = not self._numbers
         self._seconds += now - self._since
@@ -293,7 +293,8 @@ class ProgressLog:
         rewards = {"average_step_reward": "reward", "episode_return": "return"}
         parts = [f"{word} {known[name]:.3g}" for name, word in rewards.items() if name in known][:1]
         assisted = " with assistance" if known.get("assistance", 0.0) > 0.0 else ""
-        parts += [f"success {known['success']:.0%}{assisted}"] if "success" in known else []
+        result = "wins" if "team0/win" in known else "success"
+        parts += [f"{result} {known['success']:.0%}{assisted}"] if "success" in known else []
         self._numbers = ", ".join([*parts, f"{row['fps']:,.0f} steps/s"])
         if self._bar is not None:
             self._bar.update(self._task, completed=self._step)
