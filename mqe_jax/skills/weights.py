@@ -27,6 +27,7 @@ from mqe_jax.core.files import (
     parse_json,
     parsing,
     read_tensors,
+    split_bytes,
     write_atomically,
 )
 from mqe_jax.physics.robots.quadruped import JOINTS, NUM_JOINTS
@@ -157,7 +158,7 @@ class Networks:
     ) -> None:
         """Writes weights and metadata to a safetensors file, atomically.
 
-        With `half`, weights are rounded to float16.
+        With `half`, weights are rounded to float16, and stored by `split_bytes`.
         """
         from safetensors.numpy import save
 
@@ -166,7 +167,8 @@ class Networks:
         for part, layers in params.items():
             for layer, arrays in layers.items():
                 for kind, array in arrays.items():
-                    flat[f"{part}.{layer}.{kind}"] = np.ascontiguousarray(array, dtype)
+                    rounded = np.ascontiguousarray(array, dtype)
+                    flat[f"{part}.{layer}.{kind}"] = split_bytes(rounded) if half else rounded
         file = pathlib.Path(path)
         check_locks(file)
         try:
