@@ -29,12 +29,11 @@ ROOT = Path(__file__).parents[1]
 DATA = ROOT / "results" / "strength"
 PAGES = ROOT / "docs" / "results"
 SECTIONS = {
-    "strength.md": ("strength",),
-    "population.md": ("population",),
-    "exploitability.md": ("exploitability",),
+    "strength.md": ("strength", "population"),
+    "../exploiting.md": ("exploitability",),
     "robustness.md": ("robustness",),
     "../comparing.md": ("mates",),
-    "skills.md": ("walk",),
+    "../skills.md": ("walk",),
 }
 """Filled sections of each page."""
 COOPERATIVE = (
@@ -161,13 +160,12 @@ def population(found: Rates) -> str:
 
 
 def exploitability() -> str:
-    """Returns the table of the largest lead of the best responses to each team of version 0.3.0."""
-    leads = {
-        task: max(rate(row) for row in rows("exploitability") if row["task"] == task)
-        for task in MATCHES
-    }
-    body = [[f"`{task}`", lead.percent] for task, lead in leads.items()]
-    return table(("match", "lead, points"), body)
+    """Returns the table of the largest lead of the best responses to each team."""
+    body = []
+    for task in MATCHES:
+        own = [row for row in rows("exploitability") if row["task"] == task]
+        body.append([f"`{task}`", own[0]["team"], max(map(rate, own)).percent])
+    return table(("match", "team", "lead, points"), body)
 
 
 def robustness(found: Rates, former: Rates) -> str:
@@ -361,6 +359,7 @@ def leads(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             episodes = result["episodes"]
             own = {
                 "task": result["task"],
+                "team": "shipped",
                 "from": cell.split("+")[1],
                 "seed": seed.removeprefix("seed"),
             }

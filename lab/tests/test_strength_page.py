@@ -20,9 +20,7 @@ from tests.inputs import refuses
 @pytest.fixture
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the published data, which a test may change."""
-    shutil.copytree(
-        strength_page.DATA, tmp_path / "data", ignore=shutil.ignore_patterns("policies")
-    )
+    shutil.copytree(strength_page.DATA, tmp_path / "data")
     monkeypatch.setattr(strength_page, "DATA", tmp_path / "data")
     return tmp_path / "data"
 
@@ -100,18 +98,17 @@ def test_every_file_has_its_command_date_and_hardware() -> None:
         assert "/strength.yaml --part " in row[1] and row[2], file.name
 
 
-def test_every_match_has_best_responses_of_two_seeds_and_the_page_shows_the_largest_lead() -> None:
+def test_every_match_has_best_responses_of_both_kinds_and_the_page_shows_the_largest_lead() -> None:
     found = strength_page.rows("exploitability")
     shown = lines(strength_page.tables()["exploitability"])
     for task, row in zip(strength_page.MATCHES, shown, strict=True):
         own = [each for each in found if each["task"] == task]
         assert len({(each["seed"], each["from"], each["actions"]) for each in own}) == len(own)
-        assert (
-            sum(each["actions"] == "sampled" for each in own) == 4
-            and len({each["seed"] for each in own}) == 2
-        )
+        kinds = {(each["from"], each["actions"]) for each in own}
+        assert kinds == {(x, y) for x in ("scratch", "champion") for y in ("sampled", "mean")}
         best = max(own, key=lambda x: float(x["value"]))
-        assert row == [f"`{task}`", Rate(*(float(best[name]) for name in Rate._fields)).percent]
+        lead = Rate(*(float(best[name]) for name in Rate._fields))
+        assert row == [f"`{task}`", best["team"], lead.percent]
 
 
 def test_conditions_are_shown_as_far_as_they_are_measured(data: Path) -> None:
