@@ -103,13 +103,13 @@ def test_a_divergence_in_training_is_recorded(mqe: Any, monkeypatch: Any) -> Non
     # in the second step
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)
     Path("small.yaml").write_text("network: {hidden_sizes: [4], recurrent: false}")
-    task = "go1revolvingdoor --impl c --control position --config small.yaml --num-envs 4"
+    task = "go1plane --impl c --control position --config small.yaml --num-envs 2"
     few = "--rollout-steps 2 --total-steps 4 --ppo.minibatches 1"
     said = mqe(f"train {task} {few} --run-dir run --dump-diverged dump").err
     assert "recorded 2 divergences" in said
     for file in ("diverged_0000.npz", "diverged_0001.npz"):
         recording = load_recording(Path("dump", file))
-        assert recording.task == "go1revolvingdoor" and recording.states["step"].tolist() == [0, 1]
+        assert recording.task == "go1plane" and recording.states["step"].tolist() == [0, 1]
         assert recording.actions.shape == (2, 2, 12)
 
 

@@ -230,7 +230,13 @@ BATCHES: dict[str, Callable[[], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", BATCHES)
+# which a league has too
+PARTS = ("versus", "mirror", "both sides")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.soak if x in PARTS else ()) for x in BATCHES]
+)
 def test_batches(name: str) -> None:
     """Programs are compared as text: most take long to compile."""
     batch = BATCHES[name]()

@@ -381,9 +381,10 @@ def test_mistakes_of_a_function_are_named() -> None:
 
 def test_actions_that_are_not_finite_are_an_error_not_a_draw() -> None:
     def broken(obs: Any, memory: Any, key: Any) -> Any:
-        return np.full((*obs.shape[:2], 3), np.nan, np.float32), memory
+        return np.full((*obs.shape[:2], 12), np.nan, np.float32), memory
 
-    match = mqe_jax.make("go1tug", impl="c", num_envs=4, episode_length=0.04)
+    still = {"control": "position", "episode_length": 0.04}
+    match = mqe_jax.make("go1tug", impl="c", num_envs=4, **still)
     options: dict[str, Any] = {"episodes": 2, "num_envs": 2}
     said = "broken returns actions with NaN or infinity"
     refuses(f"policy: {said}", mqe_jax.evaluate, match, broken, "idle", **options)

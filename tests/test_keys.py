@@ -150,7 +150,10 @@ def walk() -> Any:
     return VectorEnv(WalkEnv(GO1, WalkTask(shove=50.0, action_lag=1), impl="c", num_envs=2), 2)
 
 
-@pytest.mark.parametrize("made", [sheep, flocks, defended, demonstrated, match, walk])
+SLOW = [pytest.param(made, marks=pytest.mark.soak) for made in (defended, demonstrated)]
+
+
+@pytest.mark.parametrize("made", [sheep, flocks, match, walk, *SLOW])
 def test_no_key_of_a_reset_and_two_steps_is_used_twice(made: Any, recorder: Recorder) -> None:
     batch = made()
     assert recorder.twice(two_steps(batch, batch.num_agents, 2)) == set()

@@ -140,7 +140,8 @@ STEPS = (gymnasium, vector, pettingzoo, brax, jaxmarl)
 @pytest.mark.parametrize(
     ("step", "opponent"),
     [
-        *((step, "idle") for step in STEPS),
+        *((step, "idle") for step in STEPS if step is not jaxmarl),
+        pytest.param(jaxmarl, "idle", marks=pytest.mark.soak),
         *(
             pytest.param(step, None, marks=() if step is gymnasium else pytest.mark.soak)
             for step in STEPS

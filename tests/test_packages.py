@@ -64,8 +64,8 @@ def test_a_run_asks_for_the_import_of_its_task(forget: Any, mqe: Any, monkeypatc
         assert said == "mqe: run: the task 'race' of runs/race is not registered; " + (
             "add --import race.py\n"
         )
-    few = "--episodes 2 --num-envs 2 --impl c"
-    assert "policy               runs/race" in mqe(f"eval runs/race --import=race.py {few}").out
+    imports.add("race.py")
+    assert mqe_jax.load_policy("runs/race").task == "race"
     forget()
     assert "race" in mqe("--import race.py --import ./race.py tasks").out  # both once
 
@@ -92,6 +92,7 @@ def test_a_run_asks_for_what_else_its_import_registered(forget: Any, mqe: Any) -
         assert mqe("eval run", code=2).err == f"mqe: {said}"
 
 
+@pytest.mark.soak
 def test_a_sweep_resumes_with_the_same_file_only(forget: Any, mqe: Any) -> None:
     Path("few.yaml").write_text(
         "{tasks: [race], algorithms: [default], seeds: [0], settings: {num_envs: 8, "

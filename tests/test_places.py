@@ -136,6 +136,7 @@ for call in mqe_jax.make, mqe_jax.load_policy:
     )
 
 
+@pytest.mark.soak
 def test_help_needs_no_docstrings(tmp_path: Path) -> None:
     code = """
 from contextlib import suppress

@@ -371,6 +371,7 @@ def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
         assert "skill=walk" in tab.url
 
 
+@pytest.mark.soak
 def test_a_phone_shows_what_to_do_and_its_button_and_pads_drive(page: Path) -> None:
     """Nothing covers anything else; who falls in a match, here one without physics, loses."""
     with opened(page, "seed=3", 390, 844, touch=True) as tab:

@@ -77,6 +77,7 @@ def test_an_interrupted_recording_keeps_whole_episodes(
     refuses("^folder: 'own' is not allowed", mqe_jax.record, short, folder="own")
 
 
+@pytest.mark.soak
 def test_the_command_records_observations_of_sensors(
     mqe: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

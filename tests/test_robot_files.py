@@ -556,6 +556,7 @@ def rewards_of(robot: ModelRobot, factor: float = 1.0) -> dict[str, float]:
     return {name: float(value) for name, value in terms.items()}
 
 
+@pytest.mark.soak
 def test_rewards_of_skills_are_relative_to_mass_and_height() -> None:
     robot = read(DOG)
     usual = rewards_of(dataclasses.replace(robot, sizes=Proportions()))

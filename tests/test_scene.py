@@ -378,7 +378,8 @@ def test_joints_in_the_air_start_along_their_torque_line() -> None:
             assert 0.75 < found / speed < 1.35, joint
 
 
-@pytest.mark.parametrize("robot", ["go1", pytest.param("go2", marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("robot", ["go1", "go2"])
 def test_engines_agree_where_motors_saturate(robot: str) -> None:
     states = {}
     for impl in ("c", "jax"):

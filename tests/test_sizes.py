@@ -399,7 +399,7 @@ def forged(env: Any, state: Any) -> Any:
     return dataclasses.replace(state, data=state.data.replace(**fields))
 
 
-@pytest.mark.parametrize("task", [BALL, SHEEP])
+@pytest.mark.parametrize("task", [pytest.param(BALL, marks=pytest.mark.soak), SHEEP])
 def test_nothing_that_a_parked_robot_is_or_does_changes_anything_for_the_others(task: str) -> None:
     env = varied(task, True)
     start = begun(task)

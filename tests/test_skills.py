@@ -446,6 +446,7 @@ def test_scripted_and_idle_policies_use_the_first_skill(match: Any) -> None:
         assert np.all(skill_commands(match, load_policy(name, match), obs)[:, -1] <= 0.0)
 
 
+@pytest.mark.soak
 def test_policies_of_two_skills_meet(policies: Any, match: Any) -> None:
     batch = VectorEnv(match, 4)
     env = versus(BothSides(batch), [policies["walk"], policies["agile"]])

@@ -32,6 +32,7 @@ SMALL: dict[str, Any] = {
     "total_steps": 96,
     "ppo.minibatches": 1,
     "ppo.epochs": 1,
+    "network": {"recurrent": False, "hidden_sizes": [8]},
 }
 
 
@@ -76,13 +77,11 @@ def test_engines_agree_on_unlike_robots() -> None:
 
 
 def test_a_name_for_each_of_like_robots_is_the_robot_to_the_last_bit() -> None:
-    runs = []
-    for given in ({"robot": "go1"}, {"robots": ("go1", "go1")}):
-        few = {**SMALL, "network.recurrent": False, "network.hidden_sizes": [8]}
-        runs.append(mqe_jax.learn("go1gate", few, env=given, impl="c"))
-    one, two = (run.policy for run in runs)
-    assert one.actor.digest == two.actor.digest
-    assert one.needs == two.needs and one.needs.robot == "go1"
+    one = make("go1gate", impl="c")
+    two = make("go1gate", impl="c", robots=("go1", "go1"))
+    jax.tree.map(np.testing.assert_array_equal, stepped(one), stepped(two))
+    needs = [untrained(VectorEnv(env, 2), TrainConfig()).needs for env in (one, two)]
+    assert needs[0] == needs[1] and needs[0].robot == "go1"
 
 
 def test_robots_see_which_bodies_they_and_others_have() -> None:
@@ -173,7 +172,7 @@ def test_robots_of_other_joint_counts_act_together(uneven: Any, tmp_path: Path) 
 
 
 def test_entries_of_joints_that_a_robot_lacks_teach_nothing(uneven: Any) -> None:
-    own = {"share_policy": False, "log_std_init": 0.0, "chunk_length": 2}
+    own = {**SMALL["network"], "share_policy": False, "log_std_init": 0.0}
     config = {**SMALL, "num_envs": 8, "network": own, "ppo.entropy_coef": 0.1}
     policy = mqe_jax.learn(uneven, config).policy
     moved = np.asarray(policy.params["log_std"]) != 0.0  # where it begins
