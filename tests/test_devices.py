@@ -230,8 +230,8 @@ BATCHES: dict[str, Callable[[], Any]] = {
 }
 
 
-# which a league has too
-PARTS = ("versus", "mirror", "both sides")
+# the longest to trace
+PARTS = ("versus", "mirror", "both sides", "demonstrated")
 
 
 @pytest.mark.parametrize(

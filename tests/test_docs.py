@@ -183,7 +183,8 @@ def small(shared_programs: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 # `make release` runs the first hour; other tests play the match, call the adapters, and train.
 SLOW_PAGES = {
-    f"docs/{name}.md" for name in ("adapters", "evaluating", "first_hour", "new_match", "training")
+    f"docs/{name}.md"
+    for name in ("adapters", "evaluating", "first_hour", "new_match", "shaping", "training")
 }
 
 
@@ -305,7 +306,8 @@ def commands(text: str) -> list[list[str]]:
     return [words for words in found if words]
 
 
-def accepted(words: list[str]) -> bool:
+@functools.cache
+def accepted(words: tuple[str, ...]) -> bool:
     """Whether the program's own parser accepts a command; `mqe eval` alone names one."""
     if " ".join(words[1:]) in (*COMMANDS, "--version"):
         return True
@@ -319,9 +321,9 @@ def accepted(words: list[str]) -> bool:
         **dict.fromkeys(("N", "I", "GPU", "SEED"), "1"),
     }
     standing |= {"reach": "go1gate", "race": "go1tug"}  # which a page registers
-    _, words = take_imports(words[1:])
+    _, others = take_imports([*words[1:]])
     try:
-        return bool(parse([standing.get(word, word) for word in words]))
+        return bool(parse([standing.get(word, word) for word in others]))
     except SystemExit as stop:
         return stop.code == 0
 
@@ -338,7 +340,7 @@ def check_commands(text: str) -> None:
             end = next(
                 (i for i, word in enumerate(words) if word in ("|", "&&", ">", "&")), len(words)
             )
-            assert accepted(words[:end]), words
+            assert accepted(tuple(words[:end])), words
         elif program == "make":
             assert words[1] in targets, words
         elif program == "python" and words[1].endswith(".py"):
@@ -354,7 +356,13 @@ def test_commands_on_pages_exist(page: str) -> None:
     check_commands(read(page))
 
 
-def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
+def test_commands_in_docstrings_exist() -> None:
+    for path in (ROOT / "mqe_jax").rglob("*.py"):
+        check_commands(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.soak
+def test_commands_on_generated_pages_exist() -> None:
     pytest.importorskip("mkdocs")
     pages = importlib.import_module("docs_pages").pages()
     for name, task in TASKS.items():
@@ -362,10 +370,7 @@ def test_commands_on_generated_pages_and_in_docstrings_exist() -> None:
         assert {"render", "train", "view"} == {
             words[1] for words in commands(pages[f"tasks/{name}.md"])
         }
-    for text in [
-        *pages.values(),
-        *(path.read_text(encoding="utf-8") for path in (ROOT / "mqe_jax").rglob("*.py")),
-    ]:
+    for text in pages.values():
         check_commands(text)
 
 

@@ -353,7 +353,7 @@ def files(policy: TrainedPolicy, tmp_path_factory: pytest.TempPathFactory) -> di
     return {"run": run, "sampled": sampled, "mean": mean}
 
 
-@pytest.mark.parametrize("actions", ["mean", "sampled"])
+@pytest.mark.parametrize("actions", ["mean", pytest.param("sampled", marks=pytest.mark.soak)])
 def test_a_team_of_processes_acts_as_the_policy(
     policy: TrainedPolicy, files: Any, actions: str
 ) -> None:

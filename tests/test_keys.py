@@ -150,10 +150,10 @@ def walk() -> Any:
     return VectorEnv(WalkEnv(GO1, WalkTask(shove=50.0, action_lag=1), impl="c", num_envs=2), 2)
 
 
-SLOW = [pytest.param(made, marks=pytest.mark.soak) for made in (defended, demonstrated)]
+SLOW = [pytest.param(made, marks=pytest.mark.soak) for made in (defended, demonstrated, walk)]
 
 
-@pytest.mark.parametrize("made", [sheep, flocks, match, walk, *SLOW])
+@pytest.mark.parametrize("made", [sheep, flocks, match, *SLOW])
 def test_no_key_of_a_reset_and_two_steps_is_used_twice(made: Any, recorder: Recorder) -> None:
     batch = made()
     assert recorder.twice(two_steps(batch, batch.num_agents, 2)) == set()

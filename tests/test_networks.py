@@ -459,7 +459,8 @@ def test_statistics_are_those_of_all_entities_of_a_kind_that_are_there() -> None
     )
 
 
-@pytest.mark.parametrize("recurrent", [pytest.param(False, marks=pytest.mark.soak), True])
+@pytest.mark.soak
+@pytest.mark.parametrize("recurrent", [False, True])
 def test_entities_and_images_are_exported(recurrent: bool) -> None:
     pytest.importorskip("jax2onnx")
     blocks = (*BLOCKS, image("depth", 5, 4))

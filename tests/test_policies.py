@@ -92,6 +92,7 @@ def test_the_readme_and_the_list_have_the_rates_of_the_cards(mqe: Any) -> None:
     assert 0.0 < found["low"] < found["value"] <= found["high"] <= 1.0 and found["sides"] == "both"
 
 
+@pytest.mark.soak
 def test_a_shipped_policy_does_what_its_card_says() -> None:
     """32 episodes of the gate: within four standard errors of the rate on the card."""
     env = VectorEnv(make("go1gate", impl="c", num_envs=32), 32)

@@ -64,13 +64,14 @@ def shipped() -> list[str | None]:
 
 
 def digests() -> dict[str, str]:
-    """Returns a digest for each task and name: how the settings, with every algorithm and some task
+    """Returns a digest for each task and name: how the settings, with every algorithm or some task
     parameters, differ from the defaults.
     """
     found = {}
     for task, name in itertools.product(SHIPPED, shipped()):
         resolved = []
-        for algorithm, env in itertools.product((None, *ALGORITHMS), ENVS):
+        changed = [(None, env) for env in ENVS] + [(each, {}) for each in ALGORITHMS]
+        for algorithm, env in changed:
             config = resolve(task, name, algorithm, {"": {"env": env}})
             changes = differences(config, TrainConfig())
             resolved.append({key: to_mapping(value) for key, value in changes.items()})

@@ -529,7 +529,7 @@ def policy(task: str, env: Any, **settings: Any) -> TrainedPolicy:
     return untrained(env, build(TrainConfig, settings))
 
 
-@pytest.mark.parametrize("task", [BALL, SHEEP])
+@pytest.mark.parametrize("task", [pytest.param(BALL, marks=pytest.mark.soak), SHEEP])
 def test_fewer_robots_do_what_they_do_in_a_scene_of_their_number(task: str, tmp_path: Path) -> None:
     """So do the sheep, the scripted policy, and a policy of any size, whose file was written at the
     other size.

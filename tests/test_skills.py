@@ -281,6 +281,7 @@ def test_a_policy_needs_the_contents_of_its_skill_weights(weights: str, tmp_path
     refuses("skill_weights: .* has changed", skills_of, env, 1)
 
 
+@pytest.mark.soak
 def test_a_policy_that_learns_in_a_batch_knows_its_parameters() -> None:
     batch = VectorEnv(
         make("go1plane", impl="c", num_envs=2, control="position", position_scale=2.0), 2

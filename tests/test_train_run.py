@@ -121,6 +121,7 @@ def test_a_training_knows_the_contents_of_the_policies_that_play_in_it(tmp_path:
     assert [*found[0]] == [f"imitation.teacher {file}", f"curriculum.demonstrator {file}"]
 
 
+@pytest.mark.soak
 def test_a_longer_run_brings_back_nothing_that_has_ended(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     warmed = settings(ppo__critic_warmup=0.4)

@@ -593,6 +593,7 @@ def test_a_mirrored_observation_is_that_of_the_mirrored_robot() -> None:
         )
 
 
+@pytest.mark.soak
 def test_descending_the_loss_makes_a_policy_symmetric() -> None:
     params = walk_policy.init_params(jax.random.PRNGKey(0))
     flat = jax.random.normal(jax.random.PRNGKey(1), (8, 2100))

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from lab import publish, report
 from mqe_jax.study import statistics
@@ -19,6 +20,7 @@ REFERENCE = report.Reference(
 )
 
 
+@pytest.mark.soak
 def test_final_values_stand_beside_the_reference(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(report, "read_runs", lambda folder: RUNS)
     files = {file.name: file for file in report.report(tmp_path, REFERENCE)}
