@@ -157,16 +157,12 @@ def markdown(found: Mapping[str, Mapping[str, Any]]) -> str:
     """
     rows = read(RESULTS / "laptop.csv")
     known = {row["task"] for row in rows if OTHER not in row["source"]}
-    lines = [
-        "| task | laptop, minutes | mean, % | worst, % | GPU, minutes | mean, % | worst, % |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = ["| task | minutes | mean, % | worst, % |", "|---|---|---|---|"]
     for task, devices in found.items():
         if "laptop" not in devices:
             continue
         minutes, *levels = _cells(devices["laptop"])
         cells = [f"`{task}`", minutes if task in known else f"{minutes}*", *levels]
-        cells += _cells(devices["gpu"]) if "gpu" in devices else [""] * 3
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -156,7 +156,7 @@ def population(found: Rates) -> str:
         body.append(
             [f"`{task}`", found[task, "plain", "win_rate"].percent, leads[worst].percent, worst]
         )
-    return table(("match", "wins, %", "smallest lead, points", "against"), body)
+    return table(("match", "mean wins, %", "smallest lead, points", "against"), body)
 
 
 def exploitability() -> str:

@@ -46,7 +46,10 @@ def test_a_task_without_a_time_is_left_out(results: Path) -> None:
     rows = "go1gate,0,64,24,256,0.5,0.4,0.6,x\ngo1gate,1,64,nan,256,1,0.9,1,x\n"
     (results / "laptop.csv").write_text(f"{HEAD}{rows}go1tug,0,64,nan,256,1,0.9,1,x\n")
     table = laptop.markdown(laptop.levels()).splitlines()
-    assert len(table) == 3 and table[2].startswith("| `go1gate` | 12 | 75.0 | 50.0 of 2 | 5.7 |")
+    assert len(table) == 3 and table[2] == "| `go1gate` | 12 | 75.0 | 50.0 of 2 |"
+    slower = rows.replace(",x\n", ",other machine\n")
+    (results / "laptop.csv").write_text(HEAD + slower)
+    assert "| 12* |" in laptop.markdown(laptop.levels())
 
 
 def test_a_second_call_measures_only_new_teams(
