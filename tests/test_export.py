@@ -37,7 +37,12 @@ from mqe_jax.export.policy import input_shapes, shapes, to_onnx  # noqa: E402
 from mqe_jax.export.robot_graph import robot_onnx, skill_onnx, verify_robot  # noqa: E402
 from mqe_jax.export.robot_team import RobotTeam, open_team  # noqa: E402
 from mqe_jax.export.site import entries  # noqa: E402
-from mqe_jax.export.task import TaskFunctions, policy_function, state_arrays  # noqa: E402
+from mqe_jax.export.task import (  # noqa: E402
+    TaskFunctions,
+    policy_function,
+    skill_function,
+    state_arrays,
+)
 
 GATE = zoo.file_of("go1gate")
 WALK_MEMORY = ["walk_action", "walk_gait", "walk_history", "walk_previous_action"]
@@ -85,6 +90,18 @@ def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: A
     assert (properties["kp_nm_per_rad"], properties["kd_nms_per_rad"]) == ("20.0", "0.5")
     assert properties["period_s"] == "0.02" and properties["opset"] == "17"
     assert file.stat().st_size < 4.0e6  # weights that float16 represents are stored as such
+
+
+def test_the_function_of_a_skill_bounds_turns_as_the_simulation_does() -> None:
+    env = make("go1plane", impl="c", skill="agile", gait=None)
+    act, sizes = skill_function(env)
+    inputs = {name: jnp.full(shape, 0.1) for name, shape in sizes.items()}
+    turn = env.controller.skill.turn
+    assert turn
+    moves = ([2.5, 0.0, 2.5], [2.5, 0.0, turn / 2.5], [2.5, 0.0, 0.5])
+    fast, bounded, slow = (act({**inputs, "command": jnp.array(x)})["joint_target"] for x in moves)
+    np.testing.assert_allclose(fast, bounded, atol=1e-6)
+    assert np.abs(fast - slow).max() > 1e-3
 
 
 @pytest.mark.parametrize("params", [{"control": "position"}, {"robots": ["go1", "go2"]}])

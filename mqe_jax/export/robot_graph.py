@@ -86,9 +86,10 @@ def verify_robot(policy: TrainedPolicy, env: QuadrupedEnv) -> tuple[onnx.ModelPr
 def skill_onnx(env: QuadrupedEnv) -> onnx.ModelProto:
     """Returns the graph of the skill of a task's robots, which must be alike.
 
-    `joint_position` and `joint_target` are angles in rad, not minus the stance. At an episode's
-    start, the inputs with the skill's name are zero; then they are the outputs `next_NAME`. The
-    metadata has the joints, their stance and gains, and the default of each command.
+    `joint_position` and `joint_target` are angles in rad, not minus the stance. The graph bounds
+    turns as the simulation does (`Skill.turn`). At an episode's start, the inputs with the skill's
+    name are zero; then they are the outputs `next_NAME`. The metadata has the joints, their stance
+    and gains, and the default of each command.
     """
     function, sizes = skill_function(env)
     skill = env.controller.skill

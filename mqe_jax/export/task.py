@@ -209,7 +209,8 @@ def skill_function(env: QuadrupedEnv) -> tuple[Function, Shapes]:
     def act(inputs: Arrays) -> dict[str, jax.Array]:
         sensed = Proprioception(*(inputs[name] for name in SENSED))
         state = fill_arrays(skill.name, skill.init_memory(), inputs)
-        target, state = skill.targets(group.params, state, inputs["command"], sensed)
+        command = skill.limit_turn(inputs["command"])
+        target, state = skill.targets(group.params, state, command, sensed)
         return {"joint_target": target} | name_arrays(f"next_{skill.name}", state)
 
     return act, shapes
