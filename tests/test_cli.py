@@ -99,6 +99,7 @@ def test_a_divergence_is_recorded_and_replayed(mqe: Any, monkeypatch: Any) -> No
     assert Path("clip.png").stat().st_size > 500
 
 
+@pytest.mark.soak
 def test_a_divergence_in_training_is_recorded(mqe: Any, monkeypatch: Any) -> None:
     # in the second step
     monkeypatch.setattr(QuadrupedEnv, "_diverged", lambda self, data: data.time > 0.03)

@@ -409,6 +409,7 @@ def test_the_match_of_the_guide_is_that_of_the_example_package() -> None:
     assert blocks(read("docs/new_match.md"), "python")[0] == read("examples/race/race.py")
 
 
+@pytest.mark.soak
 def test_the_example_can_be_solved_and_its_parts_behave_as_documented(example: Any) -> None:
     env = VectorEnv(make("go1catch", impl="c", num_envs=8), 8)
     plan = jax.vmap(scripted_policy(env.env))

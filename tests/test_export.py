@@ -173,6 +173,7 @@ def test_networks_memories_and_controls_agree(
     assert export_error(new_policy(env, control, **network), env) < 2e-5
 
 
+@pytest.mark.soak
 def test_agents_that_see_each_other_know_who_takes_part() -> None:
     """In the simulation, for plain observations and in a graph, whose parked robots have zeros."""
     env = make("go1gate", impl="c", control="torque", num_agents=3, fewest_agents=1, num_envs=1)

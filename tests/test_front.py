@@ -178,6 +178,7 @@ class Standing(StagesSettings):
         return (Stages if self.learns else Still)(network, config)
 
 
+@pytest.mark.soak
 def test_an_own_algorithm_is_trained_and_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(algorithms, "STAGES", {**algorithms.STAGES})
     kind = register_stages("standing")(Standing)

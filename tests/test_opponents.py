@@ -81,6 +81,7 @@ def new_policy(
     return untrained(env, build(TrainConfig, {**SETTINGS, **own, **settings}), seed)
 
 
+@pytest.mark.soak
 def test_teams_may_see_different_groups_of_observations() -> None:
     task = matches("go1tug", 2).env
     plain = VectorEnv(task, 2)

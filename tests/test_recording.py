@@ -58,6 +58,7 @@ def test_episodes_are_whole_and_aligned(short: mqe_jax.QuadrupedEnv) -> None:
     assert len(starts) == 5
 
 
+@pytest.mark.soak
 def test_an_interrupted_recording_keeps_whole_episodes(
     short: mqe_jax.QuadrupedEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -145,6 +145,7 @@ def test_scripted_policies_command_the_same_in_other_ranges(task: str, weights: 
     assert np.abs(first[:, :3]).max(0) == pytest.approx([1.0, 0.5, 0.5])
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(("control", "size"), [("command", 3), ("position", 12)])
 def test_npc_robots_keep_the_walk_policy(control: str, size: int, weights: str) -> None:
     """The defender's joint targets are those beside agents that walk."""

@@ -369,6 +369,7 @@ def test_processes_share_a_sweep(tmp_path: Path) -> None:
     assert sweeps.plan(sweep, folder, config_of) == []
 
 
+@pytest.mark.soak
 def test_a_sweep_that_is_stopped_and_copied_resumes_elsewhere(tmp_path: Path) -> None:
     sweep = load(tmp_path)
     folder = tmp_path / "study"

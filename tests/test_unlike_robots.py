@@ -96,6 +96,7 @@ def test_robots_see_which_bodies_they_and_others_have() -> None:
     assert guarded.layouts["policy"].blocks[-1].width == 6
 
 
+@pytest.mark.soak
 def test_a_team_of_unlike_robots_is_trained_and_evaluated(tmp_path: Path) -> None:
     unlike = {"robots": ["go1", "go2"]}
     run = mqe_jax.learn("go1gate", SMALL, env=unlike, impl="c", run_dir=tmp_path / "run")
