@@ -3,6 +3,7 @@ SIGTERM: one line, exit code 130 or 143; SIGKILL too leaves a run that resumes e
 """
 
 import contextlib
+import importlib.metadata
 import os
 import re
 import signal
@@ -332,13 +333,21 @@ def test_members_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(device)
     monkeypatch.setattr(launch, "_gpus", lambda: 2)
     assert [own[device] for own in members(*TWO)] == ["0", "1"]
-    said = "processes: 3 is not allowed; it must be at most the number of this host's GPUs, 2"
+    said = "processes: 3 .* at most the number of this host's GPUs, 2; CUDA_VISIBLE_DEVICES=0,0,0"
     refuses(said, members, "--processes", "3")
     monkeypatch.setenv(device, "1")
     refuses("processes: 2 .* at most the number of GPUs in CUDA_VISIBLE_DEVICES, 1", members, *TWO)
     monkeypatch.setenv(device, "1,1")
     shared = launch.Launch(processes=2, command=("sweep", "sweep.yaml"))._members()
-    assert [own[device] for own in shared] == ["1", "1"]
+    memory = "XLA_PYTHON_CLIENT_MEM_FRACTION"
+    assert [(own[device], own[memory]) for own in shared] == [("1", "0.38")] * 2
+    monkeypatch.setenv(memory, "0.2")
+    monkeypatch.setattr(importlib.metadata, "version", lambda package: "2.30.3")
+    assert members(*TWO)[1][memory] == "0.2"
+    monkeypatch.setattr(importlib.metadata, "version", lambda package: "2.28.9")
+    refuses("nvidia-nccl-cu12: '2.28.9' .* at least 2.30", members, *TWO)
+    monkeypatch.setenv(device, "1,2")
+    assert all(memory not in own for own in members(*TWO))
     monkeypatch.setenv(device, "4,5,6")
     monkeypatch.setenv("SLURM_PROCID", "5")
     monkeypatch.setenv("SLURM_LOCALID", "1")

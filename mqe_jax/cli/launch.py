@@ -1,5 +1,7 @@
 """The command `launch`: a training in several processes, one for each device."""
 
+import contextlib
+import importlib.metadata
 import os
 import re
 import signal
@@ -38,6 +40,8 @@ PROGRAM = [sys.executable, "-P", "-m", "mqe_jax.cli"]
 folder."""
 
 _DEVICES = "CUDA_VISIBLE_DEVICES"
+_MEMORY = 0.75  # of a GPU: JAX's default, shared by the processes; Warp needs the rest
+_NCCL = "NCCL_MULTI_RANK_GPU_ENABLE"
 _NO_DEVICES = ("", "-1")  # of `_DEVICES`: JAX computes on the CPU
 _RANKS = {"SLURM_PROCID": "SLURM_LOCALID", "OMPI_COMM_WORLD_RANK": "OMPI_COMM_WORLD_LOCAL_RANK"}
 """Variables of srun and mpirun: a process's index among all, and among those of its host."""
@@ -63,7 +67,8 @@ class Launch:
     """
 
     processes: PositiveInt | None = None
-    """Number of processes of this host, on its first GPUs or those in CUDA_VISIBLE_DEVICES."""
+    """Number of processes of this host, on its first GPUs or those in CUDA_VISIBLE_DEVICES, where
+    processes share a GPU that is named twice."""
     command: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
     """Arguments of the command."""
 
@@ -91,6 +96,8 @@ class Launch:
         own = self._own_devices(self.processes)
         if self._sweeps or self.processes == 1:
             return [{**variables, MEMBER: ALONE} for variables in own]
+        if any(_NCCL in variables for variables in own):
+            _check_nccl()
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
@@ -122,11 +129,35 @@ class Launch:
             return [{} for _ in range(count)]
         gpus = _gpus()
         if visible is None and 0 < gpus < count:
-            fail("processes", count, f"at most the number of this host's GPUs, {gpus}")
+            share = f"{_DEVICES}={','.join('0' * count)} shares one"
+            fail("processes", count, f"at most the number of this host's GPUs, {gpus}; {share}")
         devices = _split(visible) or list(map(str, range(count)))
         if len(devices) < count:
             fail("processes", count, f"at most the number of GPUs in {_DEVICES}, {visible}")
-        return [{_DEVICES: device} for device in devices[:count]]
+        devices = devices[:count]
+        return [{_DEVICES: device} | _sharing(devices.count(device)) for device in devices]
+
+
+def _sharing(processes: int) -> dict[str, str]:
+    """Returns the variables of each of the processes that have one GPU, unless they are set."""
+    if processes == 1:
+        return {}
+    memory = f"{_MEMORY / processes:.2f}"
+    variables = {_NCCL: "1", "XLA_PYTHON_CLIENT_MEM_FRACTION": memory}
+    return {name: os.environ.get(name, value) for name, value in variables.items()}
+
+
+def _check_nccl() -> None:
+    """Raises an InputError if the installed NCCL refuses processes that share a GPU."""
+    for package in ("nvidia-nccl-cu12", "nvidia-nccl-cu13"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            version = importlib.metadata.version(package)
+            if tuple(map(int, version.split(".")[:2])) < (2, 30):
+                fail(
+                    package,
+                    version,
+                    f"at least 2.30 if processes share a GPU: pip install -U {package}",
+                )
 
 
 def _gpus() -> int:

@@ -154,17 +154,19 @@ class Engine(abc.ABC):
 
         It is created on first use: importing MJX takes a second, which `mqe tasks` avoids.
         """
+        _finish_at_exit()
         with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
             return self.blank()
 
 
-@atexit.register
-def _finish() -> None:
-    """Waits for programs whose results exist.
+@functools.cache
+def _finish_at_exit() -> None:
+    """Makes the interpreter wait for programs before it ends: their threads call Python."""
+    atexit.register(_finish)
 
-    Their threads cannot call Python while the interpreter ends.
-    """
-    with contextlib.suppress(Exception):  # of a platform that is not here
-        for array in jax.live_arrays():
-            with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
-                array.block_until_ready()
+
+def _finish() -> None:
+    """Waits for programs whose results exist."""
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
+            array.block_until_ready()
