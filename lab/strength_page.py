@@ -4,7 +4,6 @@
 PART` measured, as results/strength/PART.csv, mixed teams in crossplay_TASK.json and best responses
 in exploitability.csv. `python -m lab.strength_page --rates FOLDER` first copies the results of
 every part that is below FOLDER; best responses and mixed teams of tasks that it lacks stay.
-former.csv has rates of the teams of version 0.3.0.
 """
 
 import argparse
@@ -168,18 +167,12 @@ def exploitability() -> str:
     return table(("match", "team", "lead, points"), body)
 
 
-def robustness(found: Rates, former: Rates) -> str:
-    """Returns the table of success, in matches of wins, by task and condition; in parentheses that
-    of the teams of version 0.3.0 that were replaced.
-    """
+def robustness(found: Rates) -> str:
+    """Returns the table of success, in matches of wins, by task and condition."""
     body = []
     for task in (*COOPERATIVE, *MATCHES):
-        now = by_condition(found, task)
-        before = by_condition(former, task)
-        cells = []
-        for name in CONDITIONS:
-            parts = [f"{100 * each[name].value:.0f}" for each in (now, before) if name in each]
-            cells.append(" ".join([*parts[:1], *(f"({part})" for part in parts[1:])]))
+        own = by_condition(found, task)
+        cells = [f"{100 * own[name].value:.0f}" if name in own else "" for name in CONDITIONS]
         body.append([f"`{task}`", *cells])
     return table(("task", *CONDITIONS.values()), body)
 
@@ -326,7 +319,7 @@ def tables() -> dict[str, str]:
         "strength": strength(rates("cooperative"), rates("matches")),
         "population": population(rates("population")),
         "exploitability": exploitability(),
-        "robustness": robustness(robust_rates(), rates("former")),
+        "robustness": robustness(robust_rates()),
         "mates": mixed(),
         "walk": walk(rates("matches")),
     }
