@@ -163,8 +163,8 @@ def exploitability() -> str:
     body = []
     for task in MATCHES:
         own = [row for row in rows("exploitability") if row["task"] == task]
-        body.append([f"`{task}`", own[0]["team"], max(map(rate, own)).percent])
-    return table(("match", "team", "lead, points"), body)
+        body.append([f"`{task}`", max(map(rate, own)).percent])
+    return table(("match", "lead, points"), body)
 
 
 def robustness(found: Rates) -> str:
@@ -352,7 +352,6 @@ def leads(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             episodes = result["episodes"]
             own = {
                 "task": result["task"],
-                "team": "shipped",
                 "from": cell.split("+")[1],
                 "seed": seed.removeprefix("seed"),
             }

@@ -108,7 +108,7 @@ def test_every_match_has_best_responses_of_both_kinds_and_the_page_shows_the_lar
         assert kinds == {(x, y) for x in ("scratch", "champion") for y in ("sampled", "mean")}
         best = max(own, key=lambda x: float(x["value"]))
         lead = Rate(*(float(best[name]) for name in Rate._fields))
-        assert row == [f"`{task}`", best["team"], lead.percent]
+        assert row == [f"`{task}`", lead.percent]
 
 
 def test_conditions_are_shown_as_far_as_they_are_measured(data: Path) -> None:
