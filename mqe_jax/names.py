@@ -120,7 +120,7 @@ def _find(name: str, task: str, field: str) -> Found:
     shipped = name in zoo.names()
     if shipped or os.sep in name or Path(name).suffix or Path(name).exists():
         return read_policy(zoo.file_of(name) if shipped else name)
-    allowed = (*simple.names(task), *zoo.names())
+    allowed = (*simple.names(task), *(each for each in zoo.names() if task in ("", each)))
     raise InputError(
         f"{field}: unknown {name!r}{nearest(name, allowed)}; allowed: {', '.join(allowed)}, "
         "a run folder, a policy file, or one that register_scripted adds (mqe: --import FILE)"
@@ -506,8 +506,8 @@ def versus(
 ) -> Versus:
     """Returns matches as environments of team 0, against opponents that control team 1.
 
-    Opponents are policies or what `load_policy` accepts; equally many environments meet each of
-    them. Trained policies act as they are loaded (sampled, unless deterministic) and can be
+    Opponents are policies, functions or what `load_policy` accepts; equally many environments meet
+    each of them. Trained policies act as they are loaded (sampled, unless deterministic) and can be
     exchanged (`Versus.change`). A draw adds `draw_reward`. InputError for a task that is not a
     match, and for a policy of another task.
 
@@ -518,7 +518,8 @@ def versus(
         print(matches.num_agents)  # 1
         ```
     """
-    alone = isinstance(opponents, str | Path) or hasattr(opponents, "initial_memory")
+    one = isinstance(opponents, str | Path) or callable(opponents)
+    alone = one or hasattr(opponents, "initial_memory")
     given: Any = [opponents] if alone else opponents
     if not isinstance(given, Sequence):
         fail("opponents", given, "a policy, or a list of policies")

@@ -46,10 +46,12 @@ def test_a_payoff_counts_the_games_of_both_sides() -> None:
 def test_the_rating_of_two_policies_in_closed_form(win: int, draw: int, loss: int) -> None:
     results = np.zeros((2, 2, 3), int)
     results[0, 1] = [win, draw, loss]
-    odds = (win + draw / 2 + 0.5) / (loss + draw / 2 + 0.5)
-    np.testing.assert_allclose(
-        tournament.rate(results, 1).value, [400 * np.log10(odds), 0], atol=1e-6
-    )
+    share = 0.998 * (win + draw / 2) / (win + draw + loss) + 0.001
+    found = tournament.rate(results, 1)
+    np.testing.assert_allclose(found.value, [400 * np.log10(share / (1 - share)), 0], atol=1e-6)
+    more = tournament.rate(16 * results, 1)
+    np.testing.assert_allclose(more.value, found.value, atol=1e-6, err_msg="more of the same games")
+    assert more.low[0] > found.low[0]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -62,11 +64,9 @@ def test_ratings_explain_the_points_of_every_policy(seed: int) -> None:
     expected = np.zeros(len(ratings))
     points = np.zeros(len(ratings))
     for i, j in itertools.permutations(range(len(ratings)), 2):
-        won = results[i, j, 0] + results[j, i, 2] + 0.5
-        points[i] += won
-        expected[i] += (results[i, j].sum() + results[j, i].sum() + 1) / (
-            1 + 10 ** ((ratings[j] - ratings[i]) / 400)
-        )
+        played = results[i, j].sum() + results[j, i].sum()
+        points[i] += 0.998 * (results[i, j, 0] + results[j, i, 2]) + 0.001 * played
+        expected[i] += played / (1 + 10 ** ((ratings[j] - ratings[i]) / 400))
     np.testing.assert_allclose(expected, points, rtol=0, atol=1e-6)
 
 

@@ -209,16 +209,21 @@ def title(policy: Any) -> str:
     return str(policy) if isinstance(policy, Path) else str(own or policy)
 
 
+def check_actions(action: Any, shape: tuple[int, ...], name: str = "a function") -> None:
+    """Raises an InputError for actions of a policy that have another shape than the passed one."""
+    expected = shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32))
+    if shapes_of(action) != expected or is_typed_key(action):
+        given = getattr(action, "shape", type(action).__name__)
+        fail("policy", f"{name} that returns actions {given}", f"one that returns {shape}")
+
+
 def _check_act(returned: Any, shape: tuple[int, ...], memory: Memory) -> tuple[jax.Array, Memory]:
     """Returns what a policy's `act` returned: actions, and a recurrent state like its `memory`.
 
     Actions have the passed shape. InputError for anything else.
     """
     action, after = action_and_memory(returned)
-    expected = shapes_of(jax.ShapeDtypeStruct(shape, jnp.float32))
-    if shapes_of(action) != expected or is_typed_key(action):
-        given = getattr(action, "shape", type(action).__name__)
-        fail("policy", f"a function that returns actions {given}", f"one that returns {shape}")
+    check_actions(action, shape)
     if shapes_of(after) != shapes_of(memory):
         fail("policy", "a function that changes its memory's structure", "one that keeps it")
     return action, after

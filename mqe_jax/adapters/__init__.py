@@ -19,7 +19,7 @@ from gymnasium.spaces import Box
 from mqe_jax import envs, names
 from mqe_jax.acting.seats import Policy
 from mqe_jax.adapters.opponent import TaskEnv, TeamEnv
-from mqe_jax.core.errors import InputError
+from mqe_jax.core.errors import InputError, nearest
 from mqe_jax.core.limits import PositiveInt
 from mqe_jax.core.precision import single
 from mqe_jax.core.settings import checked
@@ -83,6 +83,9 @@ def task_env(
     else:
         if max_steps is not None and "episode_length" in overrides:
             raise InputError(f"episode_length: give either this or {limit}, not both")
+        for other in overrides:
+            if hint := nearest(other, ("opponent", limit), 0.8):
+                raise InputError(f"{other}: unknown argument{hint}")
         env = envs.make(name, **names.parameters_of(name, [rival]) | overrides)
         if max_steps is not None:
             env = env.changed({"episode_length": max_steps * env.dt})

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mqe_jax.acting.seats import action_and_memory
+from mqe_jax.acting.seats import action_and_memory, check_actions
 from mqe_jax.core import devices
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.precision import single
@@ -82,15 +82,18 @@ def from_function(act: Callable[..., Any], env: QuadrupedEnv, name: str = "") ->
     The function has no recurrent state: its memory is ().
     """
 
+    agents = len(env.teams[0])
+
     def plan(obs: jax.Array, key: jax.Array) -> jax.Array:
         with compiling(name):
             action, memory = action_and_memory(act(obs, (), key))
         if jax.tree.leaves(memory):
             allowed = "one that returns (action, ()); an object with `initial_memory` has a memory"
             fail("policy", f"{name or 'a function'} with a memory", allowed)
+        check_actions(action, (len(obs), agents, env.action_size), name or "a function")
         return action
 
-    return SimplePolicy(env.name, len(env.teams[0]), plan, name)
+    return SimplePolicy(env.name, agents, plan, name)
 
 
 def _uniform(shape: tuple[int, ...], obs: jax.Array, key: jax.Array) -> jax.Array:

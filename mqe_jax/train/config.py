@@ -38,7 +38,11 @@ from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_setting
 CONFIG_FILE = "config.yaml"
 """Name of the settings in a run folder."""
 
-_OPPONENT = tyro.conf.arg(name="opponent", metavar="NAME|RUN|FILE")
+_OPPONENT = tyro.conf.arg(
+    name="opponent",
+    metavar="NAME|RUN|FILE",
+    help_behavior_hint=lambda usual: f"(repeatable; default: {usual})",
+)
 
 
 @settings_class

@@ -133,7 +133,7 @@ class CrossPlay:
             "",
             f"agent 0 follows the row, the others the column; intervals are +-{wide:.0f} at most",
         ]
-        lines += [*table({"policy": [*map(shorten, names)]}), "", *grid(100 * self.success, ".0f")]
+        lines += [*table({"policy": [*map(shorten, names)]}), "", *grid(self._cells)]
         columns = {}
         for at, name in enumerate(self.references, count):
             columns[f"agent 0 {name}"] = [self.rate(at, i).text() for i in range(count)]
@@ -181,9 +181,14 @@ class CrossPlay:
         draw(
             names,
             self.success,
+            self._cells,
             "success in %, agent 0 (row) with the others (column)",
             folder / PICTURE,
         )
+
+    @property
+    def _cells(self) -> NDArray[np.str_]:
+        return np.array([[f"{100 * x:.0f}" for x in row] for row in self.success])
 
     @property
     def _pairs(self) -> list[tuple[int, int]]:

@@ -14,7 +14,7 @@ from mqe_jax.core.literal import line, to_label
 
 NAME = 28
 """Characters of a policy's name that are shown, at most."""
-_COLUMNS = 15  # of a matrix that fit into a line
+_WIDTH = 78  # characters of a matrix's line, after the number of its row
 
 
 def shorten(name: str) -> str:
@@ -38,14 +38,15 @@ def table(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
         yield " ".join([f"{number or '':>2}", *row]).rstrip()
 
 
-def grid(values: NDArray[Any], form: str, *, diagonal: bool = True) -> Iterator[str]:
-    """Yields the lines of a matrix (P, P) with numbered rows and columns."""
-    for start in range(0, len(values), _COLUMNS):
-        shown = range(start, min(start + _COLUMNS, len(values)))
-        yield "  " + "".join(f"{column + 1:5}" for column in shown)
-        for row in range(len(values)):
-            cells = (format(values[row, j], form) if diagonal or row != j else "" for j in shown)
-            yield f"{row + 1:>2}" + "".join(f"{cell:>5}" for cell in cells).rstrip()
+def grid(cells: NDArray[np.str_]) -> Iterator[str]:
+    """Yields the lines of a matrix of texts (P, P) with numbered rows and columns."""
+    width = 2 + max(map(len, cells.flat))
+    step = _WIDTH // width
+    for start in range(0, len(cells), step):
+        shown = range(start, min(start + step, len(cells)))
+        yield "  " + "".join(f"{column + 1:{width}}" for column in shown)
+        for row in range(len(cells)):
+            yield f"{row + 1:>2}" + "".join(f"{cells[row, j]:>{width}}" for j in shown).rstrip()
 
 
 def write_table(file: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -58,23 +59,22 @@ def write_table(file: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]
 def draw(
     names: Sequence[str],
     shares: NDArray[Any],
+    cells: NDArray[np.str_],
     title: str,
     path: Path,
     *,
     least: float = 0.0,
-    diagonal: bool = True,
 ) -> None:
-    """Draws shares (P, P) from `least` to 1 in percent, rows against columns, atomically."""
+    """Draws texts (P, P) on the colours of shares from `least` to 1, atomically."""
     from matplotlib.figure import Figure
 
     size = 2.6 + 0.6 * len(names)
     figure = Figure((size + 0.8, size), dpi=120, layout="constrained")
     axes = figure.add_subplot()
-    axes.imshow(shares, cmap="RdYlGn", vmin=least, vmax=1)
-    for (row, column), value in np.ndenumerate(shares):
-        if diagonal or row != column:
-            text = format(100 * value + 0.0, ".0f" if least == 0 else "+.0f")
-            axes.text(column, row, text, ha="center", va="center", fontsize=9)
+    image = axes.imshow(shares, cmap="Blues" if least == 0 else "RdBu", vmin=least, vmax=1)
+    for (row, column), text in np.ndenumerate(cells):
+        ink = "black" if np.mean(image.to_rgba(shares[row, column])[:3]) > 0.5 else "white"
+        axes.text(column, row, text, ha="center", va="center", fontsize=9, color=ink)
     shown = [to_label(shorten(name)) for name in names]
     axes.set_xticks(range(len(names)), shown, rotation=45, ha="right")
     axes.set_yticks(range(len(names)), shown)

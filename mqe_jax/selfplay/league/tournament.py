@@ -39,6 +39,8 @@ CSV = "tournament.csv"
 POLICIES = "policies.csv"
 PICTURE = "tournament.png"
 
+DRAWN = 0.002
+"""Share of the games of a rating that counts as drawn: who always wins leads by 1200 points."""
 _POINTS = 400 / np.log(10)  # Elo points of a factor e in the odds
 _ITERATIONS = 40
 
@@ -142,12 +144,18 @@ def scores(results: NDArray[Any]) -> Array:
 def rate(results: NDArray[Any], reference: int) -> Estimate:
     """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,); `reference` has 0.
 
-    A draw is half a win; every pair has one game more than it played (`games_of`), so that ratings
-    are finite. Intervals are of a Bayesian bootstrap of all these games.
+    A draw is half a win, and a share `DRAWN` of each pair's games counts as drawn, so that ratings
+    are finite and do not grow with the number of games. Intervals are of a Bayesian bootstrap of
+    the games and one more for every pair (`games_of`).
     """
-    games = games_of(results)
-    samples = _strengths(scores(resample(games, np.random.default_rng(0))), reference)
-    return estimate(_strengths(scores(games), reference), samples)
+    samples = resample(games_of(results), np.random.default_rng(0))
+    return estimate(*(_strengths(_mixed(scores(each)), reference) for each in (results, samples)))
+
+
+def _mixed(points: Array) -> Array:
+    """Returns points (..., P, P) with a share `DRAWN` of the games drawn."""
+    games = points + points.swapaxes(-1, -2)
+    return (1 - DRAWN) * points + 0.5 * DRAWN * games
 
 
 def _strengths(points: Array, reference: int) -> Array:
@@ -197,7 +205,6 @@ class Standings:
     def __repr__(self) -> str:
         found = self.analysis
         order = self._order
-        wide = 50 * np.max(found.payoff.high - found.payoff.low)
         names = [shorten(self.policies[i]) for i in order]
         ratings = [self.ratings.at(i).text(1) for i in order]
         columns = {"mean": found.mean, "worst case": found.worst}
@@ -212,8 +219,8 @@ class Standings:
             "wins minus losses of 100 games on both sides together (95% interval)",
             *table(texts),
             "",
-            f"the same of each pair, row against column; intervals are +-{wide:.0f} at most",
-            *grid(100 * found.payoff.value[np.ix_(order, order)], "+.0f", diagonal=False),
+            "the same of each pair, row against column; * if the interval excludes 0",
+            *grid(self._cells),
         ]
         return "\n".join(lines)
 
@@ -235,16 +242,18 @@ class Standings:
         It replaces files atomically.
         """
         folder = Path(folder)
+        found = self.analysis
         pairs = []
         both = self.results + self.results.swapaxes(0, 1)[..., ::-1]
         for i, j in itertools.product(range(len(self.policies)), repeat=2):
             games = max(int(both[i, j].sum()), 1)
             rates = [f"{x:.4f}" for count in both[i, j] for x in Rate.of(count / games, games)]
+            rates += [f"{x[i, j]:.4f}" for x in found.payoff]
             row = self.policies[i], self.policies[j], *self.results[i, j], *rates, self.skill
             pairs.append(row)
-        sides = [f"{name}{end}" for name in RESULTS for end in ("_both_sides", "_low", "_high")]
+        shares = (*RESULTS, "lead")
+        sides = [f"{name}{end}" for name in shares for end in ("_both_sides", "_low", "_high")]
         write_table(folder / CSV, ("team0", "team1", *RESULTS, *sides, "skill"), pairs)
-        found = self.analysis
         kinds = {"rating": self.ratings, "mean": found.mean, "worst": found.worst}
         header = [f"{name}{end}" for name in kinds for end in ("", "_low", "_high")]
         rows = [
@@ -256,14 +265,23 @@ class Standings:
             for i in self._order
         ]
         write_table(folder / POLICIES, ("policy", *header, "skill"), rows)
+        order = self._order
         draw(
-            self.policies,
-            found.payoff.value,
-            "wins minus losses of 100 games, row against column",
+            [self.policies[i] for i in order],
+            found.payoff.value[np.ix_(order, order)],
+            self._cells,
+            "wins minus losses of 100 games, row against column\n* 95% interval excludes 0",
             folder / PICTURE,
             least=-1.0,
-            diagonal=False,
         )
+
+    @property
+    def _cells(self) -> NDArray[np.str_]:
+        """Wins minus losses of 100 games of each pair as text, the strongest first (P, P)."""
+        value, low, high = (x[np.ix_(self._order, self._order)] for x in self.analysis.payoff)
+        stars = np.where((low > 0) | (high < 0), "*", "")
+        texts = np.array([[f"{100 * x + 0.0:+.0f}" for x in row] for row in value])
+        return np.where(np.eye(len(value), dtype=bool), "", np.char.add(texts, stars))
 
     @property
     def _order(self) -> list[int]:
