@@ -26,7 +26,6 @@ from mqe_jax.core.errors import InputError, NonFiniteError, one_line
 from mqe_jax.core.files import parsing, write_atomically
 from mqe_jax.core.literal import echo
 from mqe_jax.envs.registry import SHIPPED
-from mqe_jax.policies import zoo
 from mqe_jax.runs.sweeping import sweep
 from mqe_jax.study.runs import is_finished, read_curve, table
 from mqe_jax.study.sweep import load_sweep
@@ -44,8 +43,6 @@ CORES = 2
 OTHER = "other machine"
 """In the source of a training whose cores were about half as fast."""
 EPISODES = 256
-TEACHER_EPISODES = 512
-"""Episodes behind a rate on a shipped policy's card."""
 
 Row = Mapping[str, Any]
 
@@ -172,22 +169,15 @@ def _cells(one: Mapping[str, Any]) -> list[str]:
     return [f"{one['minutes']:g}", mean, f"{worst} of {one['trainings']}"]
 
 
-def with_teacher(row: Row) -> Row:
-    """Returns a row of a student with the rate of its teacher, the shipped policy."""
-    card = zoo.card(row["task"]).results
-    return {**row, "teacher": card["win/scripted" if "win/scripted" in card else "success"].value}
-
-
 def students() -> str:
-    """Returns the table of students beside their teachers."""
+    """Returns the table of students."""
     every = read(RESULTS / "student.csv")
-    lines = ["| task | minutes | student, % | teacher, % |", "|---|---|---|---|"]
+    lines = ["| task | minutes | student, % |", "|---|---|---|"]
     for task in dict.fromkeys(row["task"] for row in every):
         rows = [row for row in every if row["task"] == task]
         minutes = np.mean([row["processor_minutes"] for row in rows]) / CORES
         rate = Rate.of(float(np.mean([row["rate"] for row in rows])), EPISODES * len(rows))
-        teacher = Rate.of(rows[0]["teacher"], TEACHER_EPISODES)
-        lines.append(f"| `{task}` | {minutes:.1f} | {rate.percent} | {teacher.percent} |")
+        lines.append(f"| `{task}` | {minutes:.1f} | {rate.percent} |")
     return "\n".join(lines)
 
 
@@ -221,8 +211,6 @@ def main() -> None:
     folder = given.folder or Path("runs") / given.config
     for seed in [] if given.table else given.seeds or settings.seeds:
         rows = train(file, folder, seed, given.tasks or settings.tasks, given.impl)
-        if given.config == "student":
-            rows = [with_teacher(row) for row in rows]
         keep(RESULTS / f"{given.config}.csv", rows)
         update()
     update()

@@ -226,7 +226,8 @@ def mixed() -> str:
     body = []
     for task in COOPERATIVE:
         found = mates(task)
-        body.append([f"`{task}`", *(found[name].percent for name in ("same", "cross", "gap"))])
+        values = (f"{100 * found[name].value:.1f}" for name in ("same", "cross"))
+        body.append([f"`{task}`", *values, found["gap"].percent])
     return table(("task", "own mate, %", "other seed, %", "difference, points"), body)
 
 

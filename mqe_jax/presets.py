@@ -9,13 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mqe_jax.core.errors import InputError, nearest
+from mqe_jax.core.errors import InputError, nearest, warn
 from mqe_jax.core.settings import (
     FrozenMapping,
     Parameters,
     PathText,
     check,
     fail,
+    hints_of,
+    leaves,
     load_yaml,
     merge,
     nested,
@@ -45,14 +47,16 @@ def resolve(
     1. The defaults of `TrainConfig`.
     2. The task parameters that `needs` returns for the other layers' settings: those of the
        policies that they name.
-    3. The settings of a file or a shipped name; a file changes those that its key `config` names.
-       The default is paper/ALGORITHM for an algorithm, else tuned/TASK if it exists, else league
-       for a match and paper/mappo for other tasks.
+    3. The settings of a file or a shipped name; a file changes those that its key `config` names,
+       else the default ones, unless it names its task, as that of a run folder does. The default is
+       paper/ALGORITHM for an algorithm, else tuned/TASK if it exists, else league for a match and
+       paper/mappo for other tasks.
     4. What defines the algorithm.
     5. `onboard.yaml`, if a layer sets the task parameter `senses` and none sets `group`.
     6. `layers`.
 
-    A `TrainConfig` stands for 1 to 5. A parameter in a layer's `env` leaves any lower `train_env`.
+    A `TrainConfig` stands for 1 to 5. A parameter in a layer's `env` leaves any lower `train_env`;
+    a warning says so of 6.
 
     Raises:
         InputError: for a file, an algorithm or a value that is not allowed, or for sensors above
@@ -70,6 +74,8 @@ def resolve(
     above = [_Layer.of(f"{name}." if name else "", values) for name, values in layers.items()]
     if _select_onboard([*below, *above]):
         below.append(_Layer.of("", _parts("onboard")))
+    _check_names(task, [*below, *above])
+    _warn_of_replaced(_stack(TrainConfig(), below).train_env, above)
     settings = _stack(TrainConfig(), [*below, *above])
     needed = needs(settings)
     return _stack(TrainConfig(env=needed), [*below, *above]) if needed else settings
@@ -108,6 +114,26 @@ def _stack(config: TrainConfig, layers: list[_Layer]) -> TrainConfig:
         except InputError as error:
             raise InputError(f"{layer.prefix}{error}") from None
     return config
+
+
+def _check_names(task: str, layers: list[_Layer]) -> None:
+    """Raises an InputError for a parameter of the task among the settings."""
+    for layer in layers:
+        for name in layer.values.keys() - hints_of(TrainConfig).keys():
+            if task in TASKS and name in hints_of(TASKS[task].Params):
+                raise InputError(
+                    f"{layer.prefix}{name}: is a parameter of the task; it belongs into env"
+                )
+
+
+def _warn_of_replaced(train_env: Mapping[str, Any], above: list[_Layer]) -> None:
+    """Warns of parameters of the task that replace those with which settings train."""
+    before = dict(leaves(train_env))
+    for layer in above:
+        both = dict(leaves(layer.values.get("train_env", {})))
+        for name, value in leaves(layer.env):
+            if before.get(name, value) != value and name not in both:
+                warn(f"{name}: {value} replaces {before[name]}, the settings' value in training")
 
 
 def _without(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
@@ -172,7 +198,7 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
     if not path.is_file():
         raise InputError(f"config: no file {name!r}; allowed: {allowed}")
     values = read_settings(path)
-    base = values.pop("config", None)
+    base = values.pop("config", None if "task" in values else "default")
     if base is not None and base not in shipped:
         fail(f"{path}: config", base, f"one of {', '.join(shipped)}")
     below = [] if base is None else _layers_of(task, base)

@@ -502,14 +502,17 @@ def test_brax_trains() -> None:
 
 @pytest.mark.soak
 def test_stable_baselines3_trains() -> None:
-    adapter("pettingzoo")
-    for library in ("supersuit", "stable_baselines3"):
-        pytest.importorskip(library)
-    example = importlib.import_module("sb3_pettingzoo")
-    rows = example.train(
-        example.vectorised("go1gate", impl="c", episode_length=0.5), 200, rollout=32
-    )
+    pytest.importorskip("stable_baselines3")
+    example = importlib.import_module("sb3")
+    agents = example.Agents("go1gate", 4, impl="c", episode_length=0.5)
+    env = example.wrappers.VecNormalize(example.wrappers.VecMonitor(agents))
+    model, rows = example.train(env, 200, rollout=32)
     assert rows[-1]["env_steps"] == 256 and rows[-1]["episode_length"] <= 25
+    obs = np.random.default_rng(0).normal(size=(5, 2, 16)).astype(np.float32)
+    action, _ = example.policy_of(model, env)(obs, (), None)
+    seen = env.normalize_obs(obs.reshape(10, 16))
+    expected = model.predict(seen, deterministic=True)[0].reshape(5, 2, 3)
+    np.testing.assert_allclose(np.clip(action, -1, 1), expected, atol=1e-5)
 
 
 @pytest.mark.soak

@@ -67,6 +67,7 @@ SHELL = {
     "apt-get",
     "tar",
     "jupyter",
+    "nvidia-cuda-mps-control",
 }
 
 

@@ -10,6 +10,7 @@ import itertools
 import json
 import pickle
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -119,6 +120,13 @@ def test_a_file_changes_the_settings_that_it_names(tmp_path: Path) -> None:
         file.write_text(f"config: {base}\nppo: {{clip: 0.1}}")
         changed = resolve("go1tug", base, layers={"": {"ppo.clip": 0.1}})
         assert resolve("go1tug", file) == changed != resolve("go1tug", base)
+    file.write_text("ppo: {clip: 0.1}")
+    assert resolve("go1tug", file) == resolve("go1tug", layers={"": {"ppo.clip": 0.1}})
+    file.write_text("task: go1tug\nppo: {clip: 0.1}")  # as a run's, which has all settings
+    assert resolve("go1tug", file) == override(TrainConfig(task="go1tug"), {"ppo.clip": 0.1})
+    file.write_text("rewards: {win: 1}")
+    said = rf"^{file}: rewards: is a parameter of the task; it belongs into env"
+    refuses(said, resolve, "go1tug", file)
     file.write_text("config: own.yaml")
     refuses(rf"^{file}: config: 'own.yaml' .*one of default, demo", resolve, "go1tug", file)
 
@@ -160,9 +168,12 @@ def test_a_parameter_replaces_that_of_training_below(layers: Any) -> None:
 
 def test_one_layer_may_name_a_parameter_of_training_and_of_evaluation() -> None:
     both = {"env": {"rewards.approach": 1.0}, "train_env": {"rewards.approach": 3.0}}
-    config = resolve("go1gate", layers={"": both})
+    with warnings.catch_warnings(action="error"):
+        config = resolve("go1gate", layers={"": both})
     assert config.env == APPROACH
     assert config.train_env == {"rewards": {"approach": 3.0}}
+    with pytest.warns(UserWarning, match=r"rewards.approach: 1.0 replaces 10.0, the settings' val"):
+        resolve("go1gate", layers={"": {"env": both["env"]}})
 
 
 def test_parameters_beside_settings_count_in_training_too() -> None:

@@ -127,7 +127,7 @@ def test_a_longer_run_brings_back_nothing_that_has_ended(tmp_path: Path) -> None
     warmed = settings(ppo__critic_warmup=0.4)
     train(PROBE, dataclasses.replace(warmed, total_steps=32), run_dir)
     longer = dataclasses.replace(warmed, total_steps=96)
-    said = r"total_steps: 96 .* at most 80, beyond which ppo.critic_warmup, which has ended"
+    said = r"total_steps: 96 .* at most 80, or more with --ppo.critic-warmup 0.3333: else ppo"
     refuses(said, train, PROBE, longer, run_dir, resume=True)
     assert int(train(PROBE, warmed, run_dir, resume=True).updates) == 5
 
@@ -137,7 +137,7 @@ def test_a_longer_run_leaves_out_what_has_ended(tmp_path: Path) -> None:
     fewer = settings(curriculum__failure_bootstrap=0.5, total_steps=32)
     train(PROBE, fewer, run_dir)
     longer = dataclasses.replace(fewer, total_steps=96)
-    said = r"at most 64, .*, or beside curriculum.failure_bootstrap_until 0.3333"
+    said = r"at most 64, or more with --curriculum.failure-bootstrap-until 0.3333: else"
     refuses(said, train, PROBE, longer, run_dir, resume=True)
     said = "curriculum.failure_bootstrap: 0.25 differs from the run"
     other = override(longer, {"curriculum.failure_bootstrap": 0.25})

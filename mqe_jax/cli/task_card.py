@@ -10,7 +10,7 @@ import numpy as np
 
 from mqe_jax.core.imports import IMPORTED, flags
 from mqe_jax.core.literal import line
-from mqe_jax.core.settings import to_mapping
+from mqe_jax.core.settings import leaves, to_mapping
 from mqe_jax.envs import SCRIPTED, QuadrupedEnv
 from mqe_jax.envs.facts import facts
 from mqe_jax.physics.robots.robot import Robot
@@ -100,7 +100,8 @@ def _trainings(env: QuadrupedEnv) -> list[dict[str, Any]]:
         words = ("mqe train", shlex.quote(env.name), flag, flags(IMPORTED))
         command = " ".join(filter(None, words))
         steps = {"steps": config.total_steps, "environments": config.num_envs}
-        found.append({"command": command, "settings": name, **steps})
+        changed = {"train_env": dict(leaves(config.train_env))}
+        found.append({"command": command, "settings": name, **steps, **changed})
     return found
 
 
@@ -146,6 +147,7 @@ def show(card: Mapping[str, Any], *, long: bool) -> None:
     trainings = {
         x["command"]: f"{x['settings']}: {x['steps'] / 1e6:g} million steps of "
         f"{x['environments']} environments"
+        + "".join(f", {name}={value}" for name, value in x["train_env"].items())
         for x in card["training"]
     }
     _print_rows("Training: settings", trainings.items())

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 import tyro
 from annotated_types import Ge, Gt, Le, Lt
+from tyro.constructors import PrimitiveConstructorSpec
 
 from mqe_jax.core.errors import InputError
 from mqe_jax.core.limits import (
@@ -38,6 +39,21 @@ from mqe_jax.train.networks import ActorCritic, NetworkSettings, network_setting
 CONFIG_FILE = "config.yaml"
 """Name of the settings in a run folder."""
 
+
+def _steps(words: list[str]) -> int:
+    number = float(words[0])
+    if not number.is_integer():
+        raise ValueError(f"{words[0]} is no whole number")
+    return int(number)
+
+
+_STEPS = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="INT",
+    instance_from_str=_steps,  # also 1e6
+    is_instance=lambda value: isinstance(value, int),
+    str_from_instance=lambda value: [str(value)],
+)
 _OPPONENT = tyro.conf.arg(
     name="opponent",
     metavar="NAME|RUN|FILE",
@@ -250,7 +266,7 @@ class TrainConfig:
     """Random seed."""
     num_envs: Environments = 500
     """Number of parallel environments."""
-    total_steps: Steps = 40_000_000
+    total_steps: Annotated[Steps, _STEPS] = 40_000_000
     """Total environment steps of the run, summed over environments."""
     rollout_steps: Horizon = 200
     """Steps of each environment between two updates."""

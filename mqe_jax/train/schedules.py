@@ -78,16 +78,14 @@ def check_ended(config: TrainConfig, names: Iterable[str], updates: int) -> None
     The run has done a number of updates.
     """
     ends = _ends(config)
-    for name in names:
-        until = ends.get(name, 0.0)
-        if updates < until * config.num_updates:
-            most = int(updates / until) * config.steps_per_update
-            earlier = math.floor(1e4 * updates / config.num_updates) / 1e4
-            allowed = (
-                f"at most {most}, beyond which {name}, which has ended, would return, or "
-                f"beside {_ENDS[name]} {earlier}"
-            )
-            fail("total_steps", config.total_steps, allowed)
+    back = [name for name in names if updates < ends.get(name, 0.0) * config.num_updates]
+    if not back:
+        return
+    most = int(updates / max(ends[name] for name in back)) * config.steps_per_update
+    earlier = math.floor(1e4 * updates / config.num_updates) / 1e4
+    flags = " ".join(f"--{_ENDS[name].replace('_', '-')} {earlier}" for name in back)
+    allowed = f"at most {most}, or more with {flags}: else {', '.join(back)} would begin again"
+    fail("total_steps", config.total_steps, allowed)
 
 
 def _ends(config: TrainConfig) -> dict[str, float]:
