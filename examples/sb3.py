@@ -32,7 +32,7 @@ class Agents(wrappers.VecEnv):
     """The agents of all environments, one after another."""
 
     def __init__(self, task: str, num_envs: int = NUM_ENVS, **settings: Any) -> None:
-        self.env = gymnasium.make_vec(
+        self.env: Any = gymnasium.make_vec(
             f"mqe/{task}-v0", num_envs=num_envs, autoreset_mode="SameStep", **settings
         )
         self.num_agents, size = self.env.single_observation_space.shape
