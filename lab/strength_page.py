@@ -32,7 +32,6 @@ SECTIONS = {
     "../exploiting.md": ("exploitability",),
     "robustness.md": ("robustness",),
     "../comparing.md": ("mates",),
-    "../skills.md": ("walk",),
 }
 """Filled sections of each page."""
 COOPERATIVE = (
@@ -196,18 +195,6 @@ def worst(found: Rates, task: str) -> str:
     return f"{100 * alone[name].value:.0f} ({CONDITIONS[name]})"
 
 
-def walk(found: Rates) -> str:
-    """Returns the table of wins against the scripted team by teams with the walking and with the
-    agile skill.
-    """
-    variants = ("walk", "scripted")
-    body = [
-        [f"`{task}`", *(against(found, task, each)[0].percent for each in variants)]
-        for task in MATCHES
-    ]
-    return table(("match", "walking team", "agile team"), body)
-
-
 def published(name: str) -> dict[str, Any]:
     """Returns the content of a published JSON file."""
     return json.loads((DATA / f"{name}.json").read_text("utf-8"))
@@ -322,7 +309,6 @@ def tables() -> dict[str, str]:
         "exploitability": exploitability(),
         "robustness": robustness(robust_rates()),
         "mates": mixed(),
-        "walk": walk(rates("matches")),
     }
 
 
