@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from mqe_jax.viz.curves import plot_curves
+
 RESULTS = Path(__file__).parents[1] / "results"
 WIDTH = 640  # px, of every drawing; a phone shows it at half the size
 INK = "#23252b"
@@ -44,6 +46,15 @@ def read_measurements() -> dict[str, Any]:
 def curves() -> Figure:
     """Success in evaluations during trainings with the default settings: results/curves.csv."""
     return _curves(read_rows("curves.csv"), ["go1gate", "go1seesaw", "go1pushbox"], 2.8, (0, 102))
+
+
+def demo() -> Figure:
+    """The curve of `mqe train go1gate --config demo`: results/demo.csv."""
+    rows = read_rows("demo.csv")
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    figure = plot_curves([columns], "")
+    figure.set_size_inches(WIDTH / 100, 2.8)
+    return figure
 
 
 def students() -> Figure:
