@@ -75,7 +75,7 @@ def resolve(
     if _select_onboard([*below, *above]):
         below.append(_Layer.of("", _parts("onboard")))
     _check_names(task, [*below, *above])
-    _warn_of_replaced(_stack(TrainConfig(), below).train_env, above)
+    _warn_of_replaced(functools.reduce(_joined, below, {}).get("train_env", {}), above)
     settings = _stack(TrainConfig(), [*below, *above])
     needed = needs(settings)
     return _stack(TrainConfig(env=needed), [*below, *above]) if needed else settings
@@ -107,13 +107,27 @@ class _Layer(NamedTuple):
 
 
 def _stack(config: TrainConfig, layers: list[_Layer]) -> TrainConfig:
+    """Returns settings with the changes of layers; what one breaks, the following may mend."""
+    failed: InputError | None = None
+    waiting: dict[str, Any] = {}
     for layer in layers:
-        train_env = _without(config.train_env, layer.env)
+        config = replace(config, train_env=_without(config.train_env, layer.env))
+        waiting = _joined(waiting, layer)
         try:
-            config = override(replace(config, train_env=train_env), layer.values)
+            config = override(config, waiting)
         except InputError as error:
-            raise InputError(f"{layer.prefix}{error}") from None
+            failed = failed or InputError(f"{layer.prefix}{error}")
+        else:
+            failed, waiting = None, {}
+    if failed is not None:
+        raise failed
     return config
+
+
+def _joined(values: Mapping[str, Any], layer: _Layer) -> dict[str, Any]:
+    """Returns changes with those of a further layer, whose `env` leaves their `train_env`."""
+    kept = _without(values.get("train_env", {}), layer.env)
+    return merge({**values, "train_env": kept}, layer.values)
 
 
 def _check_names(task: str, layers: list[_Layer]) -> None:
