@@ -75,7 +75,13 @@ def resolve(
     if _select_onboard([*below, *above]):
         below.append(_Layer.of("", _parts("onboard")))
     _check_names(task, [*below, *above])
-    _warn_of_replaced(functools.reduce(_joined, below, {}).get("train_env", {}), above)
+    control = _joint([*below, *above]).get("env", {}).get("control", "command")
+    if control != "command" and not isinstance(config, TrainConfig):
+        unscripted = _unscripted(below)
+        below.append(unscripted)
+        if unscripted.values:
+            warn(f"control: the scripted team does not act by {control!r}: training without it")
+    _warn_of_replaced(_joint(below).get("train_env", {}), above)
     settings = _stack(TrainConfig(), [*below, *above])
     needed = needs(settings)
     return _stack(TrainConfig(env=needed), [*below, *above]) if needed else settings
@@ -122,6 +128,11 @@ def _stack(config: TrainConfig, layers: list[_Layer]) -> TrainConfig:
     if failed is not None:
         raise failed
     return config
+
+
+def _joint(layers: list[_Layer]) -> dict[str, Any]:
+    """Returns the changes of several layers."""
+    return functools.reduce(_joined, layers, {})
 
 
 def _joined(values: Mapping[str, Any], layer: _Layer) -> dict[str, Any]:
@@ -201,7 +212,7 @@ def _layers_of(task: str, config: str | Path) -> list[_Layer]:
         parts = [_parts(file)["common"], _parts(file).get(part or task, {})]
         layers = below + [_Layer.of("", values) for values in parts]
         if task in TASKS and task not in SCRIPTED:
-            layers.append(_Layer.of("", _unscripted(_stack(TrainConfig(), layers))))
+            layers.append(_unscripted(layers))
         return layers
     path = Path(name)
     allowed = f"a YAML file, or one of {', '.join(shipped)}"
@@ -230,17 +241,19 @@ def _defaults(task: str) -> list[_Layer]:
     return _layers_of(task, name)
 
 
-def _unscripted(config: TrainConfig) -> dict[str, Any]:
-    """Returns what replaces the scripted policy in the settings of a task without one."""
+def _unscripted(layers: list[_Layer]) -> _Layer:
+    """Returns what replaces the scripted policy of layers where there is none."""
+    settings = _joint(layers)
     changes: dict[str, Any] = {}
-    if config.imitation.teacher == "scripted":
+    if settings.get("imitation", {}).get("teacher") == "scripted":
         changes["imitation.teacher"] = None
-    if config.curriculum.demonstrator == "scripted":
+    if settings.get("curriculum", {}).get("demonstrator") == "scripted":
         changes |= {"curriculum.demonstrator": None, "curriculum.assistance": 0.0}
-    if "scripted" in config.opponents:
-        others = [name for name in config.opponents if name != "scripted"]
-        changes["opponents"] = ["newest"] * (len(config.opponents) - len(others)) + others
-    return changes
+    opponents = settings.get("opponents", ())
+    if "scripted" in opponents:
+        others = [name for name in opponents if name != "scripted"]
+        changes["opponents"] = ["newest"] * (len(opponents) - len(others)) + others
+    return _Layer.of("", changes)
 
 
 def preset(algorithm: str) -> dict[str, Any]:

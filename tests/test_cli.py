@@ -319,7 +319,7 @@ BAD = {
         ["'./fifo' has no policy.safetensors", "*.safetensors"],
     ),
     "control of a teacher": (
-        ["train", "go1sheep-easy", "--control", "position"],
+        "train go1sheep-easy --control position --imitation.teacher scripted".split(),
         ["imitation.teacher: 'scripted'", "'position'"],
     ),
     "policy's file": (["eval", "fake", "--policy", "runs/none"], ["runs/none", "no such file"]),

@@ -266,7 +266,7 @@ def test_a_further_scripted_policy_acts_under_its_name_in_its_task_alone(
     action, _ = load_policy("ahead", env).act(jnp.zeros((2, 1, 12)), (), jax.random.PRNGKey(0))
     np.testing.assert_allclose(action[:, 0], [[0.7, 0, 0]] * 2, atol=1e-6)
     refuses(
-        r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1bridge",
+        r"unknown 'ahead'.*allowed: scripted, random, idle, forward, go1tug, a run",
         load_policy,
         "ahead",
         make("go1tug", impl="c", num_envs=1),

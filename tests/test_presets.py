@@ -166,6 +166,18 @@ def test_a_parameter_replaces_that_of_training_below(layers: Any) -> None:
             assert resolved.training_env == expected
 
 
+@pytest.mark.parametrize("task", ["go1gate", "go1tug"])
+def test_without_commands_presets_train_without_the_scripted_team(task: str) -> None:
+    control = {"env": {"control": "position"}}
+    with pytest.warns(UserWarning, match="control: the scripted team does not act by 'position'"):
+        config = resolve(task, "laptop", layers={"": control})
+    assert config.imitation.teacher is None and config.curriculum.demonstrator is None
+    assert "scripted" not in config.opponents
+    with pytest.warns(UserWarning, match="without it"):
+        own = resolve(task, "laptop", layers={"": {**control, "imitation.teacher": "scripted"}})
+    assert own.imitation.teacher == "scripted", "as the caller says"
+
+
 def test_one_layer_may_name_a_parameter_of_training_and_of_evaluation() -> None:
     both = {"env": {"rewards.approach": 1.0}, "train_env": {"rewards.approach": 3.0}}
     with warnings.catch_warnings(action="error"):

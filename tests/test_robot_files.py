@@ -24,7 +24,7 @@ from mqe_jax.envs import make
 from mqe_jax.export.scene import scene_settings, scene_xml
 from mqe_jax.names import load_policy, table
 from mqe_jax.physics import robots
-from mqe_jax.physics.robots import files
+from mqe_jax.physics.robots import files, motors, reader
 from mqe_jax.physics.robots.build import build_robot
 from mqe_jax.physics.robots.index import Proprioception, RobotState
 from mqe_jax.physics.robots.model import ModelRobot
@@ -182,6 +182,22 @@ def test_needs_and_digests_have_the_contents_of_a_robots_files(tmp_path: Path) -
     changed = make("go1gate", impl="c", control="position", robot=str(tmp_path / "one.xml"))
     assert changed.digests["robot"] != envs[0].digests["robot"]
     assert changed.describe("policy")["robot"] != one
+
+
+def test_default_gains_are_raised_until_a_quadruped_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = "it does not stand with kp 8 and kd 0.2; raise them"
+    (note,) = (
+        note for note in written(tmp_path, dog(), "kp: 8\nkd: 0.2").notes if "stance" in note
+    )
+    assert said in note
+    holding = read(DOG).kp * reader.SAG  # N m
+    monkeypatch.setattr(reader, "GO1_GAIN", 1.0)
+    monkeypatch.setattr(reader, "SAG", 0.4)
+    robot = written(tmp_path, dog(), name="softer")
+    assert robot.kp == pytest.approx(2.0 * holding / 0.4)
+    assert motors.stands(robot) and not any("stance" in note for note in robot.notes)
 
 
 def test_a_yaml_overrides_what_the_mjcf_says(tmp_path: Path) -> None:

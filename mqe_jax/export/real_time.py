@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +41,8 @@ class Course:
 
     successes: list[float] = field(default_factory=list)
     """Success of team 0 in each episode, or in a match whether it won."""
+    endings: Counter[str] = field(default_factory=Counter)
+    """Number of episodes that ended so, by name."""
     steps: int = 0
     """Steps of the world."""
     seconds: float = 0.0
@@ -161,6 +164,7 @@ class World:
         outcome = state.outcome
         won = outcome.success if outcome.win is None else outcome.win
         course.successes.append(float(won[0]))
+        course.endings.update(name for name, ended in outcome.ending.items() if ended)
 
     def _send(self, robots: Mapping[int, LiveRobot], number: int, episode: int, state: Any) -> None:
         seen = jax.device_get(state.groups)

@@ -41,6 +41,8 @@ class Robot:
         self._session: Any = onnxruntime.InferenceSession(graph, options, ["CPUExecutionProvider"])
         self._shapes = {x.name: tuple(x.shape[1:]) for x in self._session.get_inputs()}
         outputs = {x.name: tuple(x.shape[1:]) for x in self._session.get_outputs()}
+        if "action" not in outputs or "obs" not in self._shapes:
+            raise ValueError("graph: is none of a robot's policy, with obs and action")
         self._outputs = [*outputs]
         self._random = np.random.default_rng(seed)
         self._width = math.prod(outputs["action"])

@@ -119,8 +119,8 @@ def _check_scripted(name: str, env: QuadrupedEnv, field: str) -> None:
     find_scripted(env.name, name, field)
     if env.control != "command":
         raise InputError(
-            f"{field}: {name!r} outputs walk commands; control is {env.control!r}, use another, "
-            "such as random"
+            f"{field}: {name!r} outputs walk commands; control is {env.control!r}; use another, "
+            "such as random, or none in a training"
         )
     if tuple(env.params.commands) != TaskParams.commands:
         raise InputError(

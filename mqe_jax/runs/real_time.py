@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from mqe_jax import names
 from mqe_jax.acting.results import Rate
+from mqe_jax.core.errors import warn
 from mqe_jax.core.limits import Candidates, Latency, Positive, Seed
 from mqe_jax.core.literal import line
 from mqe_jax.core.settings import Parameters, checked, fail
@@ -45,6 +46,8 @@ class RealTime:
     """Share of a robot's steps in which it stood, as no command had come for 0.2 s."""
     delay: float
     """Median time from readings to the step that used the answer, s."""
+    endings: dict[str, float]
+    """Shares of the episodes in real time that ended so, by name."""
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values for JSON; rates have their 95% intervals beside them."""
@@ -67,6 +70,8 @@ class RealTime:
             "late commands": f"{100 * self.late:.1f}%",
             "stood without commands": f"{100 * self.stood:.1f}%",
         }
+        for name, share in self.endings.items():
+            rows[f"ends by {name.replace('_', ' ')}"] = f"{100 * share:.1f}%"
         return "\n".join(f"{name:<24} {line(value)}" for name, value in rows.items())
 
 
@@ -128,6 +133,13 @@ def real_time(
         world = World(playing.env, playing.seats)
         options |= {"episodes": episodes, "num_envs": episodes}  # one of each state
         expected = evaluate(task, team, other, **options, seed=seed)
+    ranges = playing.env.params.action_ranges()
+    for most, (name, ends) in zip(limits or (), ranges.items(), strict=False):
+        if most < max(map(abs, ends)):
+            warn(
+                f"limits: {most:g} is below the {max(map(abs, ends)):g} of {name} in training; "
+                "train with lower command_ranges, and a longer episode_length"
+            )
     keys = jax.random.split(jax.random.split(jax.random.PRNGKey(seed))[0], episodes)
     folder = None if log is None else Path(log)
     with (
@@ -149,4 +161,5 @@ def real_time(
         late=float(late.mean()),
         stood=course.stood / (course.steps * len(robots)),
         delay=float(np.median(delays)),
+        endings={name: count / episodes for name, count in course.endings.items()},
     )

@@ -221,7 +221,7 @@ def stress(
     playing = names.table(task, policy, opponent, num_envs=1, **given)
     if playing.env.params.randomization != Randomization():
         raise InputError(
-            "randomization: conditions have ranges of their own; leave it out, or set it to none"
+            "randomization: conditions have ranges of their own; set it to none, not those of a run"
         )
     lag = LONGEST if curves else ROBUST["action_lag"]
     changed = playing.env.changed({"randomization": {**ROBUST, "action_lag": lag}})

@@ -127,6 +127,12 @@ class Networks:
         shipped = ASSETS / f"{self.skill}_{robot.walk.weights}.safetensors"
         file = shipped if path is None else pathlib.Path(path)
         if not file.is_file() and path is None:
+            if robot.walk.weights:
+                names = sorted(x.stem.partition("_")[2] for x in ASSETS.glob(f"{self.skill}_*"))
+                raise InputError(
+                    f"{robot.name}: weights: {robot.walk.weights!r} is not allowed; it must be one "
+                    f"of {', '.join(names)}"
+                )
             raise NoSkillError(
                 f"{self.title}: no weights are shipped for {robot.name}; train a skill, 'mqe skill "
                 f"train agile --robot {robot.call}', then --set skill=agile --set skill_weights="

@@ -8,8 +8,6 @@ named after `mjModel` fields.
 from __future__ import annotations
 
 import abc
-import atexit
-import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping
@@ -20,6 +18,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mqe_jax.core import threefry  # noqa: F401  (for programs on a CPU)
+from mqe_jax.physics.engines.host_call import finish_at_exit
 from mqe_jax.physics.robots.motors import Motors
 
 if TYPE_CHECKING:
@@ -154,19 +153,6 @@ class Engine(abc.ABC):
 
         It is created on first use: importing MJX takes a second, which `mqe tasks` avoids.
         """
-        _finish_at_exit()
+        finish_at_exit()
         with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
             return self.blank()
-
-
-@functools.cache
-def _finish_at_exit() -> None:
-    """Makes the interpreter wait for programs before it ends: their threads call Python."""
-    atexit.register(_finish)
-
-
-def _finish() -> None:
-    """Waits for programs whose results exist."""
-    for array in jax.live_arrays():
-        with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
-            array.block_until_ready()

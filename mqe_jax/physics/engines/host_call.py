@@ -9,6 +9,8 @@ XLA's stable C interface (`jax.ffi.include_dir()`, xla/ffi/api/c_api.h, version 
 version of it, JAX's callbacks do the same without being stored.
 """
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import re
@@ -88,6 +90,19 @@ _latest: dict[int, HostFunction] = {}
 without an owner."""
 
 
+@functools.cache
+def finish_at_exit() -> None:
+    """Makes the interpreter wait for programs before it ends: their threads call Python."""
+    atexit.register(_finish)
+
+
+def _finish() -> None:
+    """Waits for programs whose results exist."""
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):  # deleted, or the result of a program that failed
+            array.block_until_ready()
+
+
 def host_call(
     number: int,
     owner: Any,
@@ -103,6 +118,7 @@ def host_call(
     live are preferred, which they must not reference. `result` has the shape and dtype without
     batch axes.
     """
+    finish_at_exit()
     _owners.setdefault(number, weakref.WeakKeyDictionary())[owner] = function
     _latest.pop(number, None)
     _latest[number] = function

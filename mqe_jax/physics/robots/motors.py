@@ -37,6 +37,7 @@ REACH = 1.25
 GAIN = 4.0  # of the armature beyond `REACH`; 1 would bring an isolated joint to its speed limit
 STEEP = 2.0
 """Timestep x slope of the torque line / inertia above which explicit integration is unstable."""
+DROP = 1.4  # height of the trunk at a reset over that of the stance
 UNLIMITED = 1e6  # rad/s, the speed limit of motors without one
 CLAMP = 1.09  # greatest share of the speed limit after a physics step
 ROUNDING = 1e-5  # relative margin that covers the rounding of single precision
@@ -57,6 +58,29 @@ def leg_response(robot: Robot) -> np.ndarray:
     mujoco.mj_fullM(model, data, matrix)
     limb = [joint.dofadr[0] for joint in joints[: robot.limb]]
     return np.abs(np.linalg.inv(matrix)[np.ix_(limb, limb)])
+
+
+def stands(robot: Robot) -> bool:
+    """Returns whether a robot holds its default pose for 2 s after a drop as at a reset."""
+    spec = build_robot(robot, 0, visual=False, torque_control=True)
+    bits = 0xFFFF
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(type=plane, size=[0, 0, 1], contype=bits, conaffinity=bits)
+    spec.option.timestep = 0.005
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    joints = [model.joint(name) for name in robot.joint_names]
+    place = [joint.qposadr[0] for joint in joints]
+    speed = [joint.dofadr[0] for joint in joints]
+    data.qpos[2] = DROP * robot.stand_height
+    data.qpos[place] = robot.default_joints
+    for _ in range(400):
+        wanted = robot.kp * (robot.default_joints - data.qpos[place])
+        torque = wanted - robot.kd * data.qvel[speed]
+        data.qfrc_applied[speed] = np.clip(torque, -robot.torque_limit, robot.torque_limit)
+        mujoco.mj_step(model, data)
+    level = data.xmat[1].reshape(3, 3)[2, 2]
+    return bool(data.qpos[2] > 0.8 * robot.stand_height and level > 0.985)
 
 
 class Run(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 from mqe_jax.core.errors import brief
 from mqe_jax.physics.robots.compiled import Compiled, Values
 from mqe_jax.physics.robots.model import LEG_JOINTS, ModelRobot
+from mqe_jax.physics.robots.motors import stands
 from mqe_jax.physics.robots.robot import GO1_HEIGHT, Body, Mirror, Proportions, WalkSettings
 from mqe_jax.physics.robots.shapes import Shapes
 from mqe_jax.physics.robots.skeleton import Foot
@@ -26,6 +27,7 @@ _GEOM = mujoco.mjtGeom
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 NEAR = 0.25  # share of the height by which a foot may be above the lowest
 UPRIGHT = 0.7  # vertical part of the trunk's z axis, at least
+STIFFER = (1.0, 1.4, 2.0)  # factors of the default gains that are tried
 BENT = 0.75  # share of a straight leg's length at which a solved stance stands
 WIDEST = 200.0  # rad, range of a joint, at most
 TORQUE = 1e5  # N m of a joint, at most
@@ -80,7 +82,7 @@ class Reader(Compiled):
         foot_z = skeleton.seen(np.array([sole.center]), sole.body)[0, 2]
         dofs = [self.model.joint(name).dofadr[0] for name in joints]
         narrow = float((self.upper - self.lower).min())
-        return ModelRobot(
+        made = ModelRobot(
             name=self.source.path.stem,
             title=settings.title or self.source.spec.modelname,
             joints=tuple(joints),
@@ -120,8 +122,22 @@ class Reader(Compiled):
             ),
             digest=self.source.digest(text, shapes.meshes),
             source=str(self.source.path),
-            notes=tuple(self.notes),
+            notes=(),
         )
+        made = self._standing(made)
+        return dataclasses.replace(made, notes=tuple(self.notes))
+
+    def _standing(self, robot: ModelRobot) -> ModelRobot:
+        """Returns a quadruped with default gains that are raised until it stands."""
+        own = self.settings.kp is None and self.settings.kd is None
+        for factor in STIFFER if own and robot.four_legged else (1.0,):
+            made = dataclasses.replace(robot, kp=factor * robot.kp, kd=factor * robot.kd)
+            if not robot.four_legged or stands(made):
+                return made
+        self.notes.append(
+            f"stance: it does not stand with kp {robot.kp:.3g} and kd {robot.kd:.3g}; raise them"
+        )
+        return robot
 
     def _values(self, given: Values | None, key: str, default: np.ndarray | float) -> np.ndarray:
         """Returns a setting's value for each joint (J,); `default` where it has none."""
@@ -322,7 +338,7 @@ class Reader(Compiled):
             name = self.joints[int(np.argmin(inertias))]
             self.notes.append(
                 f"joint {name!r}: is light, so gains above kp {most[0]:.3g} and kd {most[1]:.3g} "
-                f"are not stable; they are {kp:.3g} and {kd:.3g}; set kp and kd"
+                f"may not be stable; they are {kp:.3g} and {kd:.3g}; set others"
             )
         return kp, kd
 
