@@ -71,6 +71,7 @@ def new_policy(
     return dataclasses.replace(policy, params=params, normalizer=statistics)
 
 
+@pytest.mark.soak
 def test_a_trained_run_with_normalised_layers_is_exported(tmp_path: Path, mqe: Any) -> None:
     file = tmp_path / "box.onnx"
     said = json.loads(mqe(f"export go1pushbox --onnx {file} --json").out)

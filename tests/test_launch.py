@@ -278,7 +278,9 @@ def test_on_one_host_nobody_else_can_join() -> None:
         assert process.stdout.readline().decode().split() == ["True", "False"]
 
 
-@pytest.mark.parametrize("foreign", ["127.0.0.1", "0.0.0.0", "::"])
+@pytest.mark.parametrize(
+    "foreign", ["::", *(pytest.param(x, marks=pytest.mark.soak) for x in ("127.0.0.1", "0.0.0.0"))]
+)
 def test_a_port_of_slurm_that_another_program_uses(foreign: str) -> None:
     """It accepts and says nothing; process 0 and process 1 of two both end and name the address."""
     family = socket.AF_INET6 if ":" in foreign else socket.AF_INET
@@ -481,6 +483,7 @@ def test_a_program_that_starts_ends_at_once(number: signal.Signals, tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("shared_programs")
 def test_an_interrupted_training_is_saved_and_resumes_exactly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -234,7 +234,7 @@ def test_what_does_not_fit_is_refused(policies: list[TrainedPolicy], door: Vecto
     refuses("another form", env.change, env.reset(KEY), 1, other)
 
 
-@pytest.mark.parametrize("kind", ["versus", "mirror"])
+@pytest.mark.parametrize("kind", ["versus", pytest.param("mirror", marks=pytest.mark.soak)])
 def test_the_trainer_sees_one_team(kind: str) -> None:
     inner = matches("go1football-2vs2", 2)
     env = versus(inner, ["random"]) if kind == "versus" else Mirror(inner)

@@ -139,6 +139,7 @@ def poses(model: mujoco.MjModel) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.soak
 def test_contacts_with_boxes_are_those_of_the_c_engine() -> None:
     """All corners of a tilted box; a capsule near a box's edge, which MJX alone does not detect."""
     model = mujoco.MjModel.from_xml_string(CONTACTS)

@@ -139,6 +139,7 @@ def check_graphs(built: SimpleNamespace, steps: int) -> set[str]:
     return {name for name in ("terminated", "truncated") if verdict[name].any()}
 
 
+@pytest.mark.soak
 def test_graphs_agree_with_the_environment_in_an_episode(built: SimpleNamespace) -> None:
     assert check_graphs(built, 30) == {"terminated", "truncated"}
 
@@ -346,6 +347,7 @@ SHOW_SCENE = """async (start) => {
 """The x at which the camera looks, m, to show the whole of a track that begins at `start`."""
 
 
+@pytest.mark.soak
 def test_the_page_plays_and_a_key_takes_over_a_robot(page: Path) -> None:
     with opened(page, "seed=3&speed=0.5") as tab:
         assert tab.locator("#task").input_value() == TASK

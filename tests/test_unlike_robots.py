@@ -107,6 +107,7 @@ def test_a_team_of_unlike_robots_is_trained_and_evaluated(tmp_path: Path) -> Non
         mqe_jax.load_policy(tmp_path / "run", make("go1gate", impl="c", robots=("go2", "go1")))
 
 
+@pytest.mark.soak
 def test_both_sides_of_a_match_of_unlike_robots_are_evaluated() -> None:
     match = make("go1tug", impl="c", robots=("go1", "go2"), episode_length=0.5)
     result = mqe_jax.evaluate(match, "scripted", "forward", episodes=4, sides="both")
@@ -172,6 +173,7 @@ def test_robots_of_other_joint_counts_act_together(uneven: Any, tmp_path: Path) 
     assert (tmp_path / "two.png").stat().st_size > 1000
 
 
+@pytest.mark.soak
 def test_entries_of_joints_that_a_robot_lacks_teach_nothing(uneven: Any) -> None:
     own = {**SMALL["network"], "share_policy": False, "log_std_init": 0.0}
     config = {**SMALL, "num_envs": 8, "network": own, "ppo.entropy_coef": 0.1}

@@ -471,6 +471,7 @@ def history() -> tuple[list[TrainState], list[dict[str, jax.Array]]]:
     return updated(probe(), config, 4)
 
 
+@pytest.mark.soak
 def test_a_chunk_repeats_the_rollout(history: Any) -> None:
     for metrics in history[1]:
         assert abs(float(metrics["approx_kl"])) < 1e-5 and float(metrics["clip_fraction"]) == 0.0
