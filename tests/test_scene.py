@@ -238,11 +238,15 @@ def test_a_mirror_exchanges_the_values_of_left_and_right_joints() -> None:
 
 
 def test_missing_walk_weights_say_how_to_make_them() -> None:
-    robots.register(
-        dataclasses.replace(
-            GO1, name="new", walk=dataclasses.replace(GO1.walk, weights="walk_new.x")
-        )
-    )
+    def new(weights: str) -> Robot:
+        walk = dataclasses.replace(GO1.walk, weights=weights)
+        return dataclasses.replace(GO1, name="new", walk=walk)
+
+    robots.register(new("go3"))
+    said = "new: weights: 'go3' is not allowed; it must be one of go1, go2"
+    refuses(said, make, "go1gate", impl="c", robot="new")
+    del robots.ROBOTS["new"]
+    robots.register(new(""))
     try:
         said = r"no weights are shipped for new; .*mqe skill train agile --robot new.*'position'"
         refuses(said, make, "go1gate", impl="c", robot="new")
