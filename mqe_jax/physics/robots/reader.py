@@ -129,10 +129,12 @@ class Reader(Compiled):
 
     def _standing(self, robot: ModelRobot) -> ModelRobot:
         """Returns a quadruped with default gains that are raised until it stands."""
+        if not robot.four_legged:
+            return robot
         own = self.settings.kp is None and self.settings.kd is None
-        for factor in STIFFER if own and robot.four_legged else (1.0,):
+        for factor in STIFFER if own else (1.0,):
             made = dataclasses.replace(robot, kp=factor * robot.kp, kd=factor * robot.kd)
-            if not robot.four_legged or stands(made):
+            if stands(made):
                 return made
         self.notes.append(
             f"stance: it does not stand with kp {robot.kp:.3g} and kd {robot.kd:.3g}; raise them"
