@@ -56,7 +56,7 @@ def resolve(
     6. `layers`.
 
     A `TrainConfig` stands for 1 to 5. A parameter in a layer's `env` leaves any lower `train_env`;
-    a warning says so of 6.
+    a warning says so of files and 6.
 
     Raises:
         InputError: for a file, an algorithm or a value that is not allowed, or for sensors above
@@ -81,7 +81,9 @@ def resolve(
         below.append(unscripted)
         if unscripted.values:
             warn(f"control: the scripted team does not act by {control!r}: training without it")
-    _warn_of_replaced(_joint(below).get("train_env", {}), above)
+    given = [layer for layer in below if layer.prefix]  # a file
+    shipped = [layer for layer in below if not layer.prefix]
+    _warn_of_replaced(_joint(shipped).get("train_env", {}), [*given, *above])
     settings = _stack(TrainConfig(), [*below, *above])
     needed = needs(settings)
     return _stack(TrainConfig(env=needed), [*below, *above]) if needed else settings

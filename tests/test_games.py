@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 from mqe_jax.selfplay.league import games, tournament
 
@@ -52,6 +53,13 @@ def test_the_rating_of_two_policies_in_closed_form(win: int, draw: int, loss: in
     more = tournament.rate(16 * results, 1)
     np.testing.assert_allclose(more.value, found.value, atol=1e-6, err_msg="more of the same games")
     assert more.low[0] > found.low[0]
+
+
+def test_a_star_is_that_of_an_exact_sign_test() -> None:
+    for won, lost in itertools.product((0, 1, 4, 7, 12, 60), repeat=2):
+        expected = binomtest(won, won + lost).pvalue < 0.05 if won + lost else False
+        assert tournament.differ(won, lost) == expected
+    assert tournament.differ(2000, 1700) and not tournament.differ(2000, 1950)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -122,6 +122,9 @@ def test_a_file_changes_the_settings_that_it_names(tmp_path: Path) -> None:
         assert resolve("go1tug", file) == changed != resolve("go1tug", base)
     file.write_text("ppo: {clip: 0.1}")
     assert resolve("go1tug", file) == resolve("go1tug", layers={"": {"ppo.clip": 0.1}})
+    file.write_text("config: laptop\nenv: {rewards.approach: 5.0}")
+    with pytest.warns(UserWarning, match=r"rewards.approach: 5.0 replaces 10.0"):
+        assert resolve("go1gate", file).train_env["rewards"] == {}
     file.write_text("task: go1tug\nppo: {clip: 0.1}")  # as a run's, which has all settings
     assert resolve("go1tug", file) == override(TrainConfig(task="go1tug"), {"ppo.clip": 0.1})
     file.write_text("rewards: {win: 1}")

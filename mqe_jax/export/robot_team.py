@@ -19,7 +19,6 @@ from mqe_jax.core.files import check_file, parse_json, parsing
 from mqe_jax.core.settings import build, checked, fail
 from mqe_jax.core.types import Memory, Observations
 from mqe_jax.export.processes import AskedRobot
-from mqe_jax.export.robot import Robot
 from mqe_jax.train.config import TrainConfig
 from mqe_jax.train.needs import Needs, unmet
 from mqe_jax.train.policy import check_obs
@@ -133,9 +132,12 @@ def open_team(file: str | Path, seed: limits.Seed = 0) -> Iterator[RobotTeam]:
 def _read(file: Path, seed: int) -> RobotTeam:
     if importlib.util.find_spec("onnxruntime") is None:
         raise InputError("export: needs onnxruntime (pip install 'mqe-jax[export]')")
+    import onnxruntime
+
     check_file(file, limits.FILE_BYTES)
     with parsing(file, "an ONNX graph"):
-        about = Robot(str(file)).properties
+        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    about = session.get_modelmeta().custom_metadata_map
     if not {"needs", "actions"} <= about.keys():
         fail(
             "export",

@@ -130,8 +130,8 @@ class Networks:
             if robot.walk.weights:
                 names = sorted(x.stem.partition("_")[2] for x in ASSETS.glob(f"{self.skill}_*"))
                 raise InputError(
-                    f"{robot.name}: weights: {robot.walk.weights!r} is not allowed; it must be one "
-                    f"of {', '.join(names)}"
+                    f"{robot.call}: weights: {robot.walk.weights!r} is not allowed; it must be one "
+                    f"of {', '.join(names)}; your own go into --set skill_weights=FILE"
                 )
             raise NoSkillError(
                 f"{self.title}: no weights are shipped for {robot.name}; train a skill, 'mqe skill "

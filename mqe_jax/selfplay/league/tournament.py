@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,13 @@ def scores(results: NDArray[Any]) -> Array:
     return points + (results.sum(axis=-1) - points).swapaxes(-1, -2)
 
 
+def differ(won: int, lost: int) -> bool:
+    """Returns whether a two-sided exact sign test of won and lost games has p < 0.05."""
+    games = int(won) + int(lost)
+    tail = sum(math.comb(games, k) for k in range(min(int(won), int(lost)) + 1))
+    return 40 * tail < 2**games
+
+
 def rate(results: NDArray[Any], reference: int) -> Estimate:
     """Returns Bradley-Terry ratings in Elo points (doi 10.2307/2334029) (P,); `reference` has 0.
 
@@ -219,7 +227,7 @@ class Standings:
             "wins minus losses of 100 games on both sides together (95% interval)",
             *table(texts),
             "",
-            "the same of each pair, row against column; * if the interval excludes 0",
+            "the same of each pair, row against column; * if a sign test has p < 0.05",
             *grid(self._cells),
         ]
         return "\n".join(lines)
@@ -270,7 +278,7 @@ class Standings:
             [self.policies[i] for i in order],
             found.payoff.value[np.ix_(order, order)],
             self._cells,
-            "wins minus losses of 100 games, row against column\n* 95% interval excludes 0",
+            "wins minus losses of 100 games, row against column\n* sign test: p < 0.05",
             folder / PICTURE,
             least=-1.0,
         )
@@ -278,8 +286,11 @@ class Standings:
     @property
     def _cells(self) -> NDArray[np.str_]:
         """Wins minus losses of 100 games of each pair as text, the strongest first (P, P)."""
-        value, low, high = (x[np.ix_(self._order, self._order)] for x in self.analysis.payoff)
-        stars = np.where((low > 0) | (high < 0), "*", "")
+        order = np.ix_(self._order, self._order)
+        value = self.analysis.payoff.value[order]
+        won, _, lost = np.moveaxis(self.results + self.results.swapaxes(0, 1)[..., ::-1], -1, 0)
+        pairs = zip(won[order].flat, lost[order].flat, strict=True)
+        stars = np.where([differ(*pair) for pair in pairs], "*", "").reshape(value.shape)
         texts = np.array([[f"{100 * x + 0.0:+.0f}" for x in row] for row in value])
         return np.where(np.eye(len(value), dtype=bool), "", np.char.add(texts, stars))
 
