@@ -122,7 +122,7 @@ def test_tables_are_80_columns_wide_and_have_intervals(monkeypatch: pytest.Monke
     pairs = list(itertools.permutations(range(19), 2))
     assert found["worst"]["value"] == min(success[pair] for pair in pairs)
     assert found["cross"] == pytest.approx(np.mean([success[pair] for pair in pairs]))
-    assert "\n 1 +100 (+" in repr(standings) and " +100*" in repr(standings)
+    assert "0 +100 (+" in repr(standings) and " +100*" in repr(standings)
 
 
 def test_a_cooperative_task_is_played_by_mixed_teams(tmp_path: Path, mqe: Any) -> None:

@@ -225,9 +225,9 @@ class Standings:
             *table({"policy": names, "rating (95% interval)": ratings}),
             "",
             "wins minus losses of 100 games on both sides together (95% interval)",
-            *table(texts),
+            *table({"policy": names, **texts}),
             "",
-            "the same of each pair, row against column; * if a sign test has p < 0.05",
+            "each pair's wins minus losses of 100 games; * if a sign test has p < 0.05",
             *grid(self._cells),
         ]
         return "\n".join(lines)
