@@ -171,8 +171,10 @@ def test_robots_act_in_real_time_beside_step_by_step(file: Path, tmp_path: Path,
     sets = ["--set=episode_length=1.0", "--set=collision_force=1e6"]
     sets.append("--set=command_ranges={vx: [-0.5, 1.2]}")
     sets += ["--limits", "0.05", "0.5", "0.5"]
-    found = json.loads(mqe(words, *sets, "--log", tmp_path / "logs").out)
+    with pytest.warns(UserWarning, match="limits: 0.05 is below the 1.2 of vx in training"):
+        found = json.loads(mqe(words, *sets, "--log", tmp_path / "logs").out)
     assert found["episodes"] == 2 and found["latency"] == 0.1
+    assert sum(found["endings"].values()) == 1.0
     assert 0.0 <= found["rate"] <= 1.0 and 0.0 <= found["synchronous"] <= 1.0
     assert 0.1 < found["speed"] < 1.001 and found["delay"] >= 0.12 - 1e-6
     for number in range(2):
